@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
+from damian.advice.journal import Change, Command
 from damian.advice.rows import Acknowledgement, Advice, FleetStatus, Report
 
 
@@ -13,20 +14,6 @@ class NewFleet(BaseModel):
     """UAVs of a fleet to create or find."""
 
     uavs: list[str]
-
-
-class Members(BaseModel):
-    """UAVs that join with their first reports, and UAVs that leave now."""
-
-    join: list[str] = []
-    leave: list[str] = []
-
-
-class Command(BaseModel):
-    """What a person tells UAVs to do, all of them if ``uavs`` is not given."""
-
-    command: Literal["hold", "resume", "return"]
-    uavs: list[str] | None = None
 
 
 class Fleet(BaseModel):
@@ -131,7 +118,7 @@ ENDPOINTS = (
         rows=True,
     ),
     Endpoint("POST", f"{_FLEET}/command", "command", "holds, resumes or returns UAVs", Fleet, Command),
-    Endpoint("POST", f"{_FLEET}/uavs", "members", "lets UAVs join and leave", Fleet, Members),
+    Endpoint("POST", f"{_FLEET}/uavs", "members", "lets UAVs join and leave", Fleet, Change),
     Endpoint("GET", f"{_FLEET}/geofence", "geofence", "the region as a GeoJSON feature", None),
 )
 

@@ -341,8 +341,8 @@ class Fleet:
     def choose(self, now: float, asking: Sequence[str] | None = None) -> Choice | None:
         """What UAVs choose that have not yet in this step; nothing changes until they are told (``tell``).
 
-        A UAV that is in danger is told to hold or to return instead; one that has an answer which still holds,
-        or follows one, does not choose.
+        A UAV that is in danger is told to hold or to return instead; one that has an answer which still
+        holds, or follows one, does not choose.
         """
         numbers = self.numbers_of(asking)
         self.advance(now)
@@ -373,10 +373,9 @@ class Fleet:
         offer, order = self.offer(uav), self.decision(uav)
         if self.rules.acknowledge and order is not None and order.is_open(self.clock):
             return True
-        chosen = offer is not None and (offer.action is not None or offer.reason in ("conflict", "battery"))
-        return chosen and (
-            cast(Decision, offer).is_live(self.clock) or cast(Decision, offer).step == self.step
-        )
+        if offer is None or (offer.action is None and offer.reason not in ("conflict", "battery")):
+            return False
+        return offer.is_live(self.clock) or offer.step == self.step
 
     def _is_told(self, uav: int, reason: str) -> bool:
         """Whether a UAV in danger has been told so, and the answer still holds."""
@@ -402,12 +401,19 @@ class Fleet:
             return "silent"
         if self.rules.reserve > 0 and not (newest.battery_known and newest.battery >= self.rules.reserve):
             return "battery"
-        if self.rules.acknowledge and order is not None and newest.report.time <= order.time:
-            if order.status == ABORTED:
-                return "aborted"
-            if flies and self.clock > order.expires:
+        if self._is_nowhere(uav):
+            return "aborted"
+        if order is not None and flies and self.rules.acknowledge:
+            if self.clock > order.expires and newest.report.time <= order.time:
                 return "lost"
         return {"hold": "held", "return": "returning", "": None}[self.commands[uav]]
+
+    def _is_nowhere(self, uav: int) -> bool:
+        """Whether a UAV has aborted a flight, and has not reported since where it is."""
+        order, newest = self.decision(uav), self.logs[uav].newest
+        return (
+            order is not None and order.status == ABORTED and cast(FilledReport, newest).step <= order.since
+        )
 
     def _flight(self, uav: int, origin: int, goal: int) -> tuple[float, float]:
         """Expected duration of a flight [s], and the battery that it takes [%]."""
@@ -456,8 +462,7 @@ class Fleet:
         if offer is not None and offer.is_live(self.clock):
             booked.add(offer.goal)
         if order is not None and self.rules.acknowledge:
-            unknown = order.status == ABORTED and self.held[uav].report.time <= order.time
-            if unknown or (order.status == ACCEPTED and order.is_open(self.clock)):
+            if self._is_nowhere(uav) or (order.status == ACCEPTED and order.is_open(self.clock)):
                 booked |= {order.origin, order.goal}
         return booked
 
@@ -476,15 +481,10 @@ class Fleet:
         for uav, decision in choice.decisions.items():
             if not decision.moves:
                 continue
-            reason = None
-            at_level = [
-                self._path(each)
-                for other, each in flights.items()
-                if other != uav and abs(self.levels[other] - self.levels[uav]) < self.rules.level_step / 2
-            ]
-            if any(decision.goal in booked[other] for other in self._others(uav)) or too_close(
-                self._path(decision), at_level, self.rules.clearance
-            ):
+            reason, others, level = None, [*self._others(uav)], self.levels[uav]
+            at_level = [flights[each] for each in others if each in flights and self.levels[each] == level]
+            taken = any(decision.goal in booked[other] for other in others)
+            if taken or too_close(self._path(decision), map(self._path, at_level), self.rules.clearance):
                 reason = "conflict"
             elif decision.action is not None and self.node.scenario.battery.enabled:
                 left = cast(FilledReport, self.logs[uav].newest).battery
@@ -539,10 +539,9 @@ class Fleet:
         if choosing and action is not None:
             before = self._state(choosing)
             state = self.node.simulation.decide(before, action, self._mask(choosing))
-            columns = [each[0].tolist() for each in (action, before.goal, state.goal)]
-            decisions |= {
-                uav: self._decision(uav, *(each[uav] for each in columns), None) for uav in choosing
-            }
+            acted, here, there = (each[0].tolist() for each in (action, before.goal, state.goal))
+            for uav in choosing:
+                decisions[uav] = self._decision(uav, acted[uav], here[uav], there[uav], None)
         decisions = dict(sorted(decisions.items()))
         for number, decision in enumerate(decisions.values(), self.n_answers + 1):
             decision.answer, decision.since = f"{self.mark}-{number}".lstrip("-"), self.step
@@ -575,16 +574,29 @@ class Fleet:
             self.action = self.action.clone()
             self.action[0, uav] = torch.tensor(decision.action)
 
-    def acknowledge(self, said: Acknowledgement, now: float) -> str:
-        """Note what a UAV of the fleet does with an answer; returns how far this has come, or ``unknown``."""
+    def acknowledge(self, said: Acknowledgement, now: float, outdated: bool = False) -> str:
+        """Note what a UAV of the fleet does with an answer; returns how far this has come, or ``unknown``.
+
+        An answer that is ``outdated`` has lapsed before it was accepted.
+        """
         uav = self.number_of(said.id)
         self.advance(now)
+        if outdated:
+            self._lapse(uav)
         decision = next((each for each in self.offered[uav] if each.answer == said.answer), None)
         if decision is None:
             return "unknown"
         if decision.acknowledge(said.status, self.clock, self.step):
             self._follow(uav, decision)
         return decision.status
+
+    def outdated(self, said: Acknowledgement) -> bool:
+        """Whether a UAV accepts a flight that is not safe any more."""
+        uav = self.number_of(said.id)
+        offer = self.offer(uav)
+        if offer is None or offer.answer != said.answer or not offer.moves:
+            return False
+        return said.status == ACCEPTED and self.danger(uav) not in (None, offer.reason)
 
     def command(self, command: str, uavs: Sequence[str], now: float) -> None:
         """Let UAVs hold or return until they ``resume``; what they have not accepted yet does not hold."""
@@ -641,14 +653,15 @@ class Fleet:
         kept = {then: i for i, then in stay if then is not None}
         self.pending = [(due, kept[uav], filled) for due, uav, filled in self.pending if uav in kept]
         self.uavs, self.number = uavs, {uav: i for i, uav in enumerate(uavs)}
-        if first is not None:
-            del self.joining[first.id]
-            step = min(self.step_of(first.time), self.step)
-            filled = self.logs[-1].add(first, step, self._detected(first))
-            self.logs[-1].received += 1
         if self.start is not None:
-            self.held = moved(self.held, lambda: filled)
-            self.homes = moved(self.homes, lambda: filled.point)
+            new = []
+            if first is not None:
+                del self.joining[first.id]
+                step = min(self.step_of(first.time), self.step)
+                new = [self.logs[-1].add(first, step, self._detected(first))]
+                self.logs[-1].received += 1
+            self.held = moved(self.held, lambda: new[0])
+            self.homes = moved(self.homes, lambda: new[0].point)
             self.begun = self.step
         elif not self._missing():
             self._begin()
@@ -694,13 +707,11 @@ class Fleet:
     def _shown(self, uav: int) -> tuple[Decision | None, str]:
         """The decision that counts for a UAV, and its state."""
         offer, order = self.offer(uav), self.decision(uav)
-        if offer is not None and (offer.is_live(self.clock) or offer.step == self.step):
-            open_now = offer.is_open(self.clock) and self.rules.acknowledge
-            if offer.status in (OFFERED, ACCEPTED, LANDED):
-                return offer, "bound" if open_now else offer.kind
-        if offer is not None and offer.action is None and not offer.moves and self.clock <= offer.until:
-            if offer.status in (OFFERED, LANDED):
-                return offer, "hold"
+        if offer is not None and offer.status in (OFFERED, ACCEPTED, LANDED):
+            holds = offer.action is None and not offer.moves and self.clock <= offer.until
+            if holds or offer.is_live(self.clock) or offer.step == self.step:
+                follows = offer.is_open(self.clock) and self.rules.acknowledge
+                return offer, "bound" if follows else offer.kind
         if order is None or (self.rules.acknowledge and not order.is_open(self.clock)):
             return None, "none"
         return order, "bound"

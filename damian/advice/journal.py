@@ -82,22 +82,34 @@ class Acknowledged(BaseModel):
 
     received: Time
     acknowledged: list[Acknowledgement]
+    outdated: list[int] = []
+    """Which of them accept what was not safe any more."""
 
 
-class Commanded(BaseModel):
-    """A line about what a person tells UAVs to do."""
+class Command(BaseModel):
+    """What a person tells UAVs to do, all of them if ``uavs`` is not given."""
 
-    received: Time
     command: Literal["hold", "resume", "return"]
-    uavs: list[UavId]
+    uavs: list[UavId] | None = None
 
 
-class Members(BaseModel):
-    """A line about UAVs that join a fleet and leave it."""
+class Commanded(Command):
+    """A line about that."""
 
     received: Time
+
+
+class Change(BaseModel):
+    """UAVs that join with their first reports, and UAVs that leave now."""
+
     join: list[UavId] = []
     leave: list[UavId] = []
+
+
+class Members(Change):
+    """A line about that."""
+
+    received: Time
 
 
 Line = Received | Advised | Acknowledged | Commanded | Members
@@ -125,6 +137,7 @@ class Journal:
             """Where the whole lines end [bytes]."""
             if self.end:
                 with path.open("rb") as file:
+                    whole = 0
                     while self.end and not (whole := _before(file, self.end).rfind(b"\n") + 1):
                         self.end = max(self.end - BLOCK, 0)
                     self.end = max(self.end - BLOCK, 0) + whole if self.end else 0
@@ -147,7 +160,7 @@ class Journal:
         """When the last line was written [s since 1970]; 0 if only the first one is there."""
         with writing(self.path), self.path.open("rb") as file:
             *_, text, _ = [b"", *_before(file, self.end, 2 * MAX_LINE).split(b"\n")]
-        found = re.match(rb'\{"(?:received|asked)":([0-9.e+]+)', text)
+        found = re.search(rb'"(?:received|asked)":([0-9.e+]+)', text)
         return float(found[1]) if found else 0.0
 
 

@@ -5,7 +5,7 @@ Worked timeline, an answer that holds for 10 s: at 100 s the UAV asks and is off
 counts as bound for that landing point. Had nothing come by 110 s, the UAV would still stand where it stood.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,7 +95,7 @@ class Decision:
         return before not in _COUNTED and self.status in _COUNTED
 
 
-def too_close(path: shapely.Geometry, others: Sequence[shapely.Geometry], clearance: float) -> bool:
+def too_close(path: shapely.Geometry, others: Iterable[shapely.Geometry], clearance: float) -> bool:
     """Whether a path comes nearer to others than a distance [m], all of them in local metres."""
     return any(shapely.distance(path, other) < clearance for other in others)
 

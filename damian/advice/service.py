@@ -23,6 +23,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from damian.advice import api
 from damian.advice.clock import Clock
 from damian.advice.fleet import Waiting
+from damian.advice.journal import Change, Command
 from damian.advice.rows import (
     acknowledgements_of,
     as_csv,
@@ -180,16 +181,14 @@ class Service:
     async def command(self, request: Request) -> Response:
         """Hold, resume or return UAVs."""
         name = self._name(request)
-        said = validated(api.Command, parsed_json(await _body(request)))
-        return JSONResponse(
-            {"fleet": name, "uavs": self.session.command(name, said.command, said.uavs, self.clock())}
-        )
+        uavs = self.session.command(name, validated(Command, parsed_json(await _body(request))), self.clock())
+        return JSONResponse({"fleet": name, "uavs": uavs})
 
     async def members(self, request: Request) -> Response:
         """Let UAVs join and leave."""
         name = self._name(request)
-        said = validated(api.Members, parsed_json(await _body(request)))
-        uavs = self.session.change_members(name, said.join, said.leave, self.clock())
+        change = validated(Change, parsed_json(await _body(request)))
+        uavs = self.session.change_members(name, change, self.clock())
         return JSONResponse({"fleet": name, "uavs": uavs})
 
     async def geofence(self, request: Request) -> Response:

@@ -23,6 +23,8 @@ from damian.advice.journal import (
     About,
     Acknowledged,
     Advised,
+    Change,
+    Command,
     Commanded,
     Head,
     Journal,
@@ -194,31 +196,34 @@ class AdviceSession:
 
     def acknowledge(self, name: str, rows: list[Acknowledgement], now: float) -> list[str]:
         """Take acknowledgements, all or none; returns how far the answers have come, or ``unknown``."""
-        fleet = self.fleet(name)
+        fleet, clock = self.fleet(name), max(now, self.fleet(name).clock)
+        fleet.advance(clock)
         for row in rows:
             fleet.number_of(row.id)
             (row.model_extra or {}).clear()
-        clock = max(now, fleet.clock)
-        self._write(name, Acknowledged.model_construct(received=clock, acknowledged=rows))
-        return [fleet.acknowledge(row, clock) for row in rows]
+        outdated = [i for i, row in enumerate(rows) if fleet.start is not None and fleet.outdated(row)]
+        line = Acknowledged.model_construct(received=clock, acknowledged=rows, outdated=outdated)
+        self._write(name, line)
+        return _acknowledged(fleet, line)
 
-    def command(self, name: str, command: Any, uavs: Any, now: float) -> list[str]:
-        """Let UAVs hold, return or resume, all of them if ``uavs`` is None; returns which."""
+    def command(self, name: str, command: Command, now: float) -> list[str]:
+        """Let UAVs hold, return or resume; returns which."""
         fleet = self.fleet(name)
-        chosen = fleet.uavs if uavs is None else uavs
-        told = {"received": max(now, fleet.clock), "command": command, "uavs": chosen}
-        line = validated(Commanded, told)
-        for uav in line.uavs:
-            fleet.number_of(uav)
+        uavs = fleet.uavs if command.uavs is None else command.uavs
+        for uav in uavs:
+            fleet.number_of(uav, "uavs")
+        clock = max(now, fleet.clock)
+        line = Commanded.model_construct(command=command.command, uavs=uavs, received=clock)
         self._write(name, line)
         replay(fleet, line)
-        return line.uavs
+        return uavs
 
-    def change_members(self, name: str, join: Any, leave: Any, now: float) -> list[str]:
+    def change_members(self, name: str, change: Change, now: float) -> list[str]:
         """Let UAVs join with their first reports, and leave now; returns the members from now on."""
         fleet = self.fleet(name)
-        line = validated(Members, {"received": max(now, fleet.clock), "join": join, "leave": leave})
-        fleet.check_change(line.join, line.leave)
+        fleet.check_change(change.join, change.leave)
+        clock = max(now, fleet.clock)
+        line = Members.model_construct(join=change.join, leave=change.leave, received=clock)
         self._write(name, line)
         replay(fleet, line)
         return fleet.uavs
@@ -325,10 +330,9 @@ def replay(fleet: Fleet, line: Line) -> None:
             fleet.check(report)
         _taken(fleet, line.reports)
     elif isinstance(line, Acknowledged):
-        for row in line.acknowledged:
-            fleet.acknowledge(row, line.received)
+        _acknowledged(fleet, line)
     elif isinstance(line, Commanded):
-        fleet.command(line.command, line.uavs, line.received)
+        fleet.command(line.command, line.uavs or [], line.received)
     elif isinstance(line, Members):
         fleet.change_members(line.join, line.leave, line.received)
     elif fleet.start is None:
@@ -356,6 +360,12 @@ def _advised(fleet: Fleet, line: Advised) -> None:
     if not spec.is_in(action):
         raise InputError(f"told: {show(line.told)} are not all actions of these settings")
     fleet.tell(fleet.choice([*chosen], action, hidden, instead))
+
+
+def _acknowledged(fleet: Fleet, line: Acknowledged) -> list[str]:
+    """Give acknowledgements to a fleet."""
+    rows = enumerate(line.acknowledged)
+    return [fleet.acknowledge(row, line.received, i in line.outdated) for i, row in rows]
 
 
 def _taken(fleet: Fleet, reports: Sequence[Report]) -> list[str]:

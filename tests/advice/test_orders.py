@@ -14,9 +14,10 @@ from test_fleet import LLANBEDR, SEEN, scenario_of
 
 from damian import keys
 from damian.advice.fleet import Fleet
+from damian.advice.journal import Change, Command
 from damian.advice.known import UavLog
 from damian.advice.node import Node, for_uavs
-from damian.advice.rows import Acknowledgement, read_json
+from damian.advice.rows import Acknowledgement, read_json, validated
 from damian.advice.session import SNAPSHOT, AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
@@ -77,6 +78,13 @@ class Field:
         self.now += after
         row = Acknowledgement(**{"id": uav, "answer": answer or "", "status": status})
         return self.session.acknowledge("north", [row], self.now)[0]
+
+    def command(self, command: str, uavs: list[str] | None) -> list[str]:
+        said = validated(Command, {"command": command, "uavs": uavs})
+        return self.session.command("north", said, self.now)
+
+    def change(self, join: list[str], leave: list[str]) -> list[str]:
+        return self.session.change_members("north", Change(join=join, leave=leave), self.now)
 
     def booked(self, uav: str) -> int:
         return self.fleet._standing(self.fleet.number[uav], False)
@@ -213,7 +221,11 @@ def test_a_uav_below_its_reserve_never_flies_on(field):
         assert field.ask("A").answer == field.ask("A", 5).answer, "one answer while it holds"
     field.now += 11
     field.report("B", 300, battery=20.0)
-    assert field.ask("B").state == "fly"
+    answer = field.ask("B", 0.1)
+    assert answer.state == "fly"
+    field.now += 0.1
+    field.report("B", 300, battery=19.0)
+    assert field.say("B", answer.answer, "accepted") == "lapsed", "an answer from before"
 
 
 def test_a_battery_that_was_never_reported_is_not_full(tmp_path):
@@ -255,14 +267,14 @@ def test_a_silent_uav_holds_but_in_flight_it_may_be_silent(field):
 
 def test_a_person_holds_resumes_and_returns_uavs(field):
     before = field.ask("A", 1)
-    assert field.session.command("north", "hold", None, field.now) == ["A", "B"]
+    assert field.command("hold", None) == ["A", "B"]
     assert field.say("A", before.answer, "accepted") == "lapsed", "the hold came first"
     assert [(field.ask(uav).state, field.ask(uav).reason) for uav in "AB"] == [("hold", "held")] * 2
-    field.session.command("north", "resume", ["A"], field.now)
+    field.command("resume", ["A"])
     answer = field.ask("A", 1)
     assert (answer.state, field.ask("B").state) == ("fly", "hold")
     field.say("A", answer.answer, "accepted")
-    field.session.command("north", "return", ["A"], field.now)
+    field.command("return", ["A"])
     recalled = field.ask("A", 2)
     home = field.fleet.ground.place(200)
     assert (recalled.state, (recalled.lat, recalled.lon), recalled.heading) == ("return", home, None)
@@ -276,20 +288,20 @@ def test_a_person_holds_resumes_and_returns_uavs(field):
     field.report("A", 200)
     assert (field.ask("A", 1).state, field.ask("A").reason) == ("hold", "home")
     with pytest.raises(InputError, match="command: 'dance': Input should be 'hold', 'resume' or 'return'"):
-        field.session.command("north", "dance", None, field.now)
+        field.command("dance", None)
 
 
 def test_uavs_join_with_their_first_reports_and_leave(field):
     levels = {}
     answer = field.ask("B", 1)
     field.say("B", answer.answer, "accepted")
-    assert field.session.change_members("north", ["C"], [], field.now) == ["A", "B"]
+    assert field.change(["C"], []) == ["A", "B"]
     assert field.ask("A").state == "fly", "nobody waits for C"
     levels = dict(zip(field.fleet.uavs, field.fleet.levels, strict=True))
     assert field.report("C", 100) == ["new"]
     assert field.fleet.uavs == ["A", "B", "C"]
     assert (field.ask("C", 1).state, field.ask("C").altitude) == ("fly", 30.0)
-    assert field.session.change_members("north", [], ["A"], field.now) == ["B", "C"]
+    assert field.change([], ["A"]) == ["B", "C"]
     assert field.booked("B") == east_of(field, 300), "it is still on its way"
     assert (field.ask("B").state, field.fleet.levels) == ("bound", [levels["B"], 30.0])
     for join, leave, problem in (
@@ -298,7 +310,7 @@ def test_uavs_join_with_their_first_reports_and_leave(field):
         ([], ["B", "C"], "uavs: a fleet has 1 to 100 UAVs"),
     ):
         with pytest.raises(InputError, match=problem):
-            field.session.change_members("north", join, leave, field.now)
+            field.change(join, leave)
     with pytest.raises(InputError, match="ID: 'A' is no UAV"):
         field.report("A", 200)
 
@@ -348,11 +360,11 @@ def test_whatever_happens_nothing_is_unsafe_and_a_restart_remembers_it_all(tmp_p
                 field.say(sender, answer, said)
         elif kind < 0.97:
             command = draw.choice(["hold", "resume", "resume", "return"])
-            field.session.command("north", command, draw.choice([None, [uav]]), field.now)
+            field.command(command, draw.choice([None, [uav]]))
         elif "D" in uavs:
-            field.session.change_members("north", [], ["D"], field.now)
+            field.change([], ["D"])
         elif "D" not in field.fleet.joining:
-            field.session.change_members("north", ["D"], [], field.now)
+            field.change(["D"], [])
         else:
             field.report("D", draw.randrange(400))
         check_apart(field.fleet)
