@@ -403,17 +403,15 @@ class Fleet:
             return "battery"
         if self._is_nowhere(uav):
             return "aborted"
-        if order is not None and flies and self.rules.acknowledge:
-            if self.clock > order.expires and newest.report.time <= order.time:
-                return "lost"
+        late = order is not None and flies and self.rules.acknowledge and self.clock > order.expires
+        if late and newest.report.time <= cast(Decision, order).time:
+            return "lost"
         return {"hold": "held", "return": "returning", "": None}[self.commands[uav]]
 
     def _is_nowhere(self, uav: int) -> bool:
         """Whether a UAV has aborted a flight, and has not reported since where it is."""
-        order, newest = self.decision(uav), self.logs[uav].newest
-        return (
-            order is not None and order.status == ABORTED and cast(FilledReport, newest).step <= order.since
-        )
+        order, newest = self.decision(uav), cast(FilledReport, self.logs[uav].newest)
+        return order is not None and order.status == ABORTED and newest.step <= order.since
 
     def _flight(self, uav: int, origin: int, goal: int) -> tuple[float, float]:
         """Expected duration of a flight [s], and the battery that it takes [%]."""
@@ -461,10 +459,10 @@ class Fleet:
         booked = {self._standing(uav, False)}
         if offer is not None and offer.is_live(self.clock):
             booked.add(offer.goal)
-        if order is not None and self.rules.acknowledge:
-            if self._is_nowhere(uav) or (order.status == ACCEPTED and order.is_open(self.clock)):
-                booked |= {order.origin, order.goal}
-        return booked
+        if order is None or not self.rules.acknowledge:
+            return booked
+        leaves = order.status == ACCEPTED and order.is_open(self.clock)
+        return booked | {order.origin, order.goal} if leaves or self._is_nowhere(uav) else booked
 
     def _path(self, decision: Decision) -> shapely.LineString:
         return shapely.LineString(self.ground.points[[decision.origin, decision.goal]])

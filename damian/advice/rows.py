@@ -63,6 +63,11 @@ UavId: TypeAlias = Annotated[str, Field(pattern=r"^\w[\w .:/-]{0,63}$")]
 """ID of a UAV; it begins with a letter, digit or ``_``, so that no spreadsheet takes it for a formula."""
 
 
+def _no_default(schema: dict[str, Any]) -> None:
+    """Leave a default out of a JSON schema, which has no NaN."""
+    del schema["default"]
+
+
 class Row(BaseModel):
     """A row of a table: the names of its fields, with a space for ``_``, are the columns.
 
@@ -101,11 +106,11 @@ class Report(Row):
     """What a UAV reports; None where it does not say. Journals keep the columns of tables."""
 
     id: UavId
-    received: Time = Field(math.nan, alias="receive time", exclude=True)
+    received: Time = Field(math.nan, alias="receive time", exclude=True, json_schema_extra=_no_default)
     """When it came in [s]; a column of files only."""
     aoi: Annotated[Number, Field(ge=0, le=LATEST)] = Field(0.0, exclude=True)
     """Age of the observation when it came in [s], if there is no time."""
-    time: Time = math.nan
+    time: Time = Field(math.nan, json_schema_extra=_no_default)
     """When the observation was generated [s]."""
     lat: Latitude | None = None
     lon: Longitude | None = None
