@@ -1,4 +1,4 @@
-"""The service stays up: clocks that jump, no handles, a full disk, kill -9, nonsense; the documented client."""
+"""The service stays up: clocks that jump, no handles, a full disk, kill -9, nonsense; the documents' client."""
 
 import asyncio
 import errno
