@@ -705,7 +705,8 @@ class Fleet:
     def _shown(self, uav: int) -> tuple[Decision | None, str]:
         """The decision that counts for a UAV, and its state."""
         offer, order = self.offer(uav), self.decision(uav)
-        if offer is not None and offer.status in (OFFERED, ACCEPTED, LANDED):
+        over = offer is not None and offer.status == LANDED and offer.moves
+        if offer is not None and offer.status in (OFFERED, ACCEPTED, LANDED) and not over:
             holds = offer.action is None and not offer.moves and self.clock <= offer.until
             if holds or offer.is_live(self.clock) or offer.step == self.step:
                 follows = offer.is_open(self.clock) and self.rules.acknowledge

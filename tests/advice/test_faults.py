@@ -288,11 +288,12 @@ def test_the_client_of_the_document_flies(tmp_path):
     (text,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     program = Program(tmp_path, "motion=polynomial")
     text = text.replace(":8000", f":{program.port}").replace("3hR5...", TOKEN)
-    text = re.sub(r"time\.sleep\(.*\)", "pass", text)
+    text = re.sub(r"time\.sleep\(.*\)", "time.sleep(0.1)", text)
     command = [sys.executable, "-c", text]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     status = program.ask("GET", "/fleets/north")[1]["uavs"][0]
     program.stop()
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("landed at") == 3
-    assert (status["order"], status["reports"]) == ("landed", 3)
+    assert status["order"] == "landed"
+    assert status["reports"] >= 3

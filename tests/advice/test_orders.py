@@ -150,6 +150,8 @@ def test_whoever_has_landed_or_reports_to_be_there_chooses_again(field):
         assert field.ask("A", answer.duration).state == "bound"
         if says_so:
             assert field.say("A", answer.answer, "landed") == "landed"
+            assert field.ask("A").state == "fly", "a new answer"
+            assert field.ask("A").answer != answer.answer
         else:
             field.report("A", east_of(field, here))
         assert field.booked("A") == east_of(field, here)
