@@ -147,7 +147,9 @@ def test_whoever_has_landed_or_reports_to_be_there_chooses_again(field):
     for says_so in (True, False):
         answer, here = field.ask("A", 1), field.booked("A")
         field.say("A", answer.answer, "accepted")
-        assert field.ask("A", answer.duration).state == "bound"
+        field.now += 1
+        field.report("A", here)
+        assert field.ask("A", answer.duration).state == "bound", "it had not taken off when it reported"
         if says_so:
             assert field.say("A", answer.answer, "landed") == "landed"
             assert field.ask("A").state == "fly", "a new answer"
@@ -265,6 +267,28 @@ def test_a_silent_uav_holds_but_in_flight_it_may_be_silent(field):
     assert (field.ask("B").state, field.ask("B").reason) == ("hold", "silent")
     field.report("B", 300)
     assert field.ask("B").state == "fly", "it is heard again"
+
+
+def test_a_flight_that_is_long_over_without_a_word_ends_in_a_hold(tmp_path):
+    field = Field(tmp_path, uavs="A", oldest_report=1000.0)
+    field.report("A", 200)
+    answer = field.ask("A", 1)
+    field.say("A", answer.answer, "accepted")
+    assert field.ask("A", 2 * answer.duration + 59).state == "bound"
+    assert (field.ask("A", 3).state, field.ask("A").reason) == ("hold", "lost")
+    field.report("A", 205)
+    assert field.ask("A").state == "fly"
+
+
+def test_a_report_from_before_all_that_is_kept_changes_nothing(field):
+    for _ in range(40):
+        field.now += 5
+        field.report("A", 200, battery=None)
+    kept = len(field.fleet.logs[0].reports)
+    assert 16 <= kept < 20
+    assert field.report("A", 300, time=START + 1, battery=5.0) == ["old"]
+    assert field.report("A", 205, time=field.now - 12, battery=None) == ["late"]
+    assert field.fleet.logs[0].newest.battery == 90.0
 
 
 def test_a_person_holds_resumes_and_returns_uavs(field):
