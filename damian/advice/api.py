@@ -1,80 +1,45 @@
 """Requests and answers of the service as pydantic models, and their description as OpenAPI 3.1."""
 
 from html import escape
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-from pydantic import BaseModel
+from pydantic import BaseModel, create_model
 from pydantic.json_schema import models_json_schema
 
 from damian.advice.journal import Change, Command
 from damian.advice.rows import Acknowledgement, Advice, FleetStatus, Report
 
-
-class NewFleet(BaseModel):
-    """UAVs of a fleet to create or find."""
-
-    uavs: list[str]
-
-
-class Fleet(BaseModel):
-    """A fleet and its UAVs."""
-
-    fleet: str
-    uavs: list[str]
-
-
-class Fleets(BaseModel):
-    """Names of all fleets."""
-
-    fleets: list[str]
-
-
-class Taken(BaseModel):
-    """What became of reports: ``new``, ``late``, ``duplicate`` or ``old``, and columns not understood."""
-
-    accepted: int
-    found: list[str]
-    ignored: list[str] = []
-
-
-class Acknowledged(BaseModel):
-    """How far each answer has come; ``unknown`` if there is no such answer to this UAV."""
-
-    status: list[str]
-
-
-class Answers(BaseModel):
-    """What the UAVs are told."""
-
-    fleet: str
-    advice: list[Advice]
-
-
-class ServiceTime(BaseModel):
-    """The time of the service, which UAVs can set their clocks by."""
-
-    time: float
-    """Seconds since 1970."""
-    written: str | float
-    system_ahead: float
-    """How far the system clock is ahead [s]."""
-    jumps: int
-    """How many times the system clock has jumped."""
-
-
-class Health(BaseModel):
-    """Whether the service can keep what it acknowledges."""
-
-    status: Literal["ok", "failing"]
-    problem: str | None
-    fleets: int
-    version: str
-
-
-class Error(BaseModel):
-    """Why a request was refused, in one line."""
-
-    error: str
+NewFleet = create_model("NewFleet", uavs=(list[str], ...), __doc__="UAVs of a fleet to create or find.")
+Fleet = create_model("Fleet", fleet=(str, ...), uavs=(list[str], ...))
+Fleets = create_model("Fleets", fleets=(list[str], ...))
+Answers = create_model("Answers", fleet=(str, ...), advice=(list[Advice], ...))
+Error = create_model("Error", error=(str, ...), __doc__="Why a request was refused, in one line.")
+_MEANS = "New, late, duplicate or old, for each report; and columns that are not understood."
+Taken = create_model(
+    "Taken", accepted=(int, ...), found=(list[str], ...), ignored=(list[str], []), __doc__=_MEANS
+)
+_MEANS = "How far each answer has come; unknown if there is no such answer to this UAV."
+Acknowledged = create_model("Acknowledged", status=(list[str], ...), __doc__=_MEANS)
+_MEANS = (
+    "Seconds since 1970, also as text; how far the system clock is ahead [s], and how often it has jumped."
+)
+ServiceTime = create_model(
+    "ServiceTime",
+    time=(float, ...),
+    written=(str | float, ...),
+    system_ahead=(float, ...),
+    jumps=(int, ...),
+    __doc__=_MEANS,
+)
+_MEANS = "Whether the service is ok or failing to write journals, and why."
+Health = create_model(
+    "Health",
+    status=(str, ...),
+    problem=(str | None, ...),
+    fleets=(int, ...),
+    version=(str, ...),
+    __doc__=_MEANS,
+)
 
 
 class Endpoint(NamedTuple):

@@ -26,8 +26,6 @@ from damian.advice.orders import (
     TAKEN_OFF,
     TOLD,
     Decision,
-    level_for_another,
-    too_close,
 )
 from damian.advice.rows import Acknowledgement, Advice, FleetStatus, Report, UavStatus, written
 from damian.common.checks import SECONDS
@@ -100,7 +98,7 @@ class Fleet:
         self.levels: list[float] = []
         """Flight level of each UAV [m]."""
         for _ in self.uavs:
-            self.levels.append(level_for_another(self.rules.levels, self.levels))
+            self.levels.append(self._free_level(self.levels))
         self.homes: list[int] = []
         """Landing point of the first report of each UAV, to which it returns; empty until all have one."""
         self.commands = [""] * len(self.uavs)
@@ -134,6 +132,10 @@ class Fleet:
         n_readings = sum(each.width for each in self.node.simulation.sensors.values())
         kept = 2 * max(self.node.law_longest, REMEMBERED_STEPS)
         return UavLog(self.ground, self.node.server.observation.window, n_readings, kept)
+
+    def _free_level(self, used: Sequence[float]) -> float:
+        """The lowest of the flight levels [m] that the fewest UAVs use."""
+        return min(self.rules.levels, key=lambda level: (used.count(level), level))
 
     def _forget_history(self) -> None:
         """Begin the hidden states and the choices anew."""
@@ -480,9 +482,12 @@ class Fleet:
             if not decision.moves:
                 continue
             reason, others, level = None, [*self._others(uav)], self.levels[uav]
-            at_level = [flights[each] for each in others if each in flights and self.levels[each] == level]
-            taken = any(decision.goal in booked[other] for other in others)
-            if taken or too_close(self._path(decision), map(self._path, at_level), self.rules.clearance):
+            near = [
+                shapely.distance(self._path(flights[other]), self._path(decision)) < self.rules.clearance
+                for other in others
+                if other in flights and self.levels[other] == level
+            ]
+            if any(near) or any(decision.goal in booked[other] for other in others):
                 reason = "conflict"
             elif decision.action is not None and self.node.scenario.battery.enabled:
                 left = cast(FilledReport, self.logs[uav].newest).battery
@@ -647,7 +652,7 @@ class Fleet:
         self.told = moved(self.told, list)
         self.commands = moved(self.commands, str)
         used = [self.levels[then] for _, then in stay if then is not None]
-        self.levels = moved(self.levels, lambda: level_for_another(self.rules.levels, used))
+        self.levels = moved(self.levels, lambda: self._free_level(used))
         kept = {then: i for i, then in stay if then is not None}
         self.pending = [(due, kept[uav], filled) for due, uav, filled in self.pending if uav in kept]
         self.uavs, self.number = uavs, {uav: i for i, uav in enumerate(uavs)}

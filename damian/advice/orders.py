@@ -5,11 +5,8 @@ Worked timeline, an answer that holds for 10 s: at 100 s the UAV asks and is off
 counts as bound for that landing point. Had nothing come by 110 s, the UAV would still stand where it stood.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
-
-import shapely
 
 GRACE = 60.0
 """A landing point stays booked for so long after a late arrival [s], unless the UAV reports to be there."""
@@ -93,13 +90,3 @@ class Decision:
         elif said == LANDED and before in (OFFERED, LAPSED, ACCEPTED, TAKEN_OFF):
             self.status, self.since = LANDED, step
         return before not in _COUNTED and self.status in _COUNTED
-
-
-def too_close(path: shapely.Geometry, others: Iterable[shapely.Geometry], clearance: float) -> bool:
-    """Whether a path comes nearer to others than a distance [m], all of them in local metres."""
-    return any(shapely.distance(path, other) < clearance for other in others)
-
-
-def level_for_another(levels: list[float], used: list[float]) -> float:
-    """The lowest of the flight levels [m] that the fewest UAVs use."""
-    return min(levels, key=lambda level: (used.count(level), level))

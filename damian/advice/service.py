@@ -144,16 +144,15 @@ class Service:
     async def health(self, _: Request) -> Response:
         """Whether the journals can be written."""
         problem, n_fleets = self.session.problem, len(self.session.names)
-        status = "failing" if problem else "ok"
-        said = api.Health(status=status, problem=problem, fleets=n_fleets, version=self.version)
-        return JSONResponse(said.model_dump(), 503 if problem else 200)
+        said = {"status": "failing" if problem else "ok", "problem": problem, "fleets": n_fleets}
+        return JSONResponse({**said, "version": self.version}, 503 if problem else 200)
 
     async def time(self, _: Request) -> Response:
         """The time of the service."""
         now, clock = self.clock(), self.clock
         ahead, jumps = (clock.ahead, clock.jumps) if isinstance(clock, Clock) else (0.0, 0)
-        said = api.ServiceTime(time=now, written=written(now), system_ahead=round(ahead, 3), jumps=jumps)
-        return JSONResponse(said.model_dump())
+        said = {"time": now, "written": written(now), "system_ahead": round(ahead, 3), "jumps": jumps}
+        return JSONResponse(said)
 
     # Fleets.
 
