@@ -15,31 +15,21 @@ Fleets = create_model("Fleets", fleets=(list[str], ...))
 Answers = create_model("Answers", fleet=(str, ...), advice=(list[Advice], ...))
 Error = create_model("Error", error=(str, ...), __doc__="Why a request was refused, in one line.")
 _MEANS = "New, late, duplicate or old, for each report; and columns that are not understood."
-Taken = create_model(
-    "Taken", accepted=(int, ...), found=(list[str], ...), ignored=(list[str], []), __doc__=_MEANS
-)
+_PARTS: Any = {"accepted": (int, ...), "found": (list[str], ...), "ignored": (list[str], [])}
+Taken = create_model("Taken", **_PARTS, __doc__=_MEANS)
 _MEANS = "How far each answer has come; unknown if there is no such answer to this UAV."
 Acknowledged = create_model("Acknowledged", status=(list[str], ...), __doc__=_MEANS)
-_MEANS = (
-    "Seconds since 1970, also as text; how far the system clock is ahead [s], and how often it has jumped."
-)
-ServiceTime = create_model(
-    "ServiceTime",
-    time=(float, ...),
-    written=(str | float, ...),
-    system_ahead=(float, ...),
-    jumps=(int, ...),
-    __doc__=_MEANS,
-)
+_MEANS = "Seconds since 1970, also as text; how far the system clock is ahead [s], how often it has jumped."
+_PARTS = {
+    "time": (float, ...),
+    "written": (str | float, ...),
+    "system_ahead": (float, ...),
+    "jumps": (int, ...),
+}
+ServiceTime = create_model("ServiceTime", **_PARTS, __doc__=_MEANS)
 _MEANS = "Whether the service is ok or failing to write journals, and why."
-Health = create_model(
-    "Health",
-    status=(str, ...),
-    problem=(str | None, ...),
-    fleets=(int, ...),
-    version=(str, ...),
-    __doc__=_MEANS,
-)
+_PARTS = {"status": (str, ...), "problem": (str | None, ...), "fleets": (int, ...), "version": (str, ...)}
+Health = create_model("Health", **_PARTS, __doc__=_MEANS)
 
 
 class Endpoint(NamedTuple):

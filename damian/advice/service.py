@@ -240,8 +240,8 @@ class Service:
         quiet = 0.0
         while name in self.session.names:
             with contextlib.suppress(Waiting, RunError):
-                self.session.advise(name, self.clock())
-                rows = as_rows(self.session.told(name, uavs))
+                rows = as_rows(self.session.advise(name, self.clock()))
+                rows = [row for row in rows if uavs is None or row["ID"] in uavs]
                 new = [row for row in rows if last.get(row["ID"]) != (row["answer"], row["state"])]
                 last |= {row["ID"]: (row["answer"], row["state"]) for row in new}
                 for row in new:

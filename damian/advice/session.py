@@ -189,11 +189,6 @@ class AdviceSession:
             fleet.tell(choice)
         return fleet.advice(fleet.numbers_of(asking) if only else None)
 
-    def told(self, name: str, uavs: Sequence[str] | None) -> list[Advice]:
-        """What UAVs, or all, were told last; the fleet has begun."""
-        fleet = self.fleet(name)
-        return fleet.advice(fleet.numbers_of(uavs))
-
     def acknowledge(self, name: str, rows: list[Acknowledgement], now: float) -> list[str]:
         """Take acknowledgements, all or none; returns how far the answers have come, or ``unknown``."""
         fleet, clock = self.fleet(name), max(now, self.fleet(name).clock)

@@ -175,9 +175,7 @@ def fly_an_hour(folder: Path, words: Sequence[str], n_fleets: int) -> None:
     journal, snapshot = folder / "f10000.jsonl", folder / "f10000.snapshot"
     text = journal.read_text()
     sizes = [each.stat().st_size / 1e6 for each in (journal, snapshot)]
-    print(
-        "a journal has {1} lines and {0[0]:.2f} MB, a snapshot {0[1]:.2f} MB".format(sizes, text.count("\n"))
-    )
+    print(f"a journal has {sizes[0]:.2f} MB and", text.count("\n"), f"lines, a snapshot {sizes[1]:.2f} MB")
     for fleet in range(10_001, 10_000 + n_fleets):
         (folder / f"f{fleet}.jsonl").write_text(text.replace("f10000", f"f{fleet}", 1))
         (folder / f"f{fleet}.snapshot").write_bytes(snapshot.read_bytes())

@@ -1,4 +1,4 @@
-"""The service stays up: clocks that jump, no handles, a full disk, kill -9, nonsense; the documents' client."""
+"""The service stays up: clocks that jump, no handles, a full disk, kill -9, nonsense; a client to copy."""
 
 import asyncio
 import errno
