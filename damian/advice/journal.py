@@ -159,7 +159,11 @@ class Journal:
     def last_time(self) -> float:
         """When the last line was written [s since 1970]; 0 if only the first one is there."""
         with writing(self.path), self.path.open("rb") as file:
-            *_, text, _ = [b"", *_before(file, self.end, 2 * MAX_LINE).split(b"\n")]
+            text = b""
+            for most in (BLOCK, 2 * MAX_LINE):
+                *_, before, text, _ = [b"", b"", *_before(file, self.end, most).split(b"\n")]
+                if before:  # the line is whole
+                    break
         found = re.search(rb'"(?:received|asked)":([0-9.e+]+)', text)
         return float(found[1]) if found else 0.0
 

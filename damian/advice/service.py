@@ -89,8 +89,11 @@ async def _tick(session: AdviceSession, clock: Callable[[], float]) -> None:
     while True:
         if isinstance(clock, Clock):
             clock.watch()
-        for _ in session.upkeep(clock):
-            await asyncio.sleep(0)
+        try:
+            for _ in session.upkeep(clock):
+                await asyncio.sleep(0)
+        except Exception:  # of one fleet: the others go on
+            logging.getLogger("damian.advice").exception("a fleet could not be brought up to date")
         await asyncio.sleep(TICK)
 
 

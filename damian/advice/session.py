@@ -97,6 +97,8 @@ class AdviceSession:
         self.problem: str | None = None
         """Why a journal could not be written at last; None if it could."""
         self._journals: dict[str, Journal] = {}
+        self._unreadable: set[str] = set()
+        """Fleets that could not be restored."""
         self._unsaved: dict[str, int] = {}
         """Lines of journals since the latest snapshots."""
         self._at_close = ExitStack()
@@ -130,6 +132,7 @@ class AdviceSession:
             try:
                 self.fleets[name] = self._restored(self._journals[name])
             except InputError as error:  # its journal is damaged: the request is not wrong
+                self._unreadable.add(name)
                 raise RunError(str(error)) from None
         return self.fleets[name]
 
@@ -150,13 +153,15 @@ class AdviceSession:
 
     def end(self, name: str, now: float) -> None:
         """End a fleet; its journal stays, under another name."""
-        self.fleet(name)
+        if name not in self.names:
+            raise NoFleet(f"fleet: there is no fleet {show(name)}")
         if journal := self._journals.get(name):
             with writing(journal.path):
                 journal.path.rename(journal.path.with_suffix(f".{now:.3f}.ended"))
                 journal.path.with_suffix(SNAPSHOT).unlink(missing_ok=True)
             del self._journals[name]
-        del self.fleets[name]
+        self.fleets.pop(name, None)
+        self._unsaved.pop(name, None)
 
     def report(self, name: str, rows: Rows, now: float, file: bool = False) -> list[str]:
         """Take reports, all or none, and write them to the journal; returns what ``Fleet.report`` found."""
@@ -232,7 +237,7 @@ class AdviceSession:
         """Bring fleets up to date, one after the other; snapshots take a part of the time only."""
         spent = 0.0
         for name in self.names:
-            if name in self.fleets or name in self._journals:
+            if name in self.fleets or name in {*self._journals} - self._unreadable:
                 with suppress(RunError):  # a request says so; the other fleets go on
                     if self.fleet(name).changes_by_itself:  # another one skips quiet steps when it is asked
                         self.fleet(name).advance(clock())
@@ -299,9 +304,7 @@ class AdviceSession:
                 if stored["mark"] == (damian.__version__, head.mark) and stored["end"] <= journal.end:
                     fleet.restore(stored["state"])
                     end = stored["end"]
-            except (
-                Exception
-            ) as error:  # of a machine that stopped while it was written: the journal has it all
+            except Exception as error:  # a machine stopped while it was written; the journal has it all
                 _LOG.warning("%s: it is not read: %s", path, described(error))
                 fleet = self.make(head.uavs, head.mark)
         n_lines = 0
@@ -407,7 +410,8 @@ def read_inbox(session: AdviceSession, name: str, folder: Path, now: float) -> b
         end = DONE
         try:
             rows = rows_of_file(path)
-            if {"answer", "Answer"} & {*(rows[0][1] if rows and isinstance(rows[0][1], dict) else ())}:
+            first = rows[0][1] if rows and isinstance(rows[0][1], dict) else {}
+            if any(name.strip().lower() == "answer" for name in first):
                 session.acknowledge(name, acknowledgements_of(rows), now)
             else:
                 session.report(name, reports_of(rows), now)

@@ -17,6 +17,7 @@ from damian.advice.fleet import Fleet
 from damian.advice.journal import Change, Command
 from damian.advice.known import UavLog
 from damian.advice.node import Node, for_uavs
+from damian.advice.playback import episode_of
 from damian.advice.rows import Acknowledgement, read_json, validated
 from damian.advice.session import SNAPSHOT, AdviceSession
 from damian.baselines.greedy import greedy_policy
@@ -355,7 +356,7 @@ def same(one: Any, other: Any) -> bool:
 
 @pytest.mark.sample(3)
 @pytest.mark.parametrize("seed", range(12))
-def test_whatever_happens_nothing_is_unsafe_and_a_restart_remembers_it_all(tmp_path, seed):
+def test_whatever_happens_nothing_is_unsafe_and_a_restart_remembers_it_all(tmp_path, seed, caplog):
     """Reports and answers get lost or come late, clocks stand still, people hold and send home."""
     draw = random.Random(seed)
     few_levels = {"highest_level": 20.0} if seed % 2 else {}
@@ -401,13 +402,18 @@ def test_whatever_happens_nothing_is_unsafe_and_a_restart_remembers_it_all(tmp_p
     assert {"north.jsonl", f"north{SNAPSHOT}"} <= names
     field.session._unsaved.clear()  # as if it was killed
     field.session.close()
-    for _ in range(2):  # from the snapshot, and from the whole journal
+    for turn in range(2):  # from the snapshot, and from the whole journal
         field.session = field.open()
         field.fleet.advance(field.now)
         assert same(field.fleet.state(), state)
         field.session._unsaved.clear()
         field.session.close()
+        assert ("it is not read" in caplog.text) == (turn == 1), "the snapshot is used, if it is good"
         (tmp_path / f"north{SNAPSHOT}").write_bytes(b"damaged")
+    episode = episode_of(tmp_path / "north.jsonl", field.make([*"ABC"], state["mark"]), {})
+    assert episode.names[:3] == [*"ABC"]
+    assert episode.n_agents == 3 + ("D" in episode.names)
+    assert len({*map(len, (episode.believed, episode.age, episode.reward, episode.true, episode.sent))}) == 1
 
 
 def check_apart(fleet: Fleet) -> None:

@@ -134,6 +134,11 @@ def test_tables_in_a_folder_are_answered_and_wrong_ones_put_aside(inbox, tmp_pat
     assert names == {"1.csv.done", "2.csv.done", ".hidden.csv", "advice.csv", "advice.json", *refused}
     assert "line 2: ID: 'Z' is no UAV" in (inbox / "3.csv.refused.txt").read_text()
     assert [row["ID"] for row in json.loads((inbox / "advice.json").read_text())] == ["A", "B", "C"]
+    answers = json.loads((inbox / "advice.json").read_text())
+    said = [f"{each['ID']},{each['answer']},accepted" for each in answers if each["answer"]]
+    (inbox / "5.csv").write_text("\n".join(["ID,Answer,status", *said]))
+    assert read_inbox(session, "main", inbox, 1e9 + 10.5)
+    assert [row["state"] for row in json.loads((inbox / "advice.json").read_text())] == ["bound"] * 3
     assert not read_inbox(session, "main", inbox, 1e9 + 11)
     session.close()
     again = session_of(tmp_path / "journals").fleet("main")
