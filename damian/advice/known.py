@@ -115,6 +115,17 @@ class FilledReport:
     readings: tuple[float, ...] = ()
     """Readings of sensors of your own."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        said = self.report.model_dump_json(by_alias=True, exclude_none=True)
+        return stored_report, (said, self.report.received, *list(vars(self).values())[1:])
+
+
+def stored_report(said: str, received: float, *others: Any) -> FilledReport:
+    """A filled report from a snapshot."""
+    report = Report.model_validate_json(said)
+    report.received = received
+    return FilledReport(report, *others)
+
 
 class UavLog:
     """The reports of one UAV."""

@@ -34,7 +34,7 @@ from damian.advice.journal import (
     read_head,
     read_lines,
 )
-from damian.advice.known import FilledReport, UavLog
+from damian.advice.known import UavLog, stored_report
 from damian.advice.orders import Decision
 from damian.advice.rows import (
     Acknowledgement,
@@ -65,10 +65,10 @@ lie, those that are compared apart, and those on which no advice depends."""
 
 SNAPSHOT = ".snapshot"
 """End of the name of the file with what a fleet knows, beside its journal."""
-SNAPSHOT_LINES, SNAPSHOT_TIME = 50, 0.1
-"""Lines of a journal after which a fleet is stored anew; time for this in each round [s]."""
-STORED = [Decision, FilledReport, Report, UavLog]
-"""Classes of which snapshots are made, beside tensors and plain values; nothing else is read from them."""
+SNAPSHOT_LINES, SNAPSHOT_PERIOD, SNAPSHOT_TIME = 50, 30.0, 0.1
+"""Lines of a journal and time [s] after which a fleet is stored anew; time for this in each round [s]."""
+STORED = [Decision, UavLog, stored_report]
+"""Of what snapshots are made, beside tensors and plain values; nothing else is read from them."""
 _LOG = logging.getLogger("damian.advice")
 
 
@@ -101,6 +101,8 @@ class AdviceSession:
         """Fleets that could not be restored."""
         self._unsaved: dict[str, int] = {}
         """Lines of journals since the latest snapshots."""
+        self._saved: dict[str, float] = {}
+        """When these were made [s]."""
         self._at_close = ExitStack()
         if folder is None:
             return
@@ -241,10 +243,12 @@ class AdviceSession:
                 with suppress(RunError):  # a request says so; the other fleets go on
                     if self.fleet(name).changes_by_itself:  # another one skips quiet steps when it is asked
                         self.fleet(name).advance(clock())
-                    if self._unsaved.get(name, 0) >= SNAPSHOT_LINES and spent < SNAPSHOT_TIME:
-                        began = clock()
+                    began = clock()
+                    due = began >= self._saved.get(name, 0.0) + SNAPSHOT_PERIOD and spent < SNAPSHOT_TIME
+                    if due and self._unsaved.get(name, 0) >= SNAPSHOT_LINES:
                         self._save(name)
-                        spent += clock() - began
+                        self._saved[name] = clock()
+                        spent += self._saved[name] - began
                 yield
 
     def close(self) -> None:
