@@ -6,6 +6,7 @@ fleets there are. Only the time, the health and the description of the service n
 
 import asyncio
 import contextlib
+import gc
 import hmac
 import json
 import logging
@@ -86,9 +87,13 @@ def make_app(
 
 async def _tick(session: AdviceSession, clock: Callable[[], float]) -> None:
     """Let the fleets take their steps, one fleet at a time, so that requests come in between."""
+    n_frozen = 0
     while True:
         if isinstance(clock, Clock):
             clock.watch()
+        if len(session.fleets) > n_frozen:  # or every full collection of garbage looks through all of them
+            n_frozen = len(session.fleets)
+            gc.freeze()
         try:
             for _ in session.upkeep(clock):
                 await asyncio.sleep(0)

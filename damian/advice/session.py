@@ -238,8 +238,8 @@ class AdviceSession:
     def upkeep(self, clock: Callable[[], float]) -> Iterator[None]:
         """Bring fleets up to date, one after the other; snapshots take a part of the time only."""
         spent = 0.0
-        for name in self.names:
-            if name in self.fleets or name in {*self._journals} - self._unreadable:
+        for name in [name for name in self.names if name not in self._unreadable]:
+            if name in self.fleets or name in self._journals:
                 with suppress(RunError):  # a request says so; the other fleets go on
                     if self.fleet(name).changes_by_itself:  # another one skips quiet steps when it is asked
                         self.fleet(name).advance(clock())
