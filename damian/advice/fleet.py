@@ -435,7 +435,9 @@ class Fleet:
         """What a UAV in danger is told: to return if it is sent home or can still get there, else to hold."""
         if reason == "returning":
             return "return"
-        if reason != "battery" or not self.node.scenario.battery.enabled:
+        order, modelled = self.decision(uav), self.node.scenario.battery.enabled
+        in_flight = order is not None and order.is_open(self.clock)  # nobody knows how far it is
+        if reason != "battery" or self.commands[uav] == "hold" or in_flight or not modelled:
             return "hold"
         needed = self._flight(uav, self._standing(uav, True), self._home(uav))[1]
         return "return" if needed <= cast(FilledReport, self.logs[uav].newest).battery else "hold"

@@ -257,6 +257,11 @@ def test_a_uav_returns_on_its_reserve_if_it_reaches_home_and_no_flight_ends_belo
         answer = field.ask("A")
         assert (answer.state, answer.reason) == told
         assert (answer.lat is None) == (told[0] == "hold")
+    field.now += 11
+    field.report("A", there, battery=drain + 1)
+    assert field.ask("A").state == "return"
+    field.command("hold", ["A"])
+    assert field.ask("A", 11).state == "hold", "a person wants it so"
 
 
 def test_a_silent_uav_holds_but_in_flight_it_may_be_silent(field):
