@@ -6,6 +6,7 @@ damian advise checkpoint=runs/first port=8000 journal=journals   (several fleets
 
 import copy
 import gc
+import logging
 import os
 import secrets
 import socket
@@ -17,6 +18,8 @@ from pathlib import Path
 
 from tensordict.nn import TensorDictModuleBase
 
+import damian
+from damian.advice.clock import Clock
 from damian.advice.fitting import fit, read_log, summary, trace_rows
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.node import Node, for_uavs, scenario_of_service
@@ -28,12 +31,18 @@ from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.runs.run_lock import locked
 from damian.settings.programs import AdviseConfig, check_token
+from damian.world.vehicles import MOTION_MODELS
 
 from . import cli
 from .evaluate import stored_actor
 from .known import key_of
-from .shared.runs import save_config
+from .shared.runs import run_folder, save_config, stored_config
 
+BACKLOG = 64
+"""Connections that wait to be accepted."""
+HANDLES = BACKLOG + 64
+"""File handles that the service keeps for itself, and for those that it turns away."""
+MOST_CONNECTIONS = 4000
 FLEET = "main"
 """Name of the only fleet of a table or a folder."""
 
@@ -53,13 +62,25 @@ def make_session(config: AdviseConfig, folder: Path | None) -> AdviceSession:
         node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed)
         return node, stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
 
-    def make_fleet(uavs: list[str]) -> Fleet:
+    def make_fleet(uavs: list[str], mark: str) -> Fleet:
         node, policy = parts(len(uavs))
-        return Fleet(node, uavs, policy, drawn=config.flown == "sampled", seed=config.seed)
+        drawn = config.flown == "sampled"
+        return Fleet(node, uavs, policy, drawn, config.seed, config, parts, mark)
 
     overrides = without_token(config).overrides
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
     return AdviceSession(make_fleet, folder, about)
+
+
+def check_motion(config: AdviseConfig) -> None:
+    """Refuse a policy whose UAVs flew in no time in its training, unless it is asked for."""
+    if not config.learnt or config.instant:
+        return
+    trained = stored_config(run_folder(Path(str(config.checkpoint))), "checkpoint", trust=True).motion.kind
+    for kind in (trained, config.motion.kind):
+        if MOTION_MODELS.get(kind, "motion.kind").instant:
+            problem = "the policy's UAVs were at their targets at once: train one with motion=polynomial"
+            raise InputError(f"motion: {kind}: {problem}, or give instant=true to have it served")
 
 
 def answer_table(config: AdviseConfig, folder: Path) -> None:
@@ -95,6 +116,7 @@ def advise(config: AdviseConfig, folder: Path) -> None:
         fit_delays(config, folder)
         return
     scenario_of_service(config.eval_scenario)
+    check_motion(config)
     if config.observation.own and config.learnt:
         print("note: the policy knew a UAV's own messages at once; the service knows them when they arrive")
     if config.reports is not None:
@@ -126,27 +148,58 @@ def serve(config: AdviseConfig, session: AdviceSession) -> None:
     check_token("DAMIAN_TOKEN", given)
     token = given or secrets.token_urlsafe(24)
     try:
-        listener = socket.create_server((config.host, config.port or 0), backlog=1024)
+        listener = socket.create_server((config.host, config.port or 0), backlog=BACKLOG)
     except (OSError, UnicodeError) as error:
         raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
+    most = most_connections()
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # or an answer in two parts takes 40 ms
     host, port = listener.getsockname()[:2]
     if given is None:
         print(f"token: {token}")
     print(f"listening on http://{host}:{port}", flush=True)
-    app = service.make_app(session, token)
-    options = uvicorn.Config(app, log_level="warning", access_log=False, timeout_keep_alive=30, ws="none")
+    app = service.make_app(session, token, Clock(session.latest), damian.__version__)
+    for name in ("uvicorn.error", "asyncio", "damian.advice"):
+        logging.getLogger(name).addFilter(service.Sparse())
+    options = uvicorn.Config(
+        app,
+        http=service.limited(most),
+        backlog=BACKLOG,
+        log_level="warning",
+        access_log=False,
+        timeout_keep_alive=30,
+        timeout_graceful_shutdown=2,
+        ws="none",
+    )
     gc.collect()
     gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
     uvicorn.Server(options).run(sockets=[listener])
 
 
+def most_connections() -> int:
+    """How many connections the limit of file handles allows; the limit is raised if it can be."""
+    try:
+        import resource  # noqa: PLC0415 (Windows has none, and no such limit)
+    except ImportError:
+        return MOST_CONNECTIONS
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MOST_CONNECTIONS + HANDLES
+    if soft < wanted:
+        soft = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    if soft < HANDLES + 16:
+        raise InputError(f"port: {soft} file handles are too few: allow {HANDLES + 16} at least (ulimit -n)")
+    return min(soft - HANDLES, MOST_CONNECTIONS)
+
+
 def watch(inbox: Path, session: AdviceSession) -> None:
     """Answer every table that comes into a folder, until the program is stopped."""
     print(f"watching {inbox}", flush=True)
+    clock = Clock(session.latest)
     while True:
-        if not read_inbox(session, FLEET, inbox, time.time()):
-            session.advance(time.time())
+        clock.watch()
+        if not read_inbox(session, FLEET, inbox, clock()):
+            for _ in session.upkeep(clock):
+                pass
             time.sleep(0.2)
 
 

@@ -5,9 +5,10 @@ damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
 """
 
 from dataclasses import fields
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -22,7 +23,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
 from damian.settings import TrainConfig
-from damian.settings.programs import FILMS, FlyConfig
+from damian.settings.programs import FILMS, FieldRules, FlyConfig
 from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
 from damian.show.film import save_film
@@ -78,8 +79,15 @@ def episode_of_journal(config: FlyConfig) -> Episode:
 
     path = Path(str(config.journal))
     head = read_head(path)
-    node = Node(for_uavs(config.eval_scenario, len(head.uavs)), config.seed, reward_terms=True)
-    fleet = Fleet(node, head.uavs, greedy_policy(node.env))
+
+    @cache
+    def parts(n_uavs: int) -> tuple[Node, TensorDictModuleBase]:
+        node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed, reward_terms=True)
+        return node, greedy_policy(node.env)
+
+    node, policy = parts(len(head.uavs))
+    rules: dict[str, Any] = head.rules
+    fleet = Fleet(node, head.uavs, policy, rules=FieldRules(**rules), parts=parts, mark=head.mark)
     span = None if config.span is None else (config.span[0], config.span[1])
     about = {"policy": head.about.policy, "checkpoint": head.about.checkpoint}
     about |= {"overrides": list(config.overrides), "fleet": head.fleet}

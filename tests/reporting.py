@@ -16,9 +16,12 @@ from damian.advice.node import Node
 from damian.advice.rows import Report, read_json
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
+from damian.settings.programs import FieldRules
 
 START = 1.7e9
 """When the simulated flights begin [s since 1970]."""
+FREE = FieldRules(acknowledge=False, reserve=0.0, oldest_report=1e6)
+"""Rules that let UAVs do whatever the policy chooses, as in a simulation."""
 
 
 def names_of(n: int) -> list[str]:
@@ -130,7 +133,7 @@ def flights(
     env = make_env(scenario, 1, seed, extras=["message"])
     node = Node(scenario, seed)
     policy = policy_of(env)
-    fleet = Fleet(node, names_of(scenario.agents), policy_of(node.env), **options)
+    fleet = Fleet(node, names_of(scenario.agents), policy_of(node.env), rules=FREE, **options)
     reporter = Reporter(env, fleet.ground, fraction)
     shown = env.reset()
     reporter.send(shown, 0, at_once=True)

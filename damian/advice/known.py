@@ -7,7 +7,8 @@ import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 import shapely
@@ -23,8 +24,8 @@ from damian.world.battery import observed
 from damian.world.messages import Messages
 from damian.world.regions.geodesy import to_latlon, to_local
 
-KEPT = 512
-"""Reports of a UAV that are kept: a late one changes what newer ones left open."""
+KEPT, KEPT_ANYWAY = 512, 16
+"""Most and fewest reports of a UAV that are kept: a late one changes what newer ones left open."""
 DIGITS = {DEGREES: 8, METRES: 3}
 """Decimals of a place in answers: a millimetre."""
 
@@ -45,7 +46,7 @@ class Ground:
         self.way = lru_cache(10_000)(self._way)
         """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
 
-    @property
+    @cached_property
     def mark(self) -> str:
         """A text that stands for the landing points."""
         return str(number_of(str(self.points.round(2).tolist())))
@@ -99,6 +100,8 @@ class FilledReport:
     """Heading of its latest flight [rad]."""
     battery: float = 100.0
     """Battery level [%]."""
+    battery_known: bool = False
+    """Whether the UAV has ever reported one."""
     spotted: bool = False
     """Whether it spots the source; a UAV in flight does not."""
     detected: int | None = None
@@ -112,14 +115,31 @@ class FilledReport:
     readings: tuple[float, ...] = ()
     """Readings of sensors of your own."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        said = self.report.model_dump_json(by_alias=True, exclude_none=True)
+        return stored_report, (said, self.report.received, *list(vars(self).values())[1:])
+
+
+def stored_report(said: str, received: float, *others: Any) -> FilledReport:
+    """A filled report from a snapshot."""
+    report = Report.model_validate_json(said)
+    report.received = received
+    return FilledReport(report, *others)
+
 
 class UavLog:
     """The reports of one UAV."""
 
-    def __init__(self, ground: Ground, window: int, n_readings: int) -> None:
-        self.ground, self.window, self.n_readings = ground, window, n_readings
+    def __init__(self, ground: Ground, window: int, n_readings: int, kept_steps: int) -> None:
+        self.ground, self.window, self.n_readings, self.kept_steps = ground, window, n_readings, kept_steps
         self.reports: list[FilledReport] = []
+        self.known_from = -math.inf
+        """Time since which all reports are kept [s]."""
         self.received = self.late = self.duplicates = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is stored: all but the landing points."""
+        return self.__dict__ | {"ground": None}
 
     @property
     def newest(self) -> FilledReport | None:
@@ -160,7 +180,12 @@ class UavLog:
         self.reports.insert(at, filled)
         for i in range(at, len(self.reports)):
             self._fill(self.reports[i], self.reports[i - 1] if i else None)
-        del self.reports[: max(len(self.reports) - KEPT, 0)]
+        too_old = self.reports[-1].step - self.kept_steps
+        while len(self.reports) > KEPT or (
+            len(self.reports) > KEPT_ANYWAY and self.reports[0].step < too_old
+        ):
+            del self.reports[0]
+            self.known_from = self.reports[0].report.time
         return filled
 
     def _fill(self, filled: FilledReport, before: FilledReport | None) -> None:
@@ -180,6 +205,7 @@ class UavLog:
             track, battery, readings = before.track, before.battery, before.readings
         filled.track = track if report.track is None else math.radians(report.track) % (2 * math.pi)
         filled.battery = battery if report.battery is None else report.battery
+        filled.battery_known = report.battery is not None or (before is not None and before.battery_known)
         filled.readings = readings if report.readings is None else report.readings
         filled.spotted = report.source_spotted and not report.flies
         place = report.place("source_")

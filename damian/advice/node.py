@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.envs import Compose
 
 from damian import keys
+from damian.advice.known import Ground
 from damian.common import checks
 from damian.common.tensors import tree_map
 from damian.envs.delayed_env import DelayedEnv
@@ -105,6 +106,14 @@ class Node:
         self.env = DelayedEnv(self.worlds, Compose(*transforms))  # type: ignore[arg-type]
         """The environment for which the policy is built; nobody steps it."""
         self.env.reset()
+        self.ground = Ground(self.simulation.airspace, 2 * scenario.region.lattice_step + 50.0)
+        periods = [scenario.clock.steps(name) for name in ("agents", "server")]
+        self.settles = 2 + sum(periods)
+        """Steps after which all that has arrived is known to all, if nothing else arrives."""
+        self.held_back = 0 if periods == [1, 1] else self.settles
+        """Steps for which an observation may be held, which must be taken even if nothing arrives."""
+        self.diffuses = any(isinstance(each, Belief) for each in transforms)
+        """Whether something changes in every step, even if nothing arrives."""
         self.transforms = cast(list[StatefulTransform], transforms)
         self._unused = [transform.memory for transform in self.transforms]
         self.blank = tree_map(lambda table: table[:1].clone(), self.simulation.initial)

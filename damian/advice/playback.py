@@ -18,7 +18,7 @@ from torch import Tensor
 from damian import keys
 from damian.advice.fitting import fit
 from damian.advice.fleet import Decision, Fleet
-from damian.advice.journal import Received, read_lines
+from damian.advice.journal import Advised, Received, read_lines
 from damian.advice.rows import Place, Report, written
 from damian.advice.session import replay
 from damian.common.errors import InputError
@@ -31,10 +31,12 @@ MOST_STEPS = 20_000
 
 @dataclass
 class ServerView:
-    """What the server node knew in each of S steps of N UAVs."""
+    """What the server node knew in each of S steps of the N UAVs that were members then."""
 
     steps: list[int] = field(default_factory=list)
     """Numbers of the steps, each one more than the one before."""
+    members: list[list[str]] = field(default_factory=list)
+    """IDs of the UAVs."""
     believed: list[Tensor] = field(default_factory=list)
     """Positions in the messages that it held [m], [N, 2] each."""
     age: list[Tensor] = field(default_factory=list)
@@ -47,10 +49,10 @@ class ServerView:
     """Probability that the source is in a cell, [K] each; empty without a belief."""
     success: bool = False
     """Whether it knew in the last step that the task was accomplished."""
-    delay: dict[tuple[int, int], int] = field(default_factory=dict)
+    delay: dict[tuple[int, str], int] = field(default_factory=dict)
     """Delays of the messages that arrived [steps], by the step in which they were generated and the UAV."""
-    told: list[tuple[int, Decision]] = field(default_factory=list)
-    """What UAVs were told to do, by number."""
+    told: list[tuple[str, Decision]] = field(default_factory=list)
+    """What UAVs have followed, by ID, from the step in which this was known."""
 
 
 def episode_of(
@@ -66,20 +68,21 @@ def episode_of(
     keep, since every UAV had reported [s], and ``progress`` is like ``tqdm.tqdm``.
     """
     view, reports = _read(path, fleet, span or (0.0, math.inf), progress)
-    steps = np.array(view.steps)
-    truth = [_hindsight(fleet, reports[uav], steps) for uav in range(len(fleet.uavs))]
+    steps, uavs = np.array(view.steps), [*reports]
+    truth = [_hindsight(fleet, own, steps) for own in reports.values()]
     columns = {name: np.stack([each[name] for each in truth], 1) for name in truth[0]}
     columns["target"] = np.tile(columns["position"][0, :, :2], (len(steps), 1, 1))
     for uav, decision in view.told:
-        columns["target"][steps > decision.step, uav] = fleet.ground.points[decision.goal]
+        columns["target"][steps > decision.step, uavs.index(uav)] = fleet.ground.points[decision.goal]
     columns["sent"], columns["delay"] = _messages(fleet, view, reports, steps)
-    columns |= {name: _stacked(getattr(view, name)) for name in ("believed", "age", "reward")}
+    columns["believed"] = _of_members(view, view.believed, uavs, stays=True)
+    columns |= {name: _of_members(view, getattr(view, name), uavs) for name in ("age", "reward")}
     columns["sent"][0], columns["reward"][0] = False, 0.0
-    terms = {name: _stacked(rows) for name, rows in view.terms.items()}
+    terms = {name: _of_members(view, rows, uavs) for name, rows in view.terms.items()}
     for rows in terms.values():
         rows[0] = 0.0
     began = cast(float, fleet.start) + view.steps[0] * fleet.node.dt
-    flight = {"uavs": fleet.uavs, "began": written(began)}
+    flight = {"uavs": uavs, "began": written(began)}
     parts: dict[str, Any] = {**fixed_of(fleet.node.worlds, {**about, **flight}, 0), **columns}
     return Episode(
         **parts,
@@ -96,20 +99,23 @@ def episode_of(
 
 def _read(
     path: Path, fleet: Fleet, span: tuple[float, float], progress: Callable
-) -> tuple[ServerView, list[list[Report]]]:
-    """What was known in the steps of a span, and all reports of each UAV."""
-    view, reports, end = ServerView(), [[] for _ in fleet.uavs], math.inf
+) -> tuple[ServerView, dict[str, list[Report]]]:
+    """What was known in the steps of a span, and all reports of each UAV that has ever been a member."""
+    view, end = ServerView(), math.inf
+    reports: dict[str, list[Report]] = {uav: [] for uav in fleet.uavs}
     for number, line in progress(list(read_lines(path))):
         with named(f"{path}: line {number}"):
             if fleet.step <= end:
-                _advance(fleet, view, line.received if isinstance(line, Received) else line.asked, span)
+                _advance(fleet, view, line.asked if isinstance(line, Advised) else line.received, span)
+                before = {uav: own[-1:] for uav, own in zip(fleet.uavs, map(list, fleet.told), strict=True)}
                 replay(fleet, line)
-                told = () if isinstance(line, Received) else [fleet.number[uav] for uav in line.told]
-                view.told += [(uav, cast(Decision, fleet.decision(uav))) for uav in told]
+                for uav, own in zip(fleet.uavs, map(list, fleet.told), strict=True):
+                    view.told += [(uav, each) for each in own[-1:] if [each] != before.get(uav, [each])]
             if fleet.start is not None:
                 end = fleet.first_step + span[1] / fleet.node.dt
             for report in line.reports if isinstance(line, Received) else ():
-                reports[fleet.number[report.id]].append(report)
+                reports.setdefault(report.id, []).append(report)
+    reports = {uav: own for uav, own in reports.items() if own}
     if fleet.start is None:
         raise InputError(f"{path}: the fleet never began: not every UAV has reported")
     _advance(fleet, view, fleet.clock, span, is_last=True)
@@ -140,8 +146,9 @@ def _advance(
 def _note(fleet: Fleet, view: ServerView) -> None:
     """Note what the server node knows at the end of a step."""
     view.steps.append(fleet.step)
+    view.members.append(fleet.uavs)
     for uav, each in fleet.arrived:
-        sent = each.step, uav
+        sent = each.step, fleet.uavs[uav]
         view.delay[sent] = min(fleet.step - each.step, view.delay.get(sent, fleet.step))
     outputs = fleet.observe([])
     view.believed.append(fleet.points[[each.point for each in fleet.held]])
@@ -191,20 +198,41 @@ def _course(position: Floats) -> Floats:
 
 
 def _messages(
-    fleet: Fleet, view: ServerView, reports: Sequence[Sequence[Report]], steps: NDArray[np.int64]
+    fleet: Fleet, view: ServerView, reports: Mapping[str, Sequence[Report]], steps: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N] each."""
-    sent = np.zeros((len(steps), len(fleet.uavs)), bool)
+    sent, number = np.zeros((len(steps), len(reports)), bool), {uav: i for i, uav in enumerate(reports)}
     delay = np.zeros(sent.shape, int)
-    for (step, uav), lag in view.delay.items():
+    for (step, name), lag in view.delay.items():
+        uav = number[name]
         if step >= steps[0]:
             sent[step - steps[0], uav], delay[step - steps[0], uav] = True, lag
-    for message in fit([report for own in reports for report in own]).messages:
-        row, uav = fleet.step_of(message.time) - steps[0], fleet.number[message.uav]
+    for message in fit([report for own in reports.values() for report in own]).messages:
+        row, uav = fleet.step_of(message.time) - steps[0], number[message.uav]
         if 0 <= row < len(steps) and not sent[row, uav]:  # lost, or it came in after the last of the steps
             lag = -1 if message.received is None else fleet.step_of(message.received) - steps[0] - row
             sent[row, uav], delay[row, uav] = True, lag
     return sent, delay
+
+
+def _of_members(
+    view: ServerView, rows: Sequence[Tensor], uavs: Sequence[str], stays: bool = False
+) -> NDArray[Any]:
+    """Rows of the members [N, ...] as columns of all UAVs [S, U, ...]; 0 while a UAV is no member.
+
+    With ``stays`` it is then where it was last, and before it joins, where it will be first.
+    """
+    found = np.zeros((len(rows), len(uavs), *rows[0].shape[1:]), np.asarray(rows[0]).dtype)
+    there = np.zeros(found.shape[:2], bool)
+    for step, (members, row) in enumerate(zip(view.members, rows, strict=True)):
+        at = [uavs.index(uav) for uav in members]
+        found[step, at], there[step, at] = np.asarray(row), True
+    for uav in range(len(uavs)) if stays else ():
+        known = np.flatnonzero(there[:, uav])
+        if len(known):
+            latest = np.searchsorted(known, np.arange(len(rows)), side="right") - 1
+            found[:, uav] = found[known[latest.clip(min=0)], uav]
+    return found
 
 
 def _stacked(rows: Sequence[Tensor]) -> NDArray[Any]:

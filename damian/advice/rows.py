@@ -63,25 +63,54 @@ UavId: TypeAlias = Annotated[str, Field(pattern=r"^\w[\w .:/-]{0,63}$")]
 """ID of a UAV; it begins with a letter, digit or ``_``, so that no spreadsheet takes it for a formula."""
 
 
-class Report(BaseModel):
-    """What a UAV reports; None where it does not say.
+def _no_default(schema: dict[str, Any]) -> None:
+    """Leave a default out of a JSON schema, which has no NaN."""
+    del schema["default"]
 
-    The names of the fields, with a space for ``_``, are the columns of tables; journals keep the same ones.
+
+class Row(BaseModel):
+    """A row of a table: the names of its fields, with a space for ``_``, are the columns.
+
+    Other columns are kept in ``model_extra``, so that telemetry can be forwarded as it is.
     """
 
     model_config = ConfigDict(
         str_strip_whitespace=True,
         coerce_numbers_to_str=True,
-        extra="forbid",
+        extra="allow",
         alias_generator=lambda name: name.replace("_", " "),
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _columns(cls, row: Any) -> Any:
+        """A row by its columns, without unknown values."""
+        if not isinstance(row, Mapping):
+            return row
+        return {_column(str(name)): value for name, value in row.items() if not _is_unknown(value)}
+
+
+class Acknowledgement(Row):
+    """What a UAV does with an answer."""
+
     id: UavId
-    received: Time = Field(math.nan, alias="receive time", exclude=True)
+    answer: Annotated[str, Field(max_length=64)]
+    """ID of the answer."""
+    status: Annotated[
+        Literal["accepted", "refused", "taken off", "landed", "aborted"],
+        BeforeValidator(lambda value: _column(value) if isinstance(value, str) else value),
+    ]
+
+
+class Report(Row):
+    """What a UAV reports; None where it does not say. Journals keep the columns of tables."""
+
+    id: UavId
+    received: Time = Field(math.nan, alias="receive time", exclude=True, json_schema_extra=_no_default)
     """When it came in [s]; a column of files only."""
     aoi: Annotated[Number, Field(ge=0, le=LATEST)] = Field(0.0, exclude=True)
     """Age of the observation when it came in [s], if there is no time."""
-    time: Time = math.nan
+    time: Time = Field(math.nan, json_schema_extra=_no_default)
     """When the observation was generated [s]."""
     lat: Latitude | None = None
     lon: Longitude | None = None
@@ -142,14 +171,6 @@ class Report(BaseModel):
         if "time" not in said:
             self.time = self.received - self.aoi
 
-    @model_validator(mode="before")
-    @classmethod
-    def _columns(cls, row: Any) -> Any:
-        """A row by its columns, without unknown values."""
-        if not isinstance(row, Mapping):
-            return row
-        return {_column(str(name)): value for name, value in row.items() if not _is_unknown(value)}
-
     @model_validator(mode="after")
     def _places_are_complete(self) -> "Report":
         said, prefixes = self.model_fields_set, ("", "source_", "target_")
@@ -172,32 +193,60 @@ def _is_unknown(value: Any) -> bool:
     return value is None or (isinstance(value, str) and value.strip().lower() in UNKNOWN)
 
 
+Found = list[tuple[str, Any]]
+"""Rows, each with its place in the text (``line 2``)."""
 Rows = list[tuple[str, Report]]
-"""Reports, each with its place in the text (``line 2``)."""
 
 
 def read_file(path: Path) -> Rows:
     """Reports of a file: JSON if its name ends with ``.json``, or else CSV."""
+    return reports_of(rows_of_file(path))
+
+
+def rows_of_file(path: Path) -> Found:
+    """Rows of a file, of any kind."""
     text = read_text(path)
-    return read_json(text) if path.suffix.lower() == ".json" else read_csv(text)
+    return rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text)
+
+
+def rows_of_csv(text: str) -> Found:
+    """Rows of a CSV table, of any kind."""
+    return [(f"line {row.line}", row.cells) for row in parse_table(text, [])]
+
+
+def rows_of_json(text: str | bytes) -> Found:
+    """Rows of JSON, an object or a list of objects, of any kind."""
+    found = parsed_json(text)
+    return [(f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)]
 
 
 def read_csv(text: str) -> Rows:
     """Reports of a CSV table."""
-    return _rows([(f"line {row.line}", row.cells) for row in parse_table(text, [])])
+    return reports_of(rows_of_csv(text))
 
 
 def read_json(text: str | bytes) -> Rows:
     """Reports of JSON: an object, or a list of objects."""
-    found = parsed_json(text)
-    rows = found if isinstance(found, list) else [found]
-    return _rows([(f"row {n}", row) for n, row in enumerate(rows, 1)])
+    return reports_of(rows_of_json(text))
 
 
-def _rows(found: Sequence[tuple[str, Any]]) -> Rows:
+def reports_of(found: Found) -> Rows:
+    """Rows as reports."""
     if not found:
         raise InputError("there are no rows")
     return [(where, validated(Report, row, where)) for where, row in found]
+
+
+def acknowledgements_of(found: Found) -> list[Acknowledgement]:
+    """Rows as acknowledgements."""
+    if not found:
+        raise InputError("there are no rows")
+    return [validated(Acknowledgement, row, where) for where, row in found]
+
+
+def ignored(rows: Rows) -> list[str]:
+    """Names of the columns that are not understood."""
+    return sorted({name for _, report in rows for name in report.model_extra or ()})
 
 
 def parsed_json(text: str | bytes) -> Any:
@@ -222,17 +271,31 @@ def validated(model: type[Model], value: Any, where: str = "") -> Model:
         raise InputError(": ".join(filter(None, parts))) from None
 
 
+REASONS = ("silent", "battery", "held", "returning", "home", "aborted", "lost", "conflict")
+"""Why a UAV is not told what the policy chooses: its newest report is too old; its battery is below the
+reserve, would be after the flight, or was never reported; a person holds it or sends it home; it is there; it
+has aborted a flight, or its flight is long over, without a report since; another UAV is in its way."""
+
+
 class Advice(BaseModel):
     """What a UAV was told last."""
 
+    answer: str | None = None
+    """ID of the answer, for its acknowledgement."""
     ID: str
-    state: Literal["fly", "hold", "bound", "none"]
-    """``fly`` or ``hold`` for a UAV that has chosen in this step, ``bound`` for one that was told so before,
-    and ``none`` for one that has not been told anything."""
+    state: Literal["fly", "hold", "return", "bound", "none"]
+    """``fly``, ``hold`` or ``return`` for an answer that waits for its acceptance (without acknowledgements:
+    of this step), ``bound`` for one that the UAV follows, and ``none`` if there is none."""
+    reason: str | None = None
+    """Why the policy was not followed, one of ``REASONS``."""
     lat: float | None = None
     lon: float | None = None
     x: float | None = None
     y: float | None = None
+    altitude: float | None = None
+    """Flight level above the takeoff point [m]; None if it holds."""
+    speed: float | None = None
+    """Mean speed of the cruise, by which it arrives as expected [m/s]."""
     heading: float | None = None
     """Clockwise from north [deg]; None if it holds."""
     distance: float | None = None
@@ -241,6 +304,8 @@ class Advice(BaseModel):
     """Expected duration of the flight [s]."""
     arrival: float | str | None = None
     """When it is expected to land, as of ``written``."""
+    until: float | str | None = None
+    """By when it must be accepted, and of one that is followed, until when the landing point is booked."""
     step: int | None = None
     """The step in which it chose."""
     age: float
@@ -261,6 +326,10 @@ class UavStatus(BaseModel):
     late: int
     """Those that were older than one that was there."""
     duplicates: int
+    command: Literal["", "hold", "return"] = ""
+    """What a person has told the UAV to do."""
+    order: str | None = None
+    """How far its latest answer has come, such as ``accepted``."""
 
 
 class FleetStatus(BaseModel):

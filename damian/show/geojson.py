@@ -36,7 +36,7 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     """
     origin = origin_of(episode)
     features = [
-        {"type": "Feature", "properties": properties, "geometry": _on_earth(geometry, origin)}
+        {"type": "Feature", "properties": properties, "geometry": on_earth(geometry, origin)}
         for geometry, properties in _features(episode, step)
     ]
     return {"type": "FeatureCollection", "features": features}
@@ -75,7 +75,7 @@ def _path(places: Floats) -> shapely.LineString | shapely.Point:
     return shapely.LineString(places) if (places != places[0]).any() else shapely.Point(places[0])
 
 
-def _on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
+def on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
     """A geometry of local metres in longitude and latitude, with holes clockwise."""
 
     def degrees(metres: NDArray[np.float64]) -> NDArray[np.float64]:

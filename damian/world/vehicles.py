@@ -40,7 +40,7 @@ class MotionModel(ABC):
         self.points = airspace.points.flatten(0, 1)
         levels = flight_levels(config.motion, config.agents, shared=self.instant)
         if not self.instant:
-            _check_levels(levels, airspace)
+            check_levels(levels, airspace)
         self.levels = torch.tensor(levels)
         self.vertical = self.shortest_time(self.levels)
         self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
@@ -232,7 +232,7 @@ class PolynomialFlight(MotionModel):
         return 2 * state.vertical + state.cruise
 
 
-def _check_levels(levels: list[float], airspace: Airspace) -> None:
+def check_levels(levels: list[float], airspace: Airspace) -> None:
     """Require that each flight level lies within those of every region."""
     key = "motion.min_level + i * motion.level_separation"
     for low, high in (region.levels for region in airspace.regions if region.levels is not None):

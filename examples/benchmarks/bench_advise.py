@@ -2,10 +2,14 @@
 
     python examples/benchmarks/bench_advise.py          (make bench-advise)
     python examples/benchmarks/bench_advise.py --rate 500 --seconds 20 --fleets 5
+    python examples/benchmarks/bench_advise.py --restart 1000 --rate 100
 
 The service runs in a process of its own, on one core if the system lets it. Connections that stay open send
 the reports of 10 UAVs and a question for their advice, in turn; first at a fixed rate, then as fast as it
-goes. Where other programs use the cores too, the processor time of a request tells more than the latencies.
+goes. With ``--restart`` it starts with so many fleets of 3 UAVs, each of which has flown for an hour before
+it was killed: how long it takes until it listens, and until it has answered a first question of every fleet,
+and how long questions take from then on. Where other programs use the cores too, the processor time of a
+request tells more than the latencies.
 """
 
 import http.client
@@ -35,11 +39,12 @@ HEADER += ("status 200",)
 
 
 class Sample(NamedTuple):
-    """A request: when it was due [s], how long its answer took from then on [s], and its status."""
+    """A request: when it was due [s], how long its answer took from then on [s], its status, and its kind."""
 
     due: float
     took: float
     status: int
+    asks: bool
 
 
 def start(folder: Path, words: Sequence[str]) -> tuple[subprocess.Popen, int]:
@@ -61,16 +66,18 @@ def start(folder: Path, words: Sequence[str]) -> tuple[subprocess.Popen, int]:
 class Connection:
     """A connection that stays open, for some fleets."""
 
-    def __init__(self, port: int, fleets: Sequence[int]) -> None:
+    def __init__(self, port: int, fleets: Sequence[int], n_uavs: int = N_UAVS) -> None:
         self.http = http.client.HTTPConnection("127.0.0.1", port)
-        self.fleets, self.n = fleets, 0
+        self.fleets, self.n, self.n_uavs = fleets, 0, n_uavs
         self.headers = {"Authorization": f"Bearer {TOKEN}", "Content-Type": "application/json"}
 
     def request(self, method: str, path: str, body: object = None) -> int:
         """Send a request; returns the status of its answer."""
         self.http.request(method, path, None if body is None else json.dumps(body), self.headers)
         answer = self.http.getresponse()
-        answer.read()
+        text = answer.read()
+        if answer.status >= 500:
+            print(answer.status, text.decode())
         return answer.status
 
     def next(self) -> int:
@@ -78,7 +85,9 @@ class Connection:
         fleet = self.fleets[self.n // 2 % len(self.fleets)]
         self.n += 1
         if self.n % 2:
-            return self.request("POST", f"/fleets/f{fleet}/reports", reports(time.time(), self.n))
+            return self.request(
+                "POST", f"/fleets/f{fleet}/reports", reports(time.time(), self.n)[: self.n_uavs]
+            )
         return self.request("GET", f"/fleets/f{fleet}/advice")
 
 
@@ -112,7 +121,7 @@ def load(connections: Sequence[Connection], seconds: float, rate: float | None) 
             time.sleep(max(due - time.perf_counter(), 0.0))
             status = connection.next()
             done = time.perf_counter()
-            samples.append(Sample(due - first, done - due, status))
+            samples.append(Sample(due - first, done - due, status, connection.n % 2 == 0))
             due = due + period if rate else done
 
     with ThreadPoolExecutor(len(connections)) as pool:
@@ -136,6 +145,72 @@ def row(name: str, samples: Sequence[Sample], seconds: float, used: float) -> li
     return [name, f"{len(samples) / answered:.0f}", *times, f"{good} of {len(samples)}"]
 
 
+def fly_an_hour(folder: Path, words: Sequence[str], n_fleets: int) -> None:
+    """Journals and snapshots of fleets of 3 UAVs that have flown for an hour until now, and were killed.
+
+    Each UAV reports every 5 s, and is sent somewhere every 30 s. One fleet, f10000, flies; the others are
+    copies.
+    """
+    from damian.advice.rows import Acknowledgement, read_json  # noqa: PLC0415 (needs the extra advise)
+    from damian.recipes import cli  # noqa: PLC0415
+    from damian.recipes.advise import make_session  # noqa: PLC0415
+
+    config = cli.checked(cli.composed("advise", [*words, "port=0"]), "advise")
+    config.overrides = [*words, "port=0"]
+    session, begin = make_session(config, folder), time.time() - 3600
+    uavs = [f"uav{i}" for i in range(3)]
+    session.create("f10000", uavs)
+    for second in range(0, 3600, 5):
+        now = begin + second
+        session.report("f10000", read_json(json.dumps(reports(now, second // 5)[:3])), now + 0.5)
+        if second % 30 == 0:
+            for each in session.advise("f10000", now + 1):
+                for status in ("accepted", "landed"):
+                    said = Acknowledgement(id=each.ID, answer=each.answer or "", status=status)
+                    session.acknowledge("f10000", [said], now + 2)
+        if second == 3500:
+            session._save("f10000")
+    session._unsaved.clear()  # it was killed: nothing is stored at its end
+    session.close()
+    journal, snapshot = folder / "f10000.jsonl", folder / "f10000.snapshot"
+    text = journal.read_text()
+    sizes = [each.stat().st_size / 1e6 for each in (journal, snapshot)]
+    print(f"a journal has {sizes[0]:.2f} MB and", text.count("\n"), f"lines, a snapshot {sizes[1]:.2f} MB")
+    for fleet in range(10_001, 10_000 + n_fleets):
+        (folder / f"f{fleet}.jsonl").write_text(text.replace("f10000", f"f{fleet}", 1))
+        (folder / f"f{fleet}.snapshot").write_bytes(snapshot.read_bytes())
+
+
+def measure_restart(n_fleets: int, rate: float, seconds: float, words: Sequence[str]) -> None:
+    """Print how long a restart takes, and questions after it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        fly_an_hour(folder / "journals", words, n_fleets)
+        began = time.perf_counter()
+        process, port = start(folder, [*words, f"journal={folder}/journals"])
+        print(f"listens after {time.perf_counter() - began:.1f} s")
+        try:
+            one = Connection(port, [])
+            took = []
+            for fleet in range(10_000, 10_000 + n_fleets):
+                asked = time.perf_counter()
+                assert one.request("GET", f"/fleets/f{fleet}/advice") == 200
+                took.append(1000 * (time.perf_counter() - asked))
+            p50, p99 = np.quantile(took, [0.5, 0.99])
+            print(f"first questions: p50 {p50:.1f} ms, p99 {p99:.1f} ms, longest {max(took):.1f} ms")
+            print(f"all fleets answered after {time.perf_counter() - began:.1f} s")
+            own = [range(10_000 + i, 10_000 + n_fleets, CONNECTIONS) for i in range(CONNECTIONS)]
+            connections, before = [Connection(port, fleets, 3) for fleets in own], processor_time(process)
+            samples = load(connections, seconds, rate)
+            used = processor_time(process) - before
+            asks, others = ([each for each in samples if each.asks is kind] for kind in (True, False))
+            rows = [row(kind, each, seconds, used / 2) for kind, each in (("GET", asks), ("POST", others))]
+            print(markdown_table(HEADER, rows))
+        finally:
+            process.kill()
+            process.wait()
+
+
 def main() -> None:
     """Measure and print the table."""
     options = ArgumentParser(description="Speed of damian advise over loopback.")
@@ -143,9 +218,16 @@ def main() -> None:
     options.add_argument("--seconds", type=float, default=10.0, help="time of each measurement")
     options.add_argument("--fleets", type=int, default=4, help="number of fleets of 10 UAVs")
     options.add_argument(
-        "settings", nargs="*", default=["policy=script", "delay=paper"], help="of damian advise"
+        "settings",
+        nargs="*",
+        default=["policy=script", "delay=paper", "region=llanbedr"],
+        help="of damian advise",
     )
+    options.add_argument("--restart", type=int, metavar="N", help="restart with N fleets instead")
     args = options.parse_args()
+    if args.restart:
+        measure_restart(args.restart, args.rate, args.seconds, args.settings)
+        return
     with tempfile.TemporaryDirectory() as folder:
         process, port = start(Path(folder), args.settings)
         try:

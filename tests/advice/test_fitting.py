@@ -57,7 +57,7 @@ def test_a_law_reads_the_trace(log, tmp_path, capsys):
 
 
 def test_a_journal_is_a_log(log):
-    head = {"journal": "damian-advice", "version": 2, "fleet": "x", "uavs": ["A"], "about": {}}
+    head = {"journal": "damian-advice", "version": 3, "fleet": "x", "uavs": ["A"], "about": {}}
     reports = [
         {"received": i + 0.25, "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}]}
         for i in range(4)

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reporting import START, advise, flights
+from reporting import FREE, START, advise, flights
 
 from damian import keys
-from damian.advice.fleet import GRACE, Fleet, Waiting
+from damian.advice.fleet import Fleet, Waiting
 from damian.advice.node import Node
+from damian.advice.orders import GRACE
 from damian.advice.rows import Report
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
@@ -95,7 +96,7 @@ SILENT = 40
 
 def fleet_of(**changed) -> Fleet:
     node = Node(scenario_of(**changed), 3)
-    return Fleet(node, ["a", "b", "c"], greedy_policy(node.env))
+    return Fleet(node, ["a", "b", "c"], greedy_policy(node.env), rules=FREE)
 
 
 def report_of(
@@ -218,7 +219,7 @@ def test_fleets_that_share_a_node_do_not_see_each_other(task):
     """Beside another fleet, which began earlier elsewhere, a fleet observes what it does alone."""
 
     def flown(node: Node, beside: Fleet | None) -> list:
-        fleet, seen = Fleet(node, ["a", "b", "c"], greedy_policy(node.env)), []
+        fleet, seen = Fleet(node, ["a", "b", "c"], greedy_policy(node.env), rules=FREE), []
         for step in range(12):
             if beside:
                 told(beside, "b", START + step, 90 - step, battery=50.0, source_spotted=step % 2 == 0)
@@ -232,7 +233,7 @@ def test_fleets_that_share_a_node_do_not_see_each_other(task):
 
     scenario = scenario_of(**TASKS[task])
     shared = Node(scenario, 3)
-    beside = Fleet(shared, ["a", "b", "c"], greedy_policy(shared.env))
+    beside = Fleet(shared, ["a", "b", "c"], greedy_policy(shared.env), rules=FREE)
     for i, uav in enumerate(beside.uavs):
         told(beside, uav, START - 20, 200 + i, source_spotted=True)
     advise(beside, START - 10)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reporting import Reporter, names_of
+from reporting import FREE, Reporter, names_of
 from tensordict.nn import TensorDictModuleBase
 
 from damian import keys
@@ -48,7 +48,9 @@ SCENARIOS = {name: replace(SCENARIO, motion=motion) for name, motion in MOTIONS.
 
 
 def fleet_of(uavs: list[str], scenario: ScenarioConfig = SCENARIO) -> Fleet:
-    return Fleet(Node(scenario, 3, reward_terms=True), uavs, policy=lambda _: pytest.fail("it was asked"))
+    return Fleet(
+        Node(scenario, 3, reward_terms=True), uavs, policy=lambda _: pytest.fail("it was asked"), rules=FREE
+    )
 
 
 @pytest.fixture(scope="module", params=[pytest.param("instant", marks=pytest.mark.slow), "flights"])
@@ -60,9 +62,9 @@ def scenario(request) -> ScenarioConfig:
 def flown(tmp_path_factory, scenario) -> tuple:
     """A simulated flight, the episode that the simulation recorded, and the journal of its advice."""
 
-    def advised_fleet(uavs: list[str]) -> Fleet:
+    def advised_fleet(uavs: list[str], mark: str) -> Fleet:
         node = Node(scenario, 3)
-        return Fleet(node, uavs, greedy_policy(node.env))
+        return Fleet(node, uavs, greedy_policy(node.env), rules=FREE, mark=mark)
 
     folder = tmp_path_factory.mktemp("journals")
     env = make_env(scenario, 1, 3, extras=EXTRAS)

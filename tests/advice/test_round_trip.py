@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from reporting import START, Client, flown_by_clients, names_of
+from reporting import FREE, START, Client, flown_by_clients, names_of
 from starlette.testclient import TestClient
 from test_fleet import TASKS, scenario_of
 
@@ -39,7 +39,7 @@ def served(scenario, policy_of, n_worlds: int, horizon: int):
     """What episodes bring whose UAVs do as a service in this process tells them."""
     node = Node(scenario, 3)
     policy = policy_of(node.env)
-    session = AdviceSession(lambda uavs: Fleet(node, uavs, policy))
+    session = AdviceSession(lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark))
     now = [START]
     env = make_env(flown_by_clients(scenario), n_worlds, 3, extras=["message"])
     ground = Fleet(node, names_of(scenario.agents), policy).ground

@@ -4,6 +4,7 @@ import json
 import random
 
 import pytest
+from reporting import FREE
 from starlette.testclient import TestClient
 from test_fleet import LLANBEDR, TASKS, scenario_of
 
@@ -28,7 +29,11 @@ def parts():
 @pytest.fixture
 def session(parts, tmp_path):
     node, policy = parts
-    return AdviceSession(lambda uavs: Fleet(node, uavs, policy), tmp_path / "journals", {"policy": "greedy"})
+    return AdviceSession(
+        lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
+        tmp_path / "journals",
+        {"policy": "greedy"},
+    )
 
 
 class Clock:
@@ -90,8 +95,11 @@ def test_reports_go_in_and_landing_points_come_out(client, fleet, session, clock
     ]
     assert found == [["new"], ["duplicate"]]
     head, *table = client.get(f"{fleet}/advice?format=csv").text.splitlines()
-    assert head == "ID,state,lat,lon,heading,distance,duration,arrival,step,age"
-    assert [(line.split(",")[0], line.split(",")[-1]) for line in table] == [
+    assert (
+        head
+        == "answer,ID,state,reason,lat,lon,altitude,speed,heading,distance,duration,arrival,until,step,age"
+    )
+    assert [(line.split(",")[1], line.split(",")[-1]) for line in table] == [
         ("A", "1.0"),
         ("B", "5.0"),
         ("C", "5.0"),
@@ -135,7 +143,7 @@ def test_after_any_nonsense_the_service_goes_on(client, fleet, session, content)
         answer = client.post(f"{fleet}/reports", content=body, headers={"Content-Type": content})
         assert answer.status_code == 422, (body, answer.text)
         assert answer.json()["error"].isprintable()
-    assert not any(log.reports for log in session.fleets["north"].logs)
+    assert not any(log.reports for log in session.fleet("north").logs)
     assert client.post(f"{fleet}/reports", json=rows(session)).status_code == 200
     assert client.get(f"{fleet}/advice").status_code == 200
 
@@ -148,7 +156,11 @@ def test_a_journal_brings_everything_back(task, tmp_path):
     policy, clock = greedy_policy(node.env), Clock()
 
     def make_session() -> AdviceSession:
-        return AdviceSession(lambda uavs: Fleet(node, uavs, policy), tmp_path, {"policy": "greedy"})
+        return AdviceSession(
+            lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
+            tmp_path,
+            {"policy": "greedy"},
+        )
 
     session, generator = make_session(), random.Random(5)
     headers = {"Authorization": f"Bearer {TOKEN}"}
@@ -171,7 +183,7 @@ def test_a_journal_brings_everything_back(task, tmp_path):
                 session.advance(clock.now)
             if generator.random() < 0.5:
                 client.get(f"/fleets/north/advice?uav={generator.choice(UAVS)}")
-    one, other = session.fleets["north"], make_session().fleets["north"]
+    one, other = session.fleet("north"), make_session().fleet("north")
     assert (one.start, list(map(list, one.told))) == (other.start, list(map(list, other.told)))
     assert [log.reports for log in one.logs] == [log.reports for log in other.logs]
     for fleet in (one, other):

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 import pytest
-from reporting import START
+from reporting import FREE, START
 from test_fleet import LLANBEDR, SEEN, TASKS, scenario_of
 
 from damian.advice import journal as module
@@ -40,7 +40,13 @@ def make_session(node, tmp_path):
     def make(node: Node = node, policy=None, **about) -> AdviceSession:
         policy = policy or greedy_policy(node.env)
         folder = tmp_path / "journals"
-        made.append(AdviceSession(lambda uavs: Fleet(node, uavs, policy), folder, {**ABOUT, **about}))
+        made.append(
+            AdviceSession(
+                lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
+                folder,
+                {**ABOUT, **about},
+            )
+        )
         return made[-1]
 
     yield make
@@ -81,7 +87,6 @@ def test_what_is_appended_is_there_at_once_and_an_unfinished_line_is_removed(tmp
     for line in (HEAD, LINE):
         written.append(line)
     assert lines_of(path) == [HEAD, LINE]
-    written.close()
     assert path.stat().st_mode & 0o077 == 0, "others need not read where UAVs are"
     with path.open("a") as file:
         file.write('{"received": 1.5, "repo')
@@ -102,21 +107,21 @@ def test_a_line_that_cannot_be_written_is_not_kept(tmp_path, monkeypatch):
     assert lines_of(written.path) == [HEAD, later]
 
 
-GOOD = '{"journal": "damian-advice", "version": 2, "fleet": "x", "uavs": ["A"], "about": {}}\n'
+GOOD = '{"journal": "damian-advice", "version": 3, "fleet": "x", "uavs": ["A"], "about": {}}\n'
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("nonsense\n", "it is not JSON"),
-        (GOOD.replace("2", "1"), "line 1: version: 1: Input should be 2"),
+        (GOOD.replace("3", "2"), "line 1: version: 2: Input should be 3"),
         (GOOD, "it is of other landing points"),
     ],
 )
 def test_a_journal_of_something_else_is_refused(node, tmp_path, text, message):
     (tmp_path / "x.jsonl").write_text(text)
     with pytest.raises(InputError) as error:
-        AdviceSession(lambda uavs: Fleet(node, uavs, lambda _: pytest.fail("it was asked")), tmp_path)
+        AdviceSession(lambda uavs, mark: Fleet(node, uavs, lambda _: pytest.fail("it was asked")), tmp_path)
     assert str(error.value).startswith(f"{tmp_path / 'x.jsonl'}: {message}")
 
 
@@ -128,7 +133,7 @@ def test_journals_are_of_one_session_until_it_is_closed(make_session):
     with pytest.raises(InputError, match=r"journal: .*journals is in use by another run"):
         make_session()
     session.close()
-    assert [*make_session().fleets] == ["north"]
+    assert make_session().names == ["north"]
 
 
 # Other settings.
@@ -142,7 +147,7 @@ def test_a_journal_of_other_settings_is_refused_with_both_values(make_session):
     assert f"north.jsonl: it is of other settings: {message}" in str(error.value)
     now = ["port=8000", "host=0.0.0.0", "journal=x", "device=cuda", "agents=7"]
     session = make_session(overrides=["+region=llanbedr", *now, *WORDS[1:]])
-    assert [*session.fleets] == ["north"], "these may differ"
+    assert session.names == ["north"], "these may differ"
 
 
 # A journal that cannot be written.

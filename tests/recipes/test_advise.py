@@ -21,7 +21,7 @@ B,NA,52.8133,-4.1264,0,NA,NA,NA,0.5,0
 C,NA,52.8154,-4.1311,1,180,NA,70,NA,NA
 """
 TOKEN = "a-token-of-the-service"
-SCRIPT = ["policy=script", "actions.distances=[0,30,60]", "region.initial_conditions=1"]
+SCRIPT = ["policy=script", "actions.distances=[0,30,60]", "region.initial_conditions=1", "reserve=0"]
 
 
 @pytest.fixture
@@ -66,7 +66,15 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
     train()
     rows = TABLE.splitlines()
     Path("two.csv").write_text("\n".join(rows[:3]))
-    answer = json.loads((run("checkpoint=trained", "reports=two.csv") / "advice.json").read_text())
+    for word in ("motion=instant", "motion=polynomial"):  # what is given now does not change the training
+        check_refused(
+            lambda word=word: run("checkpoint=trained", "reports=two.csv", word), "motion: instant: ", capsys
+        )
+    answer = json.loads(
+        (
+            run("checkpoint=trained", "reports=two.csv", "instant=true", "reserve=0") / "advice.json"
+        ).read_text()
+    )
     assert [each["ID"] for each in answer] == ["A", "B"]
     assert all(each["state"] in ("fly", "hold") for each in answer)
 
@@ -102,7 +110,7 @@ def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
 
 def session_of(folder: Path) -> AdviceSession:
     region = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
-    return make_session(AdviseConfig(policy="script", region=region), folder)
+    return make_session(AdviseConfig(policy="script", region=region, reserve=0.0), folder)
 
 
 @pytest.fixture
@@ -126,6 +134,11 @@ def test_tables_in_a_folder_are_answered_and_wrong_ones_put_aside(inbox, tmp_pat
     assert names == {"1.csv.done", "2.csv.done", ".hidden.csv", "advice.csv", "advice.json", *refused}
     assert "line 2: ID: 'Z' is no UAV" in (inbox / "3.csv.refused.txt").read_text()
     assert [row["ID"] for row in json.loads((inbox / "advice.json").read_text())] == ["A", "B", "C"]
+    answers = json.loads((inbox / "advice.json").read_text())
+    said = [f"{each['ID']},{each['answer']},accepted" for each in answers if each["answer"]]
+    (inbox / "5.csv").write_text("\n".join(["ID,Answer,status", *said]))
+    assert read_inbox(session, "main", inbox, 1e9 + 10.5)
+    assert [row["state"] for row in json.loads((inbox / "advice.json").read_text())] == ["bound"] * 3
     assert not read_inbox(session, "main", inbox, 1e9 + 11)
     session.close()
     again = session_of(tmp_path / "journals").fleet("main")

@@ -40,7 +40,6 @@ def write_journal(path: Path) -> None:
             place = {"lat": 52.811 + 1e-4 * second, "lon": -4.1290, "battery": 100 - second}
             row = {"id": uav, "time": 1.7e9 + second, "source spotted": second == 3, **place}
             journal.append(Received(received=1.7e9 + second + late, reports=[row]))
-    journal.close()
 
 
 @pytest.mark.slow
