@@ -21,7 +21,7 @@ from damian.compare.comparison import (
     Comparison,
     Row,
 )
-from damian.compare.figures import plot_curves, plot_delays, plot_norms
+from damian.compare.figures import plot_curves, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.envs.pipeline import has_message_delay
@@ -126,10 +126,7 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     write_csv(folder / TABLE, [line.cells() for line in comparison.lines])
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results, missing)))
     plot_curves(comparison, results.curves, config.experiment.best, folder / CURVES)
-    if config.experiment.panels:
-        plot_delays(comparison, config.experiment.panels, folder / FIGURE)
-    else:
-        plot_norms(comparison, folder / FIGURE)
+    plot_norms(comparison, folder / FIGURE)
 
 
 def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> list[str]:

@@ -18,7 +18,6 @@ from matplotlib.ticker import EngFormatter
 
 from damian.common.plotting import COLOURS, STYLE
 from damian.compare.comparison import (
-    ALL_MESSAGES,
     BOUNDS,
     HELD_OUT_MARK,
     NOT_LATE,
@@ -110,31 +109,6 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
         for axis in axes[:, 0]:
             axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
         _legend(axes[0, -1], axes.flat)
-        figure.savefig(path, dpi=150)
-
-
-def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], path: Path) -> None:
-    """Draw the score of the arms of each panel over the delays of the first task, with 95 % intervals.
-
-    Below stands the recovery, or without a naive arm the share of the script's score that knows all messages
-    on time (dotted). Dashed lines: the undelayed arm and the random policy, without delay.
-    """
-    task = comparison.tasks()[0]
-    delays = comparison.delays(task)
-    present = {arm for delay in delays for arm in comparison.present(task, delay)}
-    panels = {title: [arm for arm in arms if arm in present] for title, arms in panels.items()}
-    panels = {title: arms for title, arms in panels.items() if arms}
-    if not panels:
-        plot_norms(comparison, path)
-        return
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(3.6 * len(panels) + 0.6, 5.0), layout="constrained")
-        axes = figure.subplots(2, len(panels), squeeze=False, sharex=True)
-        for (title, arms), column in zip(panels.items(), axes.T, strict=True):
-            column[0].sharey(axes[0, 0])
-            column[0].set_title(title)
-            _delay_column(column, comparison, task, arms)
-        axes[0, 0].set_ylabel(f"{comparison.score.replace('_', ' ')}, {comparison.policy}")
         figure.savefig(path, dpi=150)
 
 
@@ -237,48 +211,8 @@ def _known_norms(comparison: Comparison, task: str) -> dict[str, dict[int, Estim
     return found
 
 
-def _delay_column(column: Sequence[Axes], comparison: Comparison, task: str, arms: Sequence[str]) -> None:
-    """Draw the scores of arms over the delays of a task; below, their recovery or share of the oracle's."""
-    above, below = column
-    delays = comparison.delays(task)
-    has_naive = any(comparison.arms[arm].naive for arm in arms)
-    won = "recovery" if has_naive else "of_oracle"
-    compared = [comparison.compared(task, delay) for delay in delays]
-    for arm in arms:
-        scores = [comparison.mean(task, delay, arm) for delay in delays]
-        shown = [(above, list(enumerate(scores)))]
-        if not comparison.arms[arm].naive:
-            shown += [(below, [(x, found[arm][won]) for x, found in enumerate(compared) if arm in found])]
-        for axis, estimates in shown:
-            known = [(x, estimate) for x, estimate in estimates if not np.isnan(estimate.value)]
-            if known:
-                _error_bars(axis, known, label=arm, **look(comparison, arm))
-    _references(above, comparison, task)
-    for level in (0, 1):
-        below.axhline(level, **_LEVEL)
-    above.legend(frameon=False)
-    below.set_xticks(range(len(delays)), delays)
-    below.set_ylabel("recovery (0: naive, 1: undelayed)" if has_naive else "share of the script's return")
-    below.set_xlabel("delay of the observations [steps]")
-
-
 def _error_bars(axis: Axes, known: Sequence[tuple[float, Estimate]], **style: Any) -> None:
     """Draw known estimates at their places; an infinite interval has no bar."""
     bars = np.array([(each.value - each.low, each.high - each.value) for _, each in known]).T
     places, values = zip(*((x, each.value) for x, each in known), strict=True)
     axis.errorbar(places, values, yerr=bars, markersize=4, **style)
-
-
-def _references(axis: Axes, comparison: Comparison, task: str) -> None:
-    """Draw the means of the undelayed arm, the random policy and the script as horizontal lines."""
-    undelayed = (task, NOT_LATE, comparison.undelayed)
-    lines = [("undelayed", "--", comparison.values(*undelayed, comparison.policy, comparison.score))]
-    lines.append((RANDOM, "--", comparison.values(*undelayed, RANDOM, comparison.score)))
-    for delay in comparison.delays(task)[:1] if comparison.oracle else []:
-        found = comparison.values(task, delay, str(comparison.oracle), ALL_MESSAGES, comparison.score)
-        lines.append(("script, all messages on time", ":", found))
-    for label, style, values in lines:
-        if values:
-            level = fmean(values.values())
-            axis.axhline(level, color="0.5", linestyle=style, linewidth=0.8)
-            axis.annotate(label, (0.01, level), xycoords=("axes fraction", "data"), fontsize=6, va="bottom")

@@ -289,7 +289,6 @@ class Experiment(Settings):
     held_out: dict[str, HeldOut] = setting({}, "Changed tasks, TASK@NAME, to evaluate all policies in.")
     first_seed: int = setting(0, "The seeds of every arm count from this one.", low=0)
     best: dict[str, float] = setting({}, "Best possible value of a measure, drawn in its learning curves.")
-    panels: dict[str, list[str]] = setting({}, "Arms of each column of figure.png, by its title.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -308,9 +307,6 @@ class Experiment(Settings):
                 checks.one_of(f"experiment.held_out.{name}.tasks", task, self.tasks)
         for name in self.best:
             checks.one_of("experiment.best", name, PERCEIVED_SCORES)
-        for title, arms in self.panels.items():
-            for arm in arms:
-                checks.one_of(f"experiment.panels.{title}", arm, self.arms)
 
     def _check_arms(self) -> None:
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
