@@ -16,7 +16,6 @@ from damian import (
     Uniform,
     set_seed,
 )
-from damian.common.errors import InputError
 from damian.delays.samplers import MessageContext
 
 
@@ -39,11 +38,6 @@ def test_a_policy_may_write_its_action_under_another_name_than_the_environment_r
         found.append(torch.stack(steps))
     assert found[0].equal(found[1])
     check_env_specs(renamed)
-
-
-def test_several_actions_are_delayed_by_several_transforms():
-    with pytest.raises(InputError, match="in_keys_inv"):
-        ActionDelay(2, in_keys_inv=["action", "other"])
 
 
 def drawn(message: MessageContext) -> torch.Tensor:
