@@ -90,8 +90,8 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         if flies_script:
             oracle.check(unseeded)
         elif flown is None and not flies_alone:
-            should = "has no setting teacher, so that it imitates nobody"
-            checks.require(not arm.teacher or hasattr(unseeded.learner, "teacher"), "learner", name, should)
+            able = not arm.teacher or hasattr(unseeded.learner, "teacher")
+            checks.require(able, "learner", unseeded.learner.name, "has no setting teacher")
             check_learning(unseeded)
     except InputError as error:
         raise InputError(f"{task}/{delay}/{name}: {error}") from None

@@ -88,10 +88,7 @@ the ``frames`` (environment steps in training) and ``seconds``. Unknown or meani
 
 
 def regime(arms: Mapping[str, Arm], name: str) -> str:
-    """The regime of an arm: its own, or R3 without delay, R2 with a policy trained without, or else R0.
-
-    A policy that it flies, starts from, or imitates counts alike.
-    """
+    """The regime of an arm: its own, or R3 without delay, R2 if it needs a policy without, or else R0."""
     arm = arms[name]
     if arm.regime:
         return arm.regime

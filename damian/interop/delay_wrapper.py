@@ -15,7 +15,7 @@ from damian.delays.line import DelayLine, Memory
 from damian.transforms.context import ContextReader
 
 
-class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Delays what the agent observes, what it does, or both, as ``ObservationDelay`` and ``ActionDelay`` do.
 
     The agent holds the observation that was made last among those that have arrived, at first that of the
@@ -47,9 +47,6 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         default: Any = None,
         dt: float = 1.0,
     ) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(
-            self, observation=observation, action=action, loss=loss, default=default, dt=dt
-        )
         super().__init__(env)
         self._observations = _Link("observation", observation, loss, dt)
         self._actions = _Link("action", action, 0.0, dt, before_step=True)
@@ -65,7 +62,6 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         executed, _ = self._actions.send(action)
         observation, reward, terminated, truncated, info = self.env.step(executed)
         held, age = self._observations.send(observation)
-        # A copy, as users may keep and change what they get.
         return copy.deepcopy(held), reward, terminated, truncated, info | {"age": age}
 
 
