@@ -15,7 +15,7 @@ from damian.delays.line import DelayLine, Memory
 from damian.transforms.context import ContextReader
 
 
-class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
+class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Delays what the agent observes, what it does, or both, as ``ObservationDelay`` and ``ActionDelay`` do.
 
     The agent holds the observation that was made last among those that have arrived, at first that of the
@@ -28,13 +28,11 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, action: delay of each: steps (``3``), a time (``"3s"``), a distribution
             (``Uniform(3, 7)``), or a function, as ``damian.Function`` says.
         loss: probability that an observation never arrives.
-        default: the action that is executed until the first one arrives; if not given, the legal value
-            nearest to 0.
+        default: the action that is executed until the first one arrives; if not given, that nearest to 0.
         dt: length of a step [s], for delays given as times.
 
     Examples:
         >>> env = DelayWrapper(gymnasium.make("Pendulum-v1"), observation=Uniform(1, 4), action=2)
-        >>> observation, info = env.reset(seed=0)  # the seed also decides the delays
     """
 
     def __init__(
@@ -47,6 +45,8 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         default: Any = None,
         dt: float = 1.0,
     ) -> None:
+        told = {"observation": observation, "action": action, "loss": loss, "default": default, "dt": dt}
+        gymnasium.utils.RecordConstructorArgs.__init__(self, **told)
         super().__init__(env)
         self._observations = _Link("observation", observation, loss, dt)
         self._actions = _Link("action", action, 0.0, dt, before_step=True)
