@@ -159,7 +159,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
     failed: list[Run] = []
     has_runs = any((folder / task).exists() for task in config.experiment.tasks)
     if config.report_only and (folder / ROWS).exists() and not has_runs:
-        results, missing = stored_results(folder, partial(includes, config)), []
+        results, missing = stored_results(folder).only(partial(includes, config)), []
     else:
         if config.report_only and config.seeds is None:  # all up to the last one with a run
             names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
@@ -179,7 +179,7 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
     """Carry out the runs, unless only a report is asked for."""
     runs, failed, kept = plan(config, folder), [], Results([], [])
     if config.keep and (folder / ROWS).exists():
-        kept = stored_results(folder, lambda row: True)
+        kept = stored_results(folder)
         runs = _not_kept(runs, kept)
     for run in runs:
         check_stored(run)

@@ -49,7 +49,7 @@ def results(folder: str | Path) -> Any:
 def rows_of(folder: Path) -> list[dict[str, Any]]:
     """The results in a folder, a row for each policy of each run."""
     if is_comparison(folder):
-        return [dict(row) for row in stored_results(folder, lambda row: True).rows]
+        return [dict(row) for row in stored_results(folder).rows]
     return sweep_rows(folder)[1]
 
 

@@ -102,7 +102,7 @@ class Fleet:
         self.homes: list[int] = []
         """Landing point of the first report of each UAV, to which it returns; empty until all have one."""
         self.commands = [""] * len(self.uavs)
-        """What a person has told each UAV: ``hold``, ``return``, or nothing."""
+        """The command of a person to each UAV: ``hold``, ``return``, or none."""
         self.n_answers = 0
         """Answers with an ID so far."""
         self.start: float | None = None

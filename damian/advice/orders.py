@@ -1,8 +1,8 @@
 """What UAVs are told to do: an order is offered, and moves the UAV in the books once it is acknowledged.
 
 Worked timeline, an answer that holds for 10 s: at 100 s the UAV asks and is offered a landing point until
-110 s; if it asks again before, it gets the same answer. At 103 s it says ``accepted``, and from then on it
-counts as bound for that landing point. Had nothing come by 110 s, the UAV would still stand where it stood.
+110 s; if it asks again before, it gets the same answer. At 103 s it says ``accepted``, and from then on the
+service takes it to fly to that landing point. Without an acceptance by 110 s, it is taken to stay.
 """
 
 from dataclasses import dataclass

@@ -6,8 +6,8 @@
 
 The service runs in a process of its own, on one core if the system lets it. Connections that stay open send
 the reports of 10 UAVs and a question for their advice, in turn; first at a fixed rate, then as fast as it
-goes. With ``--restart`` it starts with so many fleets of 3 UAVs, each of which has flown for an hour before
-it was killed: how long it takes until it listens, and until it has answered a first question of every fleet,
+goes. With ``--restart`` it starts with this number of fleets of 3 UAVs, each with an hour of flight in its
+journal: how long it takes until it listens, and until it has answered a first question of every fleet,
 and how long questions take from then on. Where other programs use the cores too, the processor time of a
 request tells more than the latencies.
 """

@@ -96,9 +96,9 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
     return Results(rows, points)
 
 
-def stored_results(folder: Path, included: Callable[[Row], bool]) -> Results:
-    """Read the results that a folder stores; ``included`` says which rows."""
-    return Results(*(_read(folder / name) for name in (ROWS, CURVES))).only(included)
+def stored_results(folder: Path) -> Results:
+    """Read the results that a folder stores."""
+    return Results(*(_read(folder / name) for name in (ROWS, CURVES)))
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

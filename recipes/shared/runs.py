@@ -2,7 +2,7 @@
 
 import random
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -176,7 +176,7 @@ def _components(node: Any) -> Iterator[str]:
 
 def names_own_code(config: TrainConfig) -> bool:
     """Do the settings name components of your own, which a program imports only with ``trust=true``?"""
-    return any(True for _ in _components(OmegaConf.create(dict(leaves(config)))))
+    return any(_components(asdict(config)))
 
 
 def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfig:
