@@ -13,8 +13,6 @@ from damian.common.errors import InputError
 from damian.delays.samplers import MessageContext
 from damian.interop import DelayWrapper
 
-N_STEPS = 40
-
 
 def by_time(message: MessageContext) -> torch.Tensor:
     """Delays that follow from the time alone, so that messages overtake each other without chance."""
@@ -33,7 +31,7 @@ def test_the_wrapper_delays_as_the_transforms_do(name, observation, action):
     env = DelayWrapper(inner, observation, action)
     held, info = env.reset()
     rng = np.random.default_rng(0)
-    for _ in range(N_STEPS):
+    for _ in range(40):
         assert np.array_equal(held, now["observation"].numpy())
         assert info["age"] == now["age"].item()
         low, high = (-2, 2) if name == "Pendulum-v1" else (0, 2)

@@ -38,6 +38,8 @@ def test_a_mistake_in_recompute_is_one_line(change, message):
 
 def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused():
     steps, storage = rollout(make_env(()), 8), make_storage(())
+    with pytest.raises(InputError, match="step_count grows from world to world"):
+        stored(make_storage(()), steps.transpose(0, 1))
     stored(storage, steps)
     for batch in (steps.transpose(0, 1), steps[:2]):
         with pytest.raises(InputError, match=r"steps: a batch of shape \[.*\] is not one of 3 worlds: give"):
