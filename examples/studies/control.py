@@ -1,20 +1,25 @@
-"""Apply the delay transforms to another environment: SAC on Gymnasium's Pendulum-v1 with late observations.
+"""Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed late.
 
-    python examples/studies/pendulum.py --jobs 2                  (half an hour on two free cores)
-    python examples/studies/pendulum.py --arms history bpql       (these arms only)
-    python examples/studies/pendulum.py --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
+    python examples/studies/control.py --jobs 2                   (Pendulum-v1; half an hour, two free cores)
+    python examples/studies/control.py --arms history bpql        (these arms only)
+    python examples/studies/control.py --env HalfCheetah-v5 --steps 200000 --delay 5 --hidden 256 --lr 3e-4 \\
+        --out runs/cheetah                                        (pip install "gymnasium[mujoco]")
+    ... --shortest 1 --delay 5 --out runs/cheetah_random          (delays are drawn from 1 to 5 steps)
 
 Four arms are trained for each seed: undelayed; naive, whose observations are late; history, which also
-observes the agent's latest actions; and bpql, whose actor is that of history, but whose critics read only
-the state, once it has arrived (``BackupdateStorage``). The undelayed policy is also evaluated under several
-delays. The folder gets the mean returns as results.md and results.csv, and a JSON file for each arm and seed.
+observes the agent's latest actions, and the age of the observation if that varies; and bpql, whose actor is
+that of history, but whose critics read only the state, once it has arrived (``BackupdateStorage``). The
+undelayed policy is also evaluated under the delay. The folder gets the mean returns as results.md and
+results.csv, and a JSON file for each arm and seed, with the learning curve.
 """
 
 import csv
 import statistics
 from argparse import Namespace
-from typing import cast
+from collections.abc import Callable
+from typing import NamedTuple, cast
 
+import gymnasium
 import torch
 from study import Results, carried_out, parser
 from tensordict import NestedKey, TensorDictBase
@@ -23,6 +28,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import (
     CatTensors,
     Compose,
+    DoubleToFloat,
     EnvBase,
     GymEnv,
     RenameTransform,
@@ -37,6 +43,7 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common.tables import markdown_table
+from damian.delays.laws import Uniform
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
@@ -47,26 +54,37 @@ from damian.settings import BpqlConfig
 from damian.transforms import ActionHistory, ObservationDelay, set_seed
 
 ARMS = ("undelayed", "naive", "history", "bpql")
-DEPLOYED = {0: -145, 2: -153, 3: -324, 4: -757, 6: -777, 8: -977}
-REFERENCE = {("undelayed", d): r for d, r in DEPLOYED.items()}
-REFERENCE |= {("naive", 6): -1154, ("history", 6): -155, ("bpql", 6): -144}
-"""Returns by arm and delay: one seed of an independent implementation, 20 000 steps; for orientation only."""
-
-HORIZON = 200  # steps of an episode
 RANDOM_STEPS = 1000  # steps with random actions before the first update
+CURVE = 10  # points of a learning curve
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
-BATCH, LR, GAMMA, TAU = 256, 1e-3, 0.99, 0.005
+BATCH, GAMMA, TAU = 256, 0.99, 0.005
 OBSERVED = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION)  # of the actor, and the state for critics
 OUTPUTS = (*OBSERVED, "observation", "received", "age", "delay", "step_count", keys.REWARD)
 STORED = [*OBSERVED, "step_count", keys.ACTION, *map(next_key, (*OUTPUTS, *keys.ENDS))]
 
 
-def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
-    """Pendulum-v1 with delayed observations and an action history.
+class Task(NamedTuple):
+    """An environment of Gymnasium, and how late it is observed."""
+
+    name: str = "Pendulum-v1"
+    shortest: int = 0
+    """Shortest delay [steps]; delays are drawn for each observation."""
+    longest: int = 0
+    """Longest delay [steps]."""
+    history: int = 0
+    """Number of latest actions that are appended to the actor's observation."""
+
+    @property
+    def horizon(self) -> int:
+        """Steps of an episode."""
+        return gymnasium.spec(self.name).max_episode_steps or 0
+
+
+def make_env(task: Task, worlds: int | None = None) -> EnvBase:
+    """A control task with delayed observations and an action history.
 
     Args:
-        delay: of the observations [steps].
-        history: number of latest actions that are appended to the actor's observation.
+        task: the environment, its delays and the number of past actions.
         worlds: batch size of a ``SerialEnv``; a single environment without a batch size if not given.
 
     Returns:
@@ -74,33 +92,36 @@ def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
         a learner reads only what follows from the latter.
     """
 
-    def pendulum() -> EnvBase:
-        return GymEnv("Pendulum-v1")
+    def control() -> EnvBase:
+        return TransformedEnv(GymEnv(task.name), DoubleToFloat())
 
+    varies = task.shortest < task.longest
+    late = Uniform(task.shortest, task.longest) if varies else task.longest
+    seen = ["received", "age"] if varies and task.history else ["received"]
     transforms: list[Transform] = [
         RewardSum(),
         StepCounter(),
-        ObservationDelay(delay, ["observation"], ["received"], delay_key="delay"),
+        ObservationDelay(late, ["observation"], ["received"], delay_key="delay"),
         CatTensors(["received"], "state", del_keys=False),
-        CatTensors(["received"], "observed", del_keys=False),
+        CatTensors(seen, "observed", del_keys=False),
     ]
-    if history:
-        transforms.append(ActionHistory(history, append_to="observed"))
+    if task.history:
+        transforms.append(ActionHistory(task.history, append_to="observed"))
     # The learner expects these keys; a single agent needs no agent dimension.
     outputs = {"observed": keys.OBSERVATION, "state": keys.GLOBAL_OBSERVATION, "reward": keys.REWARD}
     transforms.append(RenameTransform([*outputs], [*outputs.values()], ["action"], [keys.ACTION]))
-    return TransformedEnv(SerialEnv(worlds, pendulum) if worlds else pendulum(), Compose(transforms))
+    return TransformedEnv(SerialEnv(worlds, control) if worlds else control(), Compose(transforms))
 
 
 def arrived_states(steps: TensorDictBase, observations: Tensor) -> dict[NestedKey, Tensor]:
-    """The states after steps [T, B]: what was observed then, as far as it has arrived, [T, B, 3]."""
+    """The states after steps [T, B]: what was observed then, as far as it has arrived, [T, B, D]."""
     return {next_key(keys.GLOBAL_OBSERVATION): observations}
 
 
-def make_learner(env: EnvBase, arm: str, steps: int, delay: int, hidden: int) -> Sac:
+def make_learner(env: EnvBase, arm: str, steps: int, delay: int, hidden: int, lr: float = 1e-3) -> Sac:
     """The learner that also trains UAVs: SAC, or BPQL with a storage that learns of states as they arrive."""
     kind = BpqlConfig if arm == "bpql" else SacConfig
-    config = kind(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha_init=1.0)
+    config = kind(lr=lr, alpha_lr=lr, gamma=GAMMA, tau=TAU, alpha_init=1.0)
     model = ModelConfig(hidden=[hidden, hidden], activation="relu")
     setup = LearningSetup(model, 1, 1, 1, critic_key=keys.OBSERVATION)
     if arm != "bpql":
@@ -111,8 +132,10 @@ def make_learner(env: EnvBase, arm: str, steps: int, delay: int, hidden: int) ->
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
 
-def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
-    """Train for ``steps`` environment steps, with one update after each."""
+def train(
+    env: EnvBase, learner: Sac, steps: int, bar: tqdm, watch: Callable[[int], None] | None = None
+) -> None:
+    """Train for ``steps`` environment steps, with one update after each; ``watch`` is told each step."""
     td = env.reset()
     for step in range(steps):
         # Outside of such a context TorchRL's actor takes the most likely action, and explores nothing.
@@ -123,6 +146,8 @@ def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
         if step >= RANDOM_STEPS:
             learner.update(draw(learner))
         bar.update()
+        if watch:
+            watch(step + 1)
         if transition["next", "done"].item():
             bar.set_postfix({"return": f"{transition['next', 'episode_reward'].item():.0f}"})
 
@@ -136,55 +161,66 @@ def draw(learner: Sac) -> TensorDictBase:
 
 
 @torch.no_grad()
-def evaluate_under(delay: int, history: int, actor: nn.Module, episodes: int) -> float:
+def evaluate_under(task: Task, actor: nn.Module, episodes: int) -> float:
     """Mean return of the most likely actions, in episodes with the same initial conditions at every call."""
-    env = make_env(delay, history, episodes)
+    env = make_env(task, episodes)
     set_seed(env, EVALUATION_SEED)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        rollout = env.rollout(HORIZON, actor, break_when_any_done=False)
+        rollout = env.rollout(task.horizon, actor, break_when_any_done=False)
     env.close()
-    return rollout[next_key(keys.REWARD)].sum(1).mean().item()
+    ended = rollout[next_key(keys.DONE)].long().cumsum(1) - rollout[next_key(keys.DONE)].long()
+    return (rollout[next_key(keys.REWARD)] * (ended == 0)).sum(1).mean().item()
 
 
 def run_arm(arm: str, seed: int, args: Namespace) -> dict[str, float]:
-    """Train and evaluate an arm; returns its mean returns by the delay of the evaluation."""
+    """Train and evaluate an arm; returns its mean returns by the delay of the evaluation and by step."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    delay = 0 if arm == "undelayed" else args.delay
-    history = args.delay if arm in ("history", "bpql") else 0
-    env = make_env(delay, history)
+    shortest = args.delay if args.shortest is None else args.shortest
+    late = Task(args.env, shortest, args.delay, args.delay if arm in ("history", "bpql") else 0)
+    task = Task(args.env) if arm == "undelayed" else late
+    env = make_env(task)
     set_seed(env, seed)
-    learner = make_learner(env, arm, args.steps, args.delay, args.hidden)
+    learner = make_learner(env, arm, args.steps, args.delay, args.hidden, args.lr)
+    found = {}
+
+    def watch(step: int) -> None:
+        if step % (args.steps // CURVE) == 0 and step < args.steps:
+            with torch.random.fork_rng():
+                found[f"after {step}"] = evaluate_under(task, learner.actor, args.episodes)
+
     with tqdm(total=args.steps, desc=f"seed {seed} {arm}") as bar:
-        train(env, learner, args.steps, bar)
-    delays = sorted({*DEPLOYED, args.delay}) if arm == "undelayed" else [delay]
-    return {str(d): evaluate_under(d, history, learner.actor, args.episodes) for d in delays}
+        train(env, learner, args.steps, bar, watch)
+    flown = {"0": task, str(args.delay): late} if arm == "undelayed" else {str(args.delay): late}
+    return found | {name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()}
 
 
 def table(results: Results, args: Namespace) -> str:
     """Write the results as results.csv and results.md; returns the latter's text."""
-    rows = [["arm", "delay", "mean", *(f"seed {seed}" for seed in args.seeds), "reference"]]
+    rows = [["arm", "delay", "mean", *(f"seed {seed}" for seed in args.seeds)]]
     for arm in args.arms:
         found = [results[arm, seed] for seed in args.seeds]
-        for delay in found[0]:
-            values = [returns[delay] for returns in found]
-            numbers = [f"{value:.0f}" for value in (statistics.mean(values), *values)]
-            rows.append([arm, delay, *numbers, str(REFERENCE.get((arm, int(delay)), ""))])
+        for name in found[0]:
+            values = [returns[name] for returns in found]
+            rows.append([arm, name, *(f"{value:.0f}" for value in (statistics.mean(values), *values))])
     with (args.out / "results.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
-    title = f"# Pendulum-v1, SAC, {args.steps} steps: return, mean of {args.episodes} episodes"
-    text = f"{title}\n\n{markdown_table(rows[0], rows[1:])}\n"
+    title = f"# {args.env}, SAC, {args.steps} steps: return, mean of {args.episodes} episodes"
+    text = f"{title}\n\n{markdown_table(rows[0], [row for row in rows[1:] if 'after' not in row[1]])}\n"
     (args.out / "results.md").write_text(text)
     return text
 
 
 def main(words: list[str] | None = None) -> None:
     """Train, evaluate and print the table."""
-    options = parser("SAC on Pendulum-v1 with late observations.", ARMS, "runs/pendulum")
+    options = parser("SAC on a control task with late observations.", ARMS, "runs/control")
+    options.add_argument("--env", default="Pendulum-v1", help="task of Gymnasium with continuous actions")
     options.add_argument("--steps", type=int, default=20_000, help="training steps of each arm")
     options.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
+    options.add_argument("--shortest", type=int, help="delays are drawn, from this to --delay [steps]")
     options.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
     options.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
+    options.add_argument("--lr", type=float, default=1e-3, help="learning rate of Adam")
     args = options.parse_args(words)
     print(table(carried_out(args, run_arm), args))
 

@@ -1,8 +1,8 @@
-"""The study ``pendulum``: SAC on Pendulum-v1 with the delay transforms."""
+"""The study ``control``: SAC on Pendulum-v1 with the delay transforms."""
 
 import pytest
 import torch
-from pendulum import draw, evaluate_under, make_env, make_learner, train
+from control import Task, draw, evaluate_under, make_env, make_learner, train
 from tensordict import TensorDictBase
 from torch import nn
 from tqdm import tqdm
@@ -14,7 +14,7 @@ from damian.learners.sac import Sac
 def learn(delay: int, history: int, steps: int, arm: str = "history") -> nn.Module:
     """The policy that is trained with one seed."""
     torch.manual_seed(0)
-    env = make_env(delay, history)
+    env = make_env(Task(shortest=delay, longest=delay, history=history))
     set_seed(env, 0)
     learner = make_learner(env, arm, steps, delay, 128)
     train(env, learner, steps, tqdm(disable=True))
@@ -24,12 +24,13 @@ def learn(delay: int, history: int, steps: int, arm: str = "history") -> nn.Modu
 # What the learners of the arms read.
 
 DELAY, STEPS = 3, 215  # an episode has 200 steps
+LATE = Task(shortest=DELAY, longest=DELAY, history=DELAY)
 
 
 def collected(arm: str, steps: int) -> Sac:
     """The learner of an arm after random actions."""
     torch.manual_seed(0)
-    env = make_env(DELAY, DELAY)
+    env = make_env(LATE)
     set_seed(env, 0)
     learner = make_learner(env, arm, 1000, DELAY, 8)
     train(env, learner, steps, tqdm(disable=True))
@@ -50,7 +51,7 @@ def steps() -> TensorDictBase:
 
 def test_the_states_that_critics_of_bpql_read_are_the_undelayed_observations_that_have_arrived(steps):
     assert len(steps) == STEPS
-    twin = make_env(0, 0)
+    twin = make_env(Task())
     twin.set_seed(0)
     now = twin.reset()
     for step in range(STEPS):  # the same actions without delay
@@ -80,10 +81,10 @@ def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(arm, wa
 @pytest.mark.slow
 def test_delay_lowers_the_return_and_the_action_history_restores_it():
     undelayed = learn(delay=0, history=0, steps=9_000)
-    returns = {delay: evaluate_under(delay, 0, undelayed, 20) for delay in (0, 6)}
+    returns = {delay: evaluate_under(Task(shortest=delay, longest=delay), undelayed, 20) for delay in (0, 6)}
     assert returns[0] > -300
     assert returns[6] < returns[0] - 300
-    naive = evaluate_under(6, 0, learn(delay=6, history=0, steps=12_000), 20)
+    naive = evaluate_under(Task(shortest=6, longest=6), learn(delay=6, history=0, steps=12_000), 20)
     for arm, steps in (("history", 12_000), ("bpql", 8_000)):
-        aware = evaluate_under(6, 6, learn(delay=6, history=6, steps=steps, arm=arm), 20)
+        aware = evaluate_under(Task(shortest=6, longest=6, history=6), learn(6, 6, steps, arm), 20)
         assert aware > naive + 300, arm
