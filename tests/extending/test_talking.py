@@ -1,0 +1,81 @@
+"""UAVs that attend to what they have heard of each other: what they observe of it, and that they learn."""
+
+import csv
+import importlib
+
+import pytest
+import torch
+from conftest import EXAMPLES
+from extensions import TINY
+from tensordict import TensorDict
+
+from damian import keys, make_env
+from damian.settings import LinkConfig, ModelConfig, ObservationConfig, ScenarioConfig
+from damian.transforms.server_node import OnboardNode
+
+WINDOW = 2
+WIDTH = 2 * WINDOW + 4
+
+
+@pytest.fixture
+def talking(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return importlib.import_module("talking")
+
+
+def make(agents):
+    observation = ObservationConfig(["spotted"], ["talking:heard"], window=WINDOW)
+    links = LinkConfig(kind="matrix", delay={"law": "uniform", "low": 1, "high": 4})
+    return make_env(
+        ScenarioConfig(agents=agents, observation=observation, links=links), 2, 0, extras=["message"]
+    )
+
+
+@pytest.mark.parametrize("agents", [2, 4])
+def test_what_a_uav_hears_equals_a_plain_loop_over_the_others(talking, agents):
+    env = make(agents)
+    (node,) = (each for each in env.transform if isinstance(each, OnboardNode))
+    node.dropped_keys = []
+    steps = env.rollout(9)
+    server, points = env.uav_env.server, env.uav_env.simulation.points
+    half = env.uav_env.simulation.airspace.scale[0] / 2
+    seen = steps["next"][keys.OBSERVATION][..., :-1].unflatten(-1, (agents - 1, WIDTH))
+    for world in range(2):
+        for step in range(9):
+            known = server.messages(steps["next"][keys.LINKED][world, step])
+            for i in range(agents):
+                others = [j for j in range(agents) if j != i]
+                for row, j in zip(seen[world, step, i], others, strict=True):
+                    places = [known.target[i, j], *points[known.trail[i, j]]]
+                    ways = torch.cat([(place - known.target[i, i]) / half for place in places])
+                    age = (step + 1) * env.uav_env.scenario.clock.dt - known.time[i, j]
+                    rest = torch.stack([known.spotted[i, j].float(), age / 10])
+                    torch.testing.assert_close(row, torch.cat([ways, rest]).clamp(-1, 1))
+    assert seen[..., -1].unique().numel() > 2, "the ages differ"
+
+
+def test_attention_takes_the_others_in_any_order_and_number_and_reads_their_ages(talking):
+    torch.manual_seed(0)
+    model = ModelConfig(hidden=[8])
+    three, five = (talking.TalkingConfig(width=8).make_actor(make(n), model) for n in (3, 5))
+    five.load_state_dict(three.state_dict())
+    n_actions = make(5).full_action_spec_unbatched[keys.ACTION].n
+    heard, own = torch.randn(4, 5, 4, WIDTH), torch.rand(4, 5, 1)
+
+    def logits(rows):
+        seen = {keys.OBSERVATION: torch.cat([rows.flatten(-2), own], -1)}
+        seen[keys.ACTION_MASK] = torch.ones(4, 5, n_actions, dtype=torch.bool)
+        return five.get_dist(TensorDict(seen, [4])).logits
+
+    torch.testing.assert_close(logits(heard.flip(-2)), logits(heard))
+    older = heard.clone()
+    older[..., 0, -1] += 1
+    assert not torch.allclose(logits(older), logits(heard), atol=1e-5)
+
+
+def test_who_talks_is_trained_and_flown_in_another_number(run):
+    words = ["observation.global_features=[talking:heard]", "learner=talking:TalkingConfig"]
+    first = run(*TINY, *words, "links=matrix", "links.delay=2", "aware=backupdate", "delay.obs=2")
+    flown = run(f"checkpoint={first}", "agents=4", "trust=true", program="evaluate", name="flown")
+    with (flown / "result.csv").open(newline="") as file:
+        assert float(next(csv.DictReader(file))["return"]) >= 0
