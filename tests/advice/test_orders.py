@@ -1,6 +1,5 @@
 """What UAVs are told in the field: by acknowledgement only, nothing unsafe, and the same after a restart."""
 
-import json
 import random
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from reporting import START
+from reporting import START, read_json
 from test_fleet import LLANBEDR, SEEN, scenario_of
 
 from damian import keys
@@ -17,7 +16,7 @@ from damian.advice.journal import Change, Command
 from damian.advice.known import UavLog
 from damian.advice.node import Node, for_uavs
 from damian.advice.playback import episode_of
-from damian.advice.rows import Acknowledgement, read_json, validated
+from damian.advice.rows import Acknowledgement, validated
 from damian.advice.session import SNAPSHOT, AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
@@ -68,7 +67,7 @@ class Field:
     def report(self, uav: str, point: int, **said: Any) -> list[str]:
         lat, lon = self.fleet.ground.place(point)
         row = {"ID": uav, "time": self.now, "lat": lat, "lon": lon, "battery": 90.0} | said
-        return self.session.report("north", read_json(json.dumps(row)), self.now)
+        return self.session.report("north", read_json(row), self.now)
 
     def ask(self, uav: str, after: float = 0.0):
         self.now += after

@@ -1,18 +1,16 @@
 """Fleets and their journals: what is written, what is restored, and what is refused."""
 
-import json
 import os
 from pathlib import Path
 
 import pytest
-from reporting import FREE, START
+from reporting import FREE, START, read_json
 from test_fleet import LLANBEDR, SEEN, TASKS, scenario_of
 
 from damian.advice import journal as module
 from damian.advice.fleet import Fleet
 from damian.advice.journal import About, Advised, Head, Journal, Received, read_head, read_lines
 from damian.advice.node import Node, for_uavs
-from damian.advice.rows import read_json
 from damian.advice.session import AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError, RunError
@@ -58,7 +56,7 @@ def report(
     session: AdviceSession, uav: str, time: float, point: int = 0, now: float | None = None
 ) -> list[str]:
     lat, lon = session.fleet("north").ground.place(point)
-    rows = read_json(json.dumps({"ID": uav, "time": time, "lat": lat, "lon": lon}))
+    rows = read_json({"ID": uav, "time": time, "lat": lat, "lon": lon})
     return session.report("north", rows, time if now is None else now)
 
 
