@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from reporting import FREE, START, read_json
 from test_fleet import LLANBEDR, SEEN, TASKS, scenario_of
+from test_round_trip import recurrent
 
 from damian.advice import journal as module
 from damian.advice.fleet import Fleet
@@ -14,9 +15,6 @@ from damian.advice.node import Node, for_uavs
 from damian.advice.session import AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError, RunError
-from damian.learners.mappo import MappoConfig
-from damian.learners.networks import ModelConfig
-from damian.learners.recurrent import add_recurrent_state
 
 UAVS = ["A", "B"]
 WORDS = ["region=llanbedr", "clock.simulation=1s", "delay.obs=0", "delay.obs={law: lag, steps: 2}"]
@@ -149,12 +147,6 @@ def test_a_journal_of_other_settings_is_refused_with_both_values(make_session):
 
 
 # A journal that cannot be written.
-
-
-def recurrent(env):
-    actor = MappoConfig().make_actor(env, ModelConfig(hidden=[8], rnn="gru"))
-    add_recurrent_state(env, actor)
-    return actor
 
 
 def fail(*_):
