@@ -234,22 +234,12 @@ def reason(error: BaseException, program: str = "train") -> str:
     return one_line(f"{key}: {text}" if key else text)
 
 
-def _interruption(error: BaseException) -> KeyboardInterrupt | None:
-    """The Ctrl-C during which an error was raised: one inside of OmegaConf makes it report a wrong key."""
-    found: BaseException | None = error
-    while found is not None and not isinstance(found, KeyboardInterrupt):
-        found = found.__context__
-    return found
-
-
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """End the program with one line on stderr if input is wrong (code 2) or a run cannot go on (3)."""
     try:
         yield
     except (InputError, RunError, OSError, *ERRORS) as error:
-        if stopped := _interruption(error):
-            end_interrupted(number_of(stopped))
         line, cause = reason(error), error.__cause__
         if os.environ.get("DAMIAN_TRACEBACK"):
             traceback.print_exception(error)

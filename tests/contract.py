@@ -4,11 +4,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
+from environments import KINDS
 from helpers import square, walking
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
@@ -65,14 +66,7 @@ class Drift(EnvBase):
         """The environment has no randomness."""
 
 
-def cartpole() -> EnvBase:
-    """A single world without batch dimensions."""
-    return GymEnv("CartPole-v1", categorical_action_encoding=True, max_episode_steps=4)
-
-
-def uavs() -> EnvBase:
-    """Two worlds of three UAVs, whose entries are under a nested key."""
-    return UavEnv(square(), num_worlds=2, extras=["message"])
+cartpole, uavs = KINDS["CartPole"].make, KINDS["UAVs"].make
 
 
 def unserved() -> EnvBase:

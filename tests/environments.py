@@ -72,12 +72,13 @@ class Teams(EnvBase):
         """The environment has no randomness."""
 
 
-def vmas() -> EnvBase:
-    """A multi-agent environment of VMAS."""
+def vmas(num_envs: int = 2, n_agents: int = 2, max_steps: int = 4, **options: Any) -> EnvBase:
+    """A multi-agent environment of VMAS: the first two numbers of an observation are the agent's position."""
     pytest.importorskip("vmas")
     from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
 
-    return VmasEnv("navigation", num_envs=2, seed=0, max_steps=4, n_agents=2, collisions=False)
+    sizes = {"num_envs": num_envs, "n_agents": n_agents, "max_steps": max_steps}
+    return VmasEnv("navigation", seed=0, **sizes, **options)
 
 
 def petting_zoo() -> EnvBase:
@@ -95,7 +96,7 @@ KINDS = {
         lambda: GymEnv("CartPole-v1", categorical_action_encoding=True, max_episode_steps=4), *ROOT
     ),
     "Pendulum": Kind(lambda: GymEnv("Pendulum-v1", max_episode_steps=4), *ROOT),
-    "VMAS": Kind(vmas),
+    "VMAS": Kind(lambda: vmas(collisions=False)),
     "PettingZoo": Kind(petting_zoo, *(("agent", name) for name in ROOT)),
     "PettingZoo, state": Kind(petting_zoo, "state", ("agent", "action"), ("agent", "reward")),
     "flags in the group": Kind(Teams),

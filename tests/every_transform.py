@@ -49,17 +49,12 @@ def channel(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
     return Channel(law, kind.observation, loss=0.1, **options)
 
 
-def cases(transforms: dict[str, Callable[..., StatefulTransform]]) -> pytest.MarkDecorator:
-    """Every kind of environment with every one of the transforms, and with a channel where that works."""
-    pairs = {
-        f"{name}, {kind}": (KINDS[kind], make) for kind in KINDS for name, make in transforms.items()
-    } | {f"Channel, {name}": (kind, channel) for name, kind in GROUPS.items()}
-    return pytest.mark.parametrize(("kind", "make"), pairs.values(), ids=pairs)
-
-
-every_case = cases(TRANSFORMS)
-every_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=TRANSFORMS)
-drawing = cases({name: TRANSFORMS[name] for name in ("ObservationDelay", "ActionDelay", "RewardDelay")})
+PAIRS = {f"{name} on {kind}": (KINDS[kind], make) for kind in KINDS for name, make in TRANSFORMS.items()} | {
+    f"Channel on {name}": (kind, channel) for name, kind in GROUPS.items()
+}
+"""Every kind of environment with every transform, and with a channel where that works."""
+DRAWING = {name: pair for name, pair in PAIRS.items() if name.partition("Delay")[1] or pair[1] is channel}
+drawing = pytest.mark.parametrize(("kind", "make"), DRAWING.values(), ids=DRAWING)
 
 
 def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> list[TensorDictBase]:

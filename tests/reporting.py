@@ -13,7 +13,7 @@ from damian import keys
 from damian.advice.fleet import Fleet
 from damian.advice.known import Ground
 from damian.advice.node import Node
-from damian.advice.rows import Report, read_json
+from damian.advice.rows import Report, Rows, reports_of, rows_of_json
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.settings.programs import FieldRules
@@ -104,9 +104,14 @@ class Reporter:
         return here[::-1]
 
 
+def read_json(rows: Any) -> Rows:
+    """A row, or rows, as the service reads them from JSON."""
+    return reports_of(rows_of_json(json.dumps(rows)))
+
+
 def as_reports(rows: Sequence[dict[str, Any]], now: float) -> list[Report]:
-    """Rows as the service reads them from JSON."""
-    reports = [report for _, report in read_json(json.dumps(list(rows)))] if rows else []
+    """The reports of rows that come in now."""
+    reports = [report for _, report in read_json(list(rows))] if rows else []
     for report in reports:
         report.stamp(now)
     return reports

@@ -220,16 +220,6 @@ def rows_of_json(text: str | bytes) -> Found:
     return [(f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)]
 
 
-def read_csv(text: str) -> Rows:
-    """Reports of a CSV table."""
-    return reports_of(rows_of_csv(text))
-
-
-def read_json(text: str | bytes) -> Rows:
-    """Reports of JSON: an object, or a list of objects."""
-    return reports_of(rows_of_json(text))
-
-
 def reports_of(found: Found) -> Rows:
     """Rows as reports."""
     if not found:

@@ -230,11 +230,6 @@ class AdviceSession:
         replay(fleet, line)
         return fleet.uavs
 
-    def advance(self, now: float) -> None:
-        """Let all fleets take their steps, so that no answer has to wait for many of them."""
-        for fleet in self.fleets.values():
-            fleet.advance(now)
-
     def upkeep(self, clock: Callable[[], float]) -> Iterator[None]:
         """Bring fleets up to date, one after the other; snapshots take a part of the time only."""
         spent = 0.0

@@ -97,12 +97,6 @@ def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
     return name
 
 
-def require_parentheses(first: Any, written: str) -> None:
-    """Refuse a decorator without parentheses, which gets the function as its first argument."""
-    if inspect.isfunction(first):
-        raise InputError(f"{first.__name__}: write {written} above it, with parentheses")
-
-
 def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str) -> None:
     """Require that ``given`` are the keyword-only arguments of a function; ``path`` names it in errors."""
     accepted = inspect.signature(function).parameters

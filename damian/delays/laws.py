@@ -25,7 +25,7 @@ from damian.delays.samplers import (
     Recorded,
     Sampler,
 )
-from damian.settings.delays import LONGEST
+from damian.settings.delays import LONGEST, is_matrix
 from damian.settings.fields import rules, setting
 
 Delay = int | str
@@ -427,10 +427,3 @@ def same_size(settings: Mapping[str, Any]) -> int | None:
         found = ", ".join(f"{key} {n} x {n}" for key, n in sizes.items())
         raise InputError(f"{found}: these are of different numbers of agents")
     return next(iter(sizes.values()), None)
-
-
-def is_matrix(value: Any) -> bool:
-    """Is a setting given for each link."""
-    if isinstance(value, Tensor):
-        return value.dim() > 0
-    return isinstance(value, Sequence) and not isinstance(value, str)

@@ -131,12 +131,8 @@ class UavEnv(EnvBase):
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Put the worlds into the state of a ``state_dict``, of as many worlds and the same scenario."""
-        loaded = {}
-        for name, own in self.worlds._asdict().items():
-            shape, should = list(state[name].shape), f"is not {list(own.shape)}: load it into as many worlds"
-            checks.require(shape == list(own.shape), f"UavEnv: shape of the loaded {name}", shape, should)
-            loaded[name] = state[name].to(own, copy=True)
-        self.worlds = PackedState(**loaded)
+        own = self.worlds._asdict()
+        self.worlds = PackedState(**{name: torch.empty_like(own[name]).copy_(state[name]) for name in own})
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own random stream, [B] integers; the next reset begins its first episode.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from damian.common import checks, devices
 from damian.common.errors import InputError
-from damian.common.registry import Registry, require_parentheses
+from damian.common.registry import Registry
 from damian.common.tensors import distances, gather_rows
 from damian.server.belief import (
     SourceGrid,
@@ -172,7 +172,6 @@ def feature(
         ... def track(cache):  # in lab.py, used as observation.local_features=[spotted,lab:track]
         ...     return cache.messages.track / (2 * math.pi)
     """
-    require_parentheses(scope, '@damian.feature("local")')
     checks.one_of("scope of a feature", scope, ("local", "global", "belief", "actor"))
     return lambda compute: Feature(compute, scope, width, low, high)
 

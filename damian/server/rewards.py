@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
+from damian.common.registry import Registry, check_parameters, name_of
 from damian.server.features import FEATURES
 from damian.server.termination import Status
 from damian.settings.server import INDIVIDUAL, SYSTEM, RewardConfig
@@ -50,7 +50,6 @@ def reward_term(
         ... def low_battery(features, counters, *, below=0.3):
         ...     return (features["battery"] < below).float()
     """
-    require_parentheses(reads, "@damian.reward_term(reads=[...])")
     checks.one_of("scope of a reward term", scope, ("individual", "system"))
     return lambda compute: RewardTerm(compute, tuple(reads), scope)
 

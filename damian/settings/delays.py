@@ -96,8 +96,8 @@ class LinkConfig(Settings):
 
 
 def is_matrix(written: Any) -> bool:
-    """Is a setting of the links given for each pair of UAVs?"""
-    return isinstance(written, Sequence) and not isinstance(written, str)
+    """Is a setting of the links given for each pair of UAVs, as a list or a tensor?"""
+    return getattr(written, "ndim", 0) > 0 or (isinstance(written, Sequence) and not isinstance(written, str))
 
 
 @dataclass

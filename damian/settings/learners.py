@@ -107,10 +107,6 @@ class LearningSetup(NamedTuple):
         return (self.longest_period + 2 * self.longest_delay) * self.worlds
 
 
-READABLE = ("message", "state", "reward_terms", "privileged", "hindsight")
-"""What a learner may name in ``LearnerConfig.reads``."""
-
-
 @dataclass
 class LearnerConfig(Settings):
     """Settings of a learner, which make it; those that all learners share.
@@ -134,11 +130,6 @@ class LearnerConfig(Settings):
     steps then also hold the newest message that has arrived since (``keys.HINDSIGHT``)."""
     learner: ClassVar[str] = ""
     """Path of the class that ``make`` builds, from environment, settings, setup and replay buffer."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in self.reads:
-            checks.one_of(f"{type(self).__name__}.reads", name, READABLE)
 
     def check(self, setup: LearningSetup) -> None:
         """Check that this learner can learn in such a run.

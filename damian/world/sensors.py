@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
+from damian.common.registry import Registry, check_parameters, name_of
 from damian.world.messages import Messages
 from damian.world.state import State
 
@@ -45,7 +45,6 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
         ...     to_source = state.position[..., :2] - state.source.unsqueeze(-2)
         ...     return (-torch.linalg.vector_norm(to_source, dim=-1) / reach).exp()
     """
-    require_parentheses(width, "@damian.sensor()")
     checks.whole("width of a sensor", width, 1)
     return lambda compute: Sensor(compute, width, compute.__name__)
 

@@ -151,7 +151,7 @@ def fly_an_hour(folder: Path, words: Sequence[str], n_fleets: int) -> None:
     Each UAV reports every 5 s, and is sent somewhere every 30 s. One fleet, f10000, flies; the others are
     copies.
     """
-    from damian.advice.rows import Acknowledgement, read_json  # noqa: PLC0415 (needs the extra advise)
+    from damian.advice.rows import Acknowledgement, Report  # noqa: PLC0415 (needs the extra advise)
     from damian.recipes import cli  # noqa: PLC0415
     from damian.recipes.advise import make_session  # noqa: PLC0415
 
@@ -162,7 +162,8 @@ def fly_an_hour(folder: Path, words: Sequence[str], n_fleets: int) -> None:
     session.create("f10000", uavs)
     for second in range(0, 3600, 5):
         now = begin + second
-        session.report("f10000", read_json(json.dumps(reports(now, second // 5)[:3])), now + 0.5)
+        rows = [("", Report.model_validate(row)) for row in reports(now, second // 5)[:3]]
+        session.report("f10000", rows, now + 0.5)
         if second % 30 == 0:
             for each in session.advise("f10000", now + 1):
                 for status in ("accepted", "landed"):

@@ -122,18 +122,25 @@ def begun(distance: int = 30, time: float = START, **changed) -> Fleet:
     return fleet
 
 
-@pytest.mark.parametrize("task", ["belief", "clocks"])
+@pytest.mark.parametrize("task", ["belief", "clocks", "late", "held back", "history", "the last to arrive"])
 def test_after_a_long_silence_it_does_not_matter_when_somebody_asked(task, monkeypatch):
-    """One fleet takes every step when it comes, another one many at once."""
+    """One fleet takes every step when it comes, another one many at once, or skips those of silence."""
     monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", SILENT)
     fleets = [begun(**TASKS[task]) for _ in range(2)]
-    for step in range(0, 3 * SILENT, 7):
+    if task != "belief":
+        fleets[0].node.settles = 10**9  # so that it skips none
+    for fleet in fleets:
+        told(fleet, "b", START + 4, 30, START + 5.5, source_spotted=True)
+        advise(fleet, START + 6, ["c"])
+        told(fleet, "c", START + 8, 70)
+    for step in range(9, 3 * SILENT, 7):
         fleets[0].advance(START + step)
     for fleet in fleets:
         told(fleet, "a", START + 3 * SILENT + 5.5, 17, source_spotted=True)
         fleet.advance(START + 3 * SILENT + 9)
     one, other = (fleet.observe([0, 1, 2]) for fleet in fleets)
-    assert torch.equal(one[keys.OBSERVATION], other[keys.OBSERVATION])
+    for key in (keys.OBSERVATION, keys.RECEIVED, keys.HISTORY):
+        assert key not in one.keys(True) or torch.equal(one[key], other[key])
     assert fleets[0].step == fleets[1].step == 3 * SILENT + 9
 
 

@@ -1,15 +1,13 @@
 """What UAVs are told in the field: by acknowledgement only, nothing unsafe, and the same after a restart."""
 
-import json
 import random
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from reporting import FREE, START
+from reporting import START, read_json
 from test_fleet import LLANBEDR, SEEN, scenario_of
 
 from damian import keys
@@ -18,7 +16,7 @@ from damian.advice.journal import Change, Command
 from damian.advice.known import UavLog
 from damian.advice.node import Node, for_uavs
 from damian.advice.playback import episode_of
-from damian.advice.rows import Acknowledgement, read_json, validated
+from damian.advice.rows import Acknowledgement, validated
 from damian.advice.session import SNAPSHOT, AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
@@ -69,7 +67,7 @@ class Field:
     def report(self, uav: str, point: int, **said: Any) -> list[str]:
         lat, lon = self.fleet.ground.place(point)
         row = {"ID": uav, "time": self.now, "lat": lat, "lon": lon, "battery": 90.0} | said
-        return self.session.report("north", read_json(json.dumps(row)), self.now)
+        return self.session.report("north", read_json(row), self.now)
 
     def ask(self, uav: str, after: float = 0.0):
         self.now += after
@@ -429,43 +427,3 @@ def check_apart(fleet: Fleet) -> None:
             continue
         for other in fleet._others(uav):
             assert offer.goal not in fleet._booked(other), (fleet.uavs[uav], fleet.uavs[other])
-
-
-def answers_of(fleet: Fleet, seconds: Sequence[int], moves: random.Random) -> list:
-    """What a fleet observes at some times after reports."""
-    seen = []
-    for second in seconds:
-        lat, lon = fleet.ground.place(moves.randrange(300))
-        row = {"ID": moves.choice(fleet.uavs), "time": START + second, "lat": lat, "lon": lon}
-        ((_, report),) = read_json(json.dumps(row | {"source_spotted": int(moves.random() < 0.3)}))
-        report.stamp(START + second + moves.choice([0.2, 2.2]))
-        fleet.report(report)
-        if moves.random() < 0.5:
-            choice = fleet.choose(report.received, [row["ID"]])
-            if choice:
-                fleet.tell(choice)
-        fleet.advance(START + second + 3)
-        read = fleet.observe([0])
-        seen.append({key: read[key].clone() for key in (keys.OBSERVATION, keys.RECEIVED)})
-    return seen
-
-
-def test_steps_in_which_nothing_happens_can_be_skipped(monkeypatch):
-    """Without a belief, a fleet that has been quiet observes the same as one that took every step."""
-    from test_fleet import TASKS  # noqa: PLC0415 (beside the other names it would hide where they are from)
-
-    for task in ("late", "held back", "history", "clocks", "the last to arrive"):
-        found = []
-        for settles in (None, 10**9):
-            scenario = scenario_of(**TASKS[task])
-            node = Node(scenario, 3)
-            assert not node.diffuses
-            node.settles = settles or node.settles
-            fleet = Fleet(node, ["a", "b", "c"], greedy_policy(node.env), rules=FREE)
-            for uav in fleet.uavs:
-                lat, lon = fleet.ground.place(3 + 50 * ord(uav) % 300)
-                ((_, report),) = read_json(json.dumps({"ID": uav, "time": START, "lat": lat, "lon": lon}))
-                report.stamp(START)
-                fleet.report(report)
-            found.append(answers_of(fleet, [1, 5, 6, 40, 41, 60, 120, 121, 123, 200], random.Random(4)))
-        assert all(same(dict(one), dict(other)) for one, other in zip(*found, strict=True)), task

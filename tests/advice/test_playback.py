@@ -1,19 +1,18 @@
 """A journal tells what happened: the flight as a simulation recorded it, but for the source."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from reporting import FREE, Reporter, names_of
+from reporting import FREE, Reporter, names_of, read_json
 from tensordict.nn import TensorDictModuleBase
+from test_fleet import LLANBEDR
 
 from damian import keys
 from damian.advice.fleet import Fleet
 from damian.advice.journal import About, Advised, Head, Journal
 from damian.advice.node import Node
 from damian.advice.playback import episode_of
-from damian.advice.rows import read_json
 from damian.advice.session import AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
@@ -26,11 +25,9 @@ from damian.server.termination import EpisodeConfig
 from damian.show.episode import Episode, record
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
-from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 N_STEPS = 60
-LLANBEDR = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
 SCENARIO = ScenarioConfig(
     agents=3,
     region=LLANBEDR,
@@ -77,7 +74,7 @@ def flown(tmp_path_factory, scenario) -> tuple:
         reporter.send(shown, step, at_once=step == 0)
         now = reporter.time_of(step) + 0.2 * reporter.dt
         if rows := reporter.arriving(step):
-            session.report("north", read_json(json.dumps(rows)), now)
+            session.report("north", read_json(rows), now)
         step += 1
         return now
 

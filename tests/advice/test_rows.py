@@ -3,8 +3,9 @@
 import json
 
 import pytest
+from reporting import read_json
 
-from damian.advice.rows import Report, read_csv, read_json
+from damian.advice.rows import Report, reports_of, rows_of_csv, rows_of_json
 from damian.common.errors import InputError
 
 ROW = {"ID": "B", "time": 1.75e9, "lat": 52.8, "lon": -4.1, "source_spotted": 0, "battery": 80.0}
@@ -13,14 +14,14 @@ ROW = {"ID": "B", "time": 1.75e9, "lat": 52.8, "lon": -4.1, "source_spotted": 0,
 def test_columns_may_be_written_in_any_case_and_unknown_values_are_left_out():
     head = "id,TIME,Lat,lon,Source_Spotted,Takeoff-Landing time,battery,previous,readings,Motions"
     text = f"{head}\n 7 ,2026-05-01T12:00:00Z,52.8,-4.1,1.0,NA,,53.1 -4.5; 53.2 -4.5,1;2.5,3\n"
-    ((where, report),) = read_csv(text)
+    ((where, report),) = reports_of(rows_of_csv(text))
     expected = {"id": "7", "time": 1777636800.0, "lat": 52.8, "lon": -4.1, "source_spotted": True}
     expected |= {"previous": ((53.1, -4.5), (53.2, -4.5)), "readings": (1.0, 2.5), "motions": 3}
     assert where == "line 2"
     assert report == Report(**expected)
     assert (report.place(), report.place("source_"), report.flies) == ((52.8, -4.1), None, False)
     again = json.loads(report.model_dump_json(by_alias=True, exclude_none=True))
-    assert read_json(json.dumps(again))[0][1] == report, "journals keep what was said"
+    assert read_json(again)[0][1] == report, "journals keep what was said"
 
 
 def test_times_follow_from_what_a_row_says():
@@ -51,11 +52,11 @@ REFUSED = {
 def test_a_wrong_row_is_refused_with_its_place_column_and_value(case):
     changed, message = REFUSED[case]
     with pytest.raises(InputError) as error:
-        read_json(json.dumps([ROW, ROW | changed]))
+        read_json([ROW, ROW | changed])
     assert str(error.value).startswith(f"row 2: {message}")
 
 
 @pytest.mark.parametrize("text", ["NaN", "[1e999]", "3", "[]", "[" * 20_000, b"\xff"])
 def test_what_is_no_row_is_refused(text):
     with pytest.raises(InputError):
-        read_json(text)
+        reports_of(rows_of_json(text))

@@ -1,14 +1,10 @@
-"""The service over HTTP: what it answers, what it refuses, and that it goes on after anything."""
-
-import json
-import random
+"""The service over HTTP: what it answers, and what it refuses."""
 
 import pytest
 from reporting import FREE
 from starlette.testclient import TestClient
-from test_fleet import LLANBEDR, TASKS, scenario_of
+from test_fleet import LLANBEDR, scenario_of
 
-from damian import keys
 from damian.advice.fleet import Fleet
 from damian.advice.node import Node, for_uavs
 from damian.advice.service import MAX_BODY, make_app
@@ -133,62 +129,3 @@ def test_a_fleet_is_created_once_and_can_be_ended(client, fleet, session):
 def test_a_huge_body_is_refused(client, fleet):
     answer = client.post(f"{fleet}/reports", content=b"[" + b" " * MAX_BODY * 10)
     assert answer.status_code == 413
-
-
-@pytest.mark.parametrize("content", ["application/json", "text/csv"])
-def test_after_any_nonsense_the_service_goes_on(client, fleet, session, content):
-    generator, good = random.Random(1), json.dumps(rows(session)).encode()
-    junk = [b"1e999", b"[" * 20_000, b'"\\ud800"', b'[{"lat": ' + b"1" * 5000 + b"}]", b"null", good[:-9]]
-    for body in [*junk, *(generator.randbytes(50) for _ in range(50))]:
-        answer = client.post(f"{fleet}/reports", content=body, headers={"Content-Type": content})
-        assert answer.status_code == 422, (body, answer.text)
-        assert answer.json()["error"].isprintable()
-    assert not any(log.reports for log in session.fleet("north").logs)
-    assert client.post(f"{fleet}/reports", json=rows(session)).status_code == 200
-    assert client.get(f"{fleet}/advice").status_code == 200
-
-
-@pytest.mark.sample(2)
-@pytest.mark.parametrize("task", ["belief", "flights"])
-def test_a_journal_brings_everything_back(task, tmp_path):
-    """The service is asked about and takes its steps at other times than when it is restored."""
-    node = Node(for_uavs(scenario_of(**TASKS[task]), 3))
-    policy, clock = greedy_policy(node.env), Clock()
-
-    def make_session() -> AdviceSession:
-        return AdviceSession(
-            lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
-            tmp_path,
-            {"policy": "greedy"},
-        )
-
-    session, generator = make_session(), random.Random(5)
-    headers = {"Authorization": f"Bearer {TOKEN}"}
-    with TestClient(make_app(session, TOKEN, clock), headers=headers) as client:
-        client.put("/fleets/north", json={"uavs": UAVS})
-        client.post("/fleets/north/reports", json=rows(session))
-        for step in range(60):
-            clock.now = NOW + step * 0.7
-            uav, late = generator.choice(UAVS), generator.choice([0, 0.3, 2.5])
-            sent = row(
-                uav, generator.randrange(200), session, time=clock.now - late, source_spotted=step % 7 == 0
-            )
-            known = (
-                {"track": 5.0 * step, "battery": 90.0 - step}
-                if generator.random() < 0.5
-                else {"battery": None}
-            )
-            assert client.post("/fleets/north/reports", json=sent | known).status_code == 200
-            if generator.random() < 0.5:
-                session.advance(clock.now)
-            if generator.random() < 0.5:
-                client.get(f"/fleets/north/advice?uav={generator.choice(UAVS)}")
-    one, other = session.fleet("north"), make_session().fleet("north")
-    assert (one.start, list(map(list, one.told))) == (other.start, list(map(list, other.told)))
-    assert [log.reports for log in one.logs] == [log.reports for log in other.logs]
-    for fleet in (one, other):
-        fleet.advance(clock.now + 0.5)  # while all that is remembered still counts
-    read = [fleet.observe([0]) for fleet in (one, other)]
-    for key in (keys.OBSERVATION, keys.RECEIVED, keys.HISTORY):
-        if key in read[0].keys(True):
-            assert read[0][key].equal(read[1][key]), key

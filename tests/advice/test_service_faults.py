@@ -129,14 +129,16 @@ def test_any_nonsense_is_refused_and_changes_nothing(client, field, path):
     answer, draw = begin(client), random.Random(3)
     good = {"ID": "A", "answer": answer, "status": "accepted", "command": "hold", "join": ["C"], "leave": []}
     before = (field.folder / "north.jsonl").read_bytes()
-    junk = [b"", b"[]", b"null", b"3", b"[" * 20_000, b'{"uavs": ["Z"], "command": "hold", "leave": ["Z"]}']
+    junk = [b"", b"[]", b"null", b"3", b"1e999", b'"\\ud800"', b"[" * 20_000]
+    junk += [b'{"uavs": ["Z"], "command": "hold", "leave": ["Z"]}']
     for _ in range(60):
         broken = dict(good)
         for key in {*draw.sample([*broken], 3), "status", "command", "join"}:
             broken[key] = draw.choice(["=1", "x" * 99, 7.5, [[]], {"A": {}}, True, "\u202e", ["A", "A", 1]])
         junk += [json.dumps([broken]).encode(), draw.randbytes(40)]
-    for body in junk:
-        told = client.post(f"/fleets/north/{path}", content=body)
+    for number, body in enumerate(junk):
+        kind = {"Content-Type": "text/csv" if number % 5 == 4 else "application/json"}
+        told = client.post(f"/fleets/north/{path}", content=body, headers=kind)
         assert told.status_code == 422, (body, told.text)
         assert told.json()["error"].isprintable()
     assert (field.folder / "north.jsonl").read_bytes() == before

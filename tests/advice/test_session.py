@@ -1,24 +1,20 @@
 """Fleets and their journals: what is written, what is restored, and what is refused."""
 
-import json
 import os
 from pathlib import Path
 
 import pytest
-from reporting import FREE, START
+from reporting import FREE, START, read_json
 from test_fleet import LLANBEDR, SEEN, TASKS, scenario_of
+from test_round_trip import recurrent
 
 from damian.advice import journal as module
 from damian.advice.fleet import Fleet
 from damian.advice.journal import About, Advised, Head, Journal, Received, read_head, read_lines
 from damian.advice.node import Node, for_uavs
-from damian.advice.rows import read_json
 from damian.advice.session import AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError, RunError
-from damian.learners.mappo import MappoConfig
-from damian.learners.networks import ModelConfig
-from damian.learners.recurrent import add_recurrent_state
 
 UAVS = ["A", "B"]
 WORDS = ["region=llanbedr", "clock.simulation=1s", "delay.obs=0", "delay.obs={law: lag, steps: 2}"]
@@ -58,7 +54,7 @@ def report(
     session: AdviceSession, uav: str, time: float, point: int = 0, now: float | None = None
 ) -> list[str]:
     lat, lon = session.fleet("north").ground.place(point)
-    rows = read_json(json.dumps({"ID": uav, "time": time, "lat": lat, "lon": lon}))
+    rows = read_json({"ID": uav, "time": time, "lat": lat, "lon": lon})
     return session.report("north", rows, time if now is None else now)
 
 
@@ -151,12 +147,6 @@ def test_a_journal_of_other_settings_is_refused_with_both_values(make_session):
 
 
 # A journal that cannot be written.
-
-
-def recurrent(env):
-    actor = MappoConfig().make_actor(env, ModelConfig(hidden=[8], rnn="gru"))
-    add_recurrent_state(env, actor)
-    return actor
 
 
 def fail(*_):

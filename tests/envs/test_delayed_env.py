@@ -17,13 +17,24 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from damian.delays.config import DelayConfig
+from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS, UavEnv
-from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED, REWARD
+from damian.keys import (
+    ACTION,
+    AGE,
+    EPISODE_REWARD,
+    GLOBAL_OBSERVATION,
+    MESSAGE,
+    OBSERVATION,
+    READY,
+    RECEIVED,
+    REWARD,
+)
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
+from damian.transforms.reward import EpisodeTotals
 from damian.world.landing import ActionConfig
 
 # Without delays.
@@ -176,30 +187,56 @@ def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
 # Action delays and observation delays.
 
 
-@pytest.mark.sample(2)
+ROUTES = {**DELAYS, "nothing": {}}
+ROUTES["links"] = {"delay": DelayConfig(obs=2, loss=0.1), "links": LinkConfig(kind="matrix", delay=1)}
+
+
+@pytest.mark.sample(3)
+@both_motions
+@both_kinds
+@pytest.mark.parametrize("route", ROUTES)
+def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, kind, route):
+    scenario = everything(motion, kind, **ROUTES[route])
+    check_equals_torchrls_way(scenario, delayed(scenario))
+
+
 @both_motions
 @pytest.mark.parametrize(
-    "changed",
-    [
-        pytest.param(changed, id=name, marks=() if name == "everything" else pytest.mark.slow)
-        for name, changed in {**DELAYS, "nothing": {}}.items()
-    ],
+    "route", [pytest.param(r, marks=[pytest.mark.slow] * (r != "everything")) for r in ROUTES]
 )
-def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, changed):
-    scenario = everything(motion, **changed)
-    at_once, graph = delayed(scenario), delayed(scenario).compile(backend="eager")
-    base = at_once.base_env
+def test_a_compiled_step_equals_torchrls_too(motion, route):
+    scenario = everything(motion, **ROUTES[route])
+    check_equals_torchrls_way(scenario, delayed(scenario).compile(backend="eager"))
+
+
+def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None:
+    base = env.base_env
     uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
     one_by_one = TransformedEnv(uav_env, make_transforms(scenario, uav_env.server, EXTRAS))
     for transform in one_by_one.transform:
         transform.set_seed(0)
-    for env in (one_by_one, at_once, graph):
-        env.append_transform(RewardSum([REWARD], [("agents", "episode_reward")]))
-        env.append_transform(StepCounter())
+    one_by_one.append_transform(RewardSum([REWARD], [EPISODE_REWARD]))
+    one_by_one.append_transform(StepCounter())
+    env.append_transform(EpisodeTotals())  # both in one
     actions = choices(one_by_one, 18)
-    expected = play(one_by_one, actions)
-    assert all_same(expected, play(at_once, actions))
-    assert all_same(expected, play(graph, actions))
+    expected, found = steps_of(one_by_one, actions), steps_of(env, actions)
+    assert any(td["next", "done"].any() and not td["next", "done"].all() for td in expected[::2])
+    assert all_same(expected, found)
+
+
+def steps_of(env: EnvBase, actions: list[torch.Tensor]) -> list[TensorDictBase]:
+    """What each step returns, and that with which the next one begins, without what a policy has written."""
+    following, shown = env.reset(), []
+    for t, action in enumerate(actions):
+        if t == 3:  # from here on the episode of one world ends at another time than the others
+            following = env.reset(following.set("_reset", torch.arange(4).view(4, 1) == 1)).exclude("_reset")
+        following = following.clone().set(ACTION, action)
+        following.set("policy_note", torch.ones(4)).set(("agents", "logits"), torch.zeros(4, 3, 5))
+        after, following = env.step_and_maybe_reset(following)
+        for td in (after, following):
+            assert {"policy_note", ("agents", "logits")} <= {*td.keys(True, True)}
+        shown += [td.exclude("policy_note", ACTION, ("agents", "logits")) for td in (after, following)]
+    return shown
 
 
 # Compiled environments.

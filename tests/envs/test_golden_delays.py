@@ -1,9 +1,10 @@
 """Comparison with runs recorded from the original implementation in which messages were late.
 
 The recorded messages pass an ``ObservationDelay`` with the recorded times of arrival, and the server node
-computes features, rewards and ends from what it then holds. A recorded value that this project computes
-differently is left out only for a named reason, whose condition is checked in the record itself. Each test
-pins how many values were compared, and how many were left out for each reason.
+computes features from what it then holds (rewards and ends: ``tests/server/test_golden_rewards.py``). A
+recorded value that this project computes differently is left out only for a named reason, whose condition is
+checked in the record itself. Each test pins how many values were compared, and how many were left out for
+each reason.
 """
 
 import itertools
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from golden_records import FEATURES, TOLERANCE, close, converted
+from golden_records import FEATURES, close, converted
 from helpers import DATA, GOLDEN, usecase
 from tensordict import TensorDict
 from torch import Tensor
@@ -25,9 +26,7 @@ from damian.delays.laws import Law
 from damian.delays.samplers import ContextSampler, MessageContext, Sampler
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
-from damian.server.rewards import RewardConfig
 from damian.server.server import Server
-from damian.server.termination import EpisodeConfig, Status
 from damian.transforms import ObservationDelay, delay_trajectories
 from damian.world.messages import Messages
 
@@ -53,14 +52,6 @@ class Step(NamedTuple):
     @property
     def uavs(self) -> range:
         return range(len(self.recorded("positions")))
-
-    @property
-    def motions(self) -> list[int]:
-        """Motions of the UAVs since their latest detections before the step, this one included."""
-        before = (
-            self.run["motions_counter_after"][self.number - 2] if self.number > 1 else [0] * len(self.uavs)
-        )
-        return [motions + 1 for motions in before]
 
     def recorded(self, field: str) -> Any:
         """What the record says of the step; None if episodes do not end and it lacks ``info``."""
@@ -181,16 +172,14 @@ def test_the_server_holds_the_recorded_messages_but_for_late_ones_of_the_reset(c
 
 
 LATE_RESET = "a late message of the reset came last"
-LAST_STEP = "a success in the last step is a success"
-EQ_6, BY_MOTIONS = "eq. 6 doubles a drift up to one half", "divided by the motions"
 
 
-def make_server(case: int, **sections: Any) -> Server:
+def make_server(case: int) -> Server:
     """The server of a use case that computes every recorded feature."""
     names = [FEATURES[name] for name in RUNS[f"usecase{case}"][KINDS[0]]["observations_order"]]
     names = [name for name in names if name not in ("spotted", "coverage")]
     observation = ObservationConfig(["spotted"], names, time_scale=14400.0)
-    return UavEnv(usecase(case, observation=observation, **sections), extras=()).server
+    return UavEnv(usecase(case, observation=observation), extras=()).server
 
 
 def reason_for_other_feature(step: Step, name: str, uav: int) -> str | None:
@@ -257,94 +246,3 @@ def test_the_server_computes_the_recorded_features(case, compared, reasons):
                     assert close(name, ours[name][m][uav], theirs), (name, step, uav)
     assert counts.pop(None) == compared
     assert counts == reasons
-
-
-def known_features(server: Server, steps: list[Step]) -> dict[str, Tensor]:
-    """Features that the server computes; recorded ones where they differ for a reason, or in convention."""
-    names = steps[0].run["features"]
-    ours, features = server.features(*held_by_server(steps)), {}
-    for name in names:
-        theirs = torch.tensor([[step.observed(uav)[name] for uav in step.uavs] for step in steps])
-        same = [[reason_for_other_feature(step, name, uav) is None for uav in step.uavs] for step in steps]
-        same = torch.tensor(same) & (name not in ("source_bearing", "source_drift"))
-        features[name] = torch.where(same, ours[name], theirs)
-    return features
-
-
-ENDS = {"TASK SUCCESS": "success", "MAXIMUM EPISODE TIME EXPIRED": "timeout"}
-"""How an episode ends, by the text that the original records."""
-
-
-def reason_for_other_reward(step: Step, uav: int, motions: int) -> str | None:
-    """Why a reward differs from the original's; None if it does not."""
-    if step.lost_in_reset:
-        return LATE_RESET
-    if ENDS.get(step.recorded("info")) == "timeout" and bool(step.held.spotted.all()):
-        return LAST_STEP
-    if step.observed(uav)["source_drift"] <= 0.5:
-        return EQ_6
-    if "mean_distance" in step.run["features"] and motions > 1:
-        return BY_MOTIONS
-    return None
-
-
-@pytest.mark.parametrize(
-    ("case", "kinds", "compared", "reasons", "ends"),
-    [
-        (1, KINDS[:2], 84, {EQ_6: 65, LATE_RESET: 1}, (0, 0, 0)),
-        (1, KINDS[2:], 27, {EQ_6: 5, LATE_RESET: 1}, (5, 0, 0)),
-        (2, KINDS[:2], 144, {EQ_6: 154, BY_MOTIONS: 137, LATE_RESET: 15}, (0, 0, 0)),
-        (2, KINDS[2:], 41, {EQ_6: 58, BY_MOTIONS: 66, LATE_RESET: 12, LAST_STEP: 3}, (2, 2, 2)),
-    ],
-)
-def test_the_server_gives_the_recorded_rewards_and_ends(case, kinds, compared, reasons, ends):
-    steps, golden = replay(case, *kinds), GOLDEN[case]["scenario"]
-    persistent = kinds == KINDS[:2]
-    desired = golden["desired_avg_distance_normalised_D"]
-    task = RewardConfig(
-        **dict.fromkeys(steps[0].run["features"], 1.0),
-        drift="printed",
-        desired_spotting=golden["perc_needed"],
-        desired_distance=desired,
-        desired_distance_not_spotting=desired,
-        desired_distance_spotting=desired,
-        bonus=0.5 if case == 1 else 2.0,
-        bonus_over_steps=case == 2,
-    )
-    sections = {"episode": EpisodeConfig(max_steps=None)} if persistent else {}
-    server = make_server(case, reward=task, **sections)
-    messages, numbers = held_by_server(steps)
-    motions = torch.tensor([step.motions for step in steps])
-    never = torch.zeros(len(steps), dtype=torch.bool)
-    features = known_features(server, steps)
-    result = server.reward_and_status(features, messages._replace(motions=motions), numbers, never)
-    counts = Counter()
-    for m, step in enumerate(steps):
-        for uav, value in enumerate(step.recorded("reward")):
-            reason = reason_for_other_reward(step, uav, int(motions[m, uav]))
-            counts[reason] += 1
-            if reason is None:
-                assert result.reward[m, uav].item() == pytest.approx(value, abs=TOLERANCE), (step, uav)
-    assert counts.pop(None) == compared
-    assert counts == reasons
-    if not persistent:
-        check_ends(steps, result.status, *ends)
-
-
-def check_ends(steps: list[Step], found: Status, successes: int, timeouts: int, late_successes: int) -> None:
-    """Compare ends of episodes, and the numbers of their kinds.
-
-    In the original the time limit ends an episode as a failure even if all UAVs spot the source at last; and
-    a success goes unnoticed where a late message of the reset has replaced the one that tells of it.
-    """
-    counts = Counter()
-    for m, step in enumerate(steps):
-        outcome, succeeds = ENDS.get(step.recorded("info")), found.success[m].item()
-        late = succeeds and outcome != "success"
-        assert not late or outcome == "timeout" or step.lost_in_reset
-        counts["late success" if late else outcome] += 1
-        if not late:
-            assert (succeeds, found.truncated[m].item()) == (outcome == "success", outcome == "timeout")
-            assert (found.terminated[m] | found.truncated[m]).item() == step.recorded("done")
-    del counts[None]
-    assert counts == Counter({"success": successes, "timeout": timeouts, "late success": late_successes})

@@ -1,7 +1,5 @@
 """Your own features, of any width and range, read sensors wherever features are computed."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import both_motions, everything, play, random_actions
@@ -17,9 +15,6 @@ from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.settings import ClockConfig
 
-LATE = 3
-"""Constant delay of the messages [steps]."""
-
 
 def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioConfig:
     """Episodes without end, and readings in the actor's and the critic's observation and in the reward."""
@@ -34,19 +29,6 @@ def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
     env, generator = make_env(scenario, 4, seed=1, extras=["message"]), torch.Generator().manual_seed(0)
     outputs = play(env, [random_actions(env.uav_env, generator) for _ in range(n_steps)])
     return [outputs[0], *outputs[1::2]]
-
-
-@both_motions
-def test_a_feature_is_late_by_as_many_steps_as_the_messages(motion):
-    scenario = sensing(motion)
-    timely, late = fly(scenario), fly(replace(scenario, delay=DelayConfig(obs=LATE)))
-    for step, output in enumerate(late):
-        then = timely[max(step - LATE, 0)]["agents", "message"]
-        assert output["agents", "received"].equal(then)
-        for key, columns in (("observation", slice(1, 3)), ("global_observation", slice(0, 4))):
-            expected = timely[max(step - LATE, 0)]["agents", key][..., columns]
-            assert output["agents", key][..., columns].equal(expected), (step, key)
-    assert not timely[-1]["agents", "observation"].equal(late[-1]["agents", "observation"])
 
 
 @both_motions

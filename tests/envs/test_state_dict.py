@@ -9,7 +9,6 @@ from helpers import all_same, everything
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, StepCounter
 
-from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
@@ -58,19 +57,6 @@ def played(env, step, actions) -> list:
         taken, step = env.step_and_maybe_reset(step)
         steps.append(taken["next"])
     return steps
-
-
-def test_a_state_of_other_worlds_is_refused_in_one_line_and_changes_nothing():
-    env = built("paper", "instant", 3)
-    env.reset()
-    before = env.uav_env.worlds
-    other = built("paper", "instant", 4)
-    other.reset()
-    with pytest.raises(
-        InputError, match=r"shape of the loaded floats: \[4, \d+\] is not \[3, \d+\]: load it"
-    ):
-        env.load_state_dict(other.state_dict())
-    assert all(a is b for a, b in zip(before, env.uav_env.worlds, strict=True))
 
 
 def test_a_state_as_torchrls_collector_saves_it_leaves_the_worlds():

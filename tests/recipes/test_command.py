@@ -8,7 +8,6 @@ import pytest
 from omegaconf import OmegaConf
 
 import damian
-from damian.common.errors import InputError
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
@@ -150,18 +149,3 @@ def test_help_explains_a_program_a_section_and_a_setting(capsys):
     assert "    paper: " in printed
     main(["train", "--cfg", "job", "agents=4"])
     assert "agents: 4" in capsys.readouterr().out
-
-
-def interrupted_in_omegaconf() -> None:
-    """Report a wrong key because of a Ctrl-C, as OmegaConf does."""
-    try:
-        raise KeyboardInterrupt
-    except KeyboardInterrupt:
-        raise InputError("agents: no such key") from None
-
-
-def test_an_error_that_an_interruption_has_caused_counts_as_one(capsys):
-    with pytest.raises(SystemExit) as stopped, cli.one_line_errors():
-        interrupted_in_omegaconf()
-    assert stopped.value.code == 130
-    assert capsys.readouterr().err == "interrupted\n"

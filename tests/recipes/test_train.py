@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import shlex
 from pathlib import Path
 
@@ -61,6 +62,9 @@ def trained(tmp_path_factory) -> Path:
         ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
         ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
         ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
+        ["learner=sac", "learner.warm_up=64", "actions=continuous", "motion=polynomial", "aware=backupdate"],
+        ["learner=sac", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=both"],
+        ["actions=continuous", "model=gru", "motion=polynomial", "delay=paper", "aware=both"],
     ],
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):
@@ -72,7 +76,9 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
     assert "| random |" in printed
     assert "| script |" in printed
     assert str(Path(folder.name) / "learning_curve.png") in printed
+    *_, last = metrics(folder)
     assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0]
+    assert all(math.isfinite(number) for name, number in last.items() if name.startswith("loss"))
     config = OmegaConf.load(folder / "config.yaml")
     assert config.agents == (2 if "agents=2" in overrides else 3)
     assert "${" not in (folder / "config.yaml").read_text()

@@ -54,64 +54,6 @@ def in_order(replay: TensorDictReplayBuffer, n_steps: int) -> TensorDictBase:
     return storage[storage.latest(n_steps)]
 
 
-PERSISTENT = EpisodeConfig(max_steps=None)
-CORRECTED_KEYS = [
-    ("next", "agents", "global_observation"),
-    ("next", "agents", "reward"),
-    ("next", "agents", "reward_terms"),
-    *[("next", name) for name in ("success", "done", "terminated", "truncated")],
-    ("agents", "global_observation"),
-]
-
-
-def check_corrected(corrected: TensorDictBase, expected: TensorDictBase) -> None:
-    for key in CORRECTED_KEYS:
-        entry, right = corrected[key], expected[key]
-        for name, value in right.items() if isinstance(right, TensorDictBase) else [("", right)]:
-            assert (entry[name] if name else entry).equal(value), (key, name)
-
-
-@pytest.mark.sample(2)
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-@pytest.mark.parametrize("parts", [1, 3, 13])
-def test_back_updated_steps_equal_undelayed_ones_once_every_message_has_arrived(motion, parts):
-    scenario = everything(motion, episode=PERSISTENT)
-    undelayed = rollout(scenario, 39)
-    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 39)
-    replay = buffer(scenario, 64)
-    for part in delayed.split(39 // parts, 1):
-        replay.extend(part)
-    corrected, expected = (td[: 39 - LONGEST] for td in (in_order(replay, 39), undelayed.transpose(0, 1)))
-    assert not corrected["next", "agents", "received"].equal(expected["next", "agents", "message"])
-    check_corrected(corrected, expected)
-
-
-@pytest.mark.sample(2)
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-@pytest.mark.parametrize("ctde", [False, True])
-def test_an_actors_observation_can_be_back_updated_but_its_action_history_stays(motion, ctde):
-    scenario = everything(motion, episode=PERSISTENT)
-    scenario.observation.ctde = ctde
-    undelayed = rollout(replace(scenario, delay=DelayConfig(history=2)), 39)
-    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 39)
-    replay = buffer(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 64, actor=True)
-    for part in delayed.split(13, 1):
-        replay.extend(part)
-    corrected, expected, original = (
-        td[: 39 - LONGEST]
-        for td in (in_order(replay, 39), undelayed.transpose(0, 1), delayed.transpose(0, 1))
-    )
-    for key in (("agents", "observation"), ("next", "agents", "observation")):
-        after, right, before = (td[key][..., : -2 * 2] for td in (corrected, expected, original))
-        assert not before.equal(right)
-        assert after.equal(right)
-    n_features = len(scenario.observation.actor)
-    history = delayed["agents", "observation"].transpose(0, 1)[..., -2 * 2 :]
-    assert history.any()
-    assert in_order(replay, 39)["agents", "observation"][..., -2 * 2 :].equal(history)
-    assert corrected["agents", "observation"].shape[-1] >= n_features + 2 * 2
-
-
 @pytest.mark.parametrize("corrected", [["reward"], ["critic"], ["reward", "critic"]], ids="+".join)
 def test_only_what_is_named_is_corrected(corrected):
     scenario = square()

@@ -18,6 +18,7 @@ from damian.envs.scenario import ScenarioConfig
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import CORRECTED, server_recompute
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.termination import EpisodeConfig
 from damian.settings import ClockConfig
 
@@ -28,7 +29,7 @@ ENDS = ["success", "done", "terminated", "truncated"]
 
 
 def training_env(scenario: ScenarioConfig) -> DelayedEnv:
-    env = make_env(scenario, WORLDS, extras={"message"})
+    env = make_env(scenario, WORLDS, extras={"message", "reward_terms"})
     env.append_transform(StepCounter())
     return env
 
@@ -47,7 +48,8 @@ def backupdated(scenario: ScenarioConfig, actor: bool) -> tuple[TensorDictBase, 
     """Such steps as collected, and as corrected by all that has arrived after the last one, [T, B]."""
     env = training_env(scenario)
     corrected = ["reward", "critic", *["actor"] * actor]
-    recompute = server_recompute(env.server, corrected) if has_message_delay(scenario) else None
+    late = has_message_delay(scenario)
+    recompute = server_recompute(env.server, corrected, reward_terms=True) if late else None
     names = corrected if recompute else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in names])
     storage = BackupdateStorage(2 * STEPS * WORLDS, recompute, LONGEST, corrections=corrections, device="cpu")
@@ -58,6 +60,11 @@ def backupdated(scenario: ScenarioConfig, actor: bool) -> tuple[TensorDictBase, 
 
 
 CASES: dict[str, dict[str, Any]] = {
+    "late messages": {"delay": DelayConfig(obs=LATE)},
+    "late messages, the same features for all": {
+        "delay": DelayConfig(obs=LATE, history=2),
+        "observation": ObservationConfig(list(LOCAL), list(GLOBAL), ctde=True),
+    },
     "late messages, summed rewards": {"delay": DelayConfig(obs=LATE, **SUMMED)},
     "late messages, slow server": {"delay": DelayConfig(obs=LATE), "clock": ClockConfig(server="3s")},
     "late messages and rewards": {"delay": DelayConfig(obs=LATE, rew=LATE)},
@@ -77,7 +84,7 @@ CASES: dict[str, dict[str, Any]] = {
         "links": LinkConfig("matrix", delay=1),
     },
 }
-FLYING = {"late messages, slow server", "late and summed rewards", "slow agents, history"}
+FLYING = {"late messages", "late messages, slow server", "late and summed rewards", "slow agents, history"}
 """Cases with real flights; in the others UAVs move at once."""
 
 
@@ -91,6 +98,8 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     rollouts = (*backupdated(scenario, actor), fly(training_env(on_time)))
     late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
     after = [keys.REWARD, keys.GLOBAL_OBSERVATION, *ENDS]
+    if has_message_delay(scenario):
+        after += [(*keys.REWARD_TERMS, term) for term in scenario.reward.terms]
     corrected = [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]
     for key in corrected:
         assert found[key].equal(true[key]), key

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from delay_twin import Counting
+from environments import vmas
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase, TransformedEnv
@@ -34,13 +35,6 @@ def channel(**options: Any) -> Channel:
     return Channel(options.pop("delay", LATE), seed=1, **options)
 
 
-def vmas() -> EnvBase:
-    pytest.importorskip("vmas")
-    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
-
-    return VmasEnv("navigation", num_envs=2, n_agents=N, max_steps=6, seed=0)
-
-
 def pettingzoo() -> EnvBase:
     pytest.importorskip("pettingzoo")
     spread = pytest.importorskip("mpe2.simple_spread_v3")
@@ -65,7 +59,7 @@ def outputs_of(env: EnvBase, n_steps: int = 25) -> list[TensorDictBase]:
 
 @every_channel
 def test_the_outputs_match_specs_that_can_be_indexed(options):
-    env = TransformedEnv(vmas(), channel(**options))
+    env = TransformedEnv(vmas(n_agents=N, max_steps=6), channel(**options))
     check_env_specs(env, break_when_any_done="both")
     assert env.rollout(9, break_when_any_done=False)[WRITTEN[1]].shape == (2, 9, N, N)
     for specs in (env.observation_spec, env.full_action_spec):

@@ -10,6 +10,7 @@ import pytest
 import torch
 from channel_twin import World, check_against_twin, table, turn
 from delay_twin import Counting
+from environments import vmas
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
@@ -121,14 +122,9 @@ def place(outputs: Any, b: int, agent: int) -> list[float]:
 
 @pytest.fixture
 def navigation() -> Callable[..., TransformedEnv]:
-    """VMAS's navigation: the first two numbers of an observation are the agent's position."""
-    pytest.importorskip("vmas")
-    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
-
     def make(channel: Channel) -> TransformedEnv:
-        env = VmasEnv("navigation", num_envs=len(WORLDS), n_agents=N, max_steps=9, seed=0)
         channel.set_seed(1)
-        return TransformedEnv(env, Compose(channel))
+        return TransformedEnv(vmas(len(WORLDS), N, max_steps=9), Compose(channel))
 
     return make
 

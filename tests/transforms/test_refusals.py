@@ -6,15 +6,13 @@ from contract import ACTION, OBSERVATION
 from delay_twin import Counting
 from plain_env import Plain
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, Transform, TransformedEnv
+from torchrl.envs import Compose, GymEnv, TransformedEnv
 
 from damian.common.errors import InputError
-from damian.delays.laws import Burst
 from damian.transforms import (
     ActionDelay,
     Channel,
     ObservationDelay,
-    RewardDelay,
     SampleAndHold,
     delay_trajectories,
 )
@@ -46,7 +44,6 @@ def test_an_entry_that_there_is_already_is_not_replaced(transforms):
 
 MISTAKES = {
     "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
-    "delay: .* loses messages, but no reward": lambda: RewardDelay(Burst(bad_loss=0.5)),
     "delay 2 x 2, hears 3 x 3: these are of": lambda: Channel([[0, 1], [1, 0]], hears=[[True] * 3] * 3),
     "comm_range: 5 needs a position_key": lambda: Channel(1, comm_range=5),
 }
@@ -74,14 +71,3 @@ def test_stored_steps_refuse_what_would_have_changed_what_happened(text):
 def test_outside_an_environment_the_error_says_what_to_do(use):
     with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*delay_trajectories"):
         use(ObservationDelay(2))(TensorDict({"observation": torch.zeros(3, 1)}, [3]))
-
-
-def test_the_state_of_another_delay_is_refused():
-    def begun(delay: int) -> Transform:
-        env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(delay))
-        env.rollout(3)
-        return env.transform
-
-    one, other = begun(2), begun(5)
-    with pytest.raises(RuntimeError, match="size mismatch"):
-        other.load_state_dict(one.state_dict())

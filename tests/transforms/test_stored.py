@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from delay_twin import Counting
+from environments import vmas
 from helpers import same
 from tensordict import TensorDictBase
 from torchrl.envs import (
@@ -32,14 +33,6 @@ from damian.transforms import (
 )
 
 LATE = Uniform(0, 3)
-
-
-def vmas() -> EnvBase:
-    """A multi-agent environment of VMAS."""
-    pytest.importorskip("vmas")
-    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
-
-    return VmasEnv("balance", num_envs=2, seed=0, max_steps=5, n_agents=2)
 
 
 ROOT = ("observation", "action", "reward")

@@ -4,11 +4,13 @@ import copy
 import inspect
 import io
 import pickle
+from functools import partial
 
 import pytest
 import torch
 from contract import (
     CASES,
+    Case,
     begun,
     cartpole,
     memory,
@@ -16,6 +18,7 @@ from contract import (
     uavs,
     unserved,
 )
+from every_transform import LATE, PAIRS
 from helpers import all_same, same
 from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv, SerialEnv, Transform, TransformedEnv
@@ -26,6 +29,8 @@ from damian.transforms import StatefulTransform, set_seed
 from damian.transforms.server_node import Belief, ServerNode
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+OTHERS = {name: Case(kind.make, partial(make, kind, LATE)) for name, (kind, make) in PAIRS.items()}
+everywhere = pytest.mark.parametrize("case", [*CASES.values(), *OTHERS.values()], ids=[*CASES, *OTHERS])
 AGENTS = {name: case for name, case in CASES.items() if case.env in (uavs, unserved)}
 BATCHED = {name: case for name, case in CASES.items() if case.env is not cartpole}
 
@@ -45,11 +50,17 @@ def test_the_cases_cover_every_exported_transform():
 # Places in which a transform works.
 
 
-@every_case
-def test_the_outputs_match_the_specs(case):
+@pytest.mark.sample(3)
+@everywhere
+def test_the_outputs_match_the_specs_and_every_spec_can_do_without_the_batch(case):
     env = case.build()
     check_env_specs(env, break_when_any_done="both")
     assert env.rollout(12, break_when_any_done=False).shape == (*env.batch_size, 12)
+    dims = len(env.batch_size)
+    for name in (name for name in dir(type(env)) if name.endswith("_spec_unbatched") and name[0] != "_"):
+        spec, whole = getattr(env, name), getattr(env, name.removesuffix("_unbatched"))
+        assert spec.shape == whole.shape[dims:], name
+        assert spec.rand().shape == spec.shape
 
 
 @pytest.mark.sample(4)
@@ -222,3 +233,28 @@ def test_a_reset_of_some_worlds_does_not_change_the_others(case):
     actions = twin.rand_action(td.clone()).select(*env.action_keys)
     outputs = [each.step(state.clone().update(actions))["next"] for each, state in ((env, reset), (twin, td))]
     assert same(outputs[0][1:], outputs[1][1:])
+
+
+# Memory.
+
+
+@pytest.mark.sample(4)
+@everywhere
+def test_what_is_written_shares_no_memory_with_the_buffers(case):
+    env = case.build()
+    set_seed(env, 0)
+    td = env.reset()
+    for _ in range(5):
+        owned = memory(env.transform)
+        td = env.rand_action(td)
+        executed = env.transform.inv(td.clone())
+        owned += memory(env.transform)
+        after, td = env.step_and_maybe_reset(td)
+        owned += memory(env.transform)
+        shown = [*executed.values(True, True), *after.values(True, True), *td.values(True, True)]
+        assert not storages(owned) & storages(shown)
+
+
+def storages(tensors: list[torch.Tensor]) -> set[int]:
+    """Addresses of the memory of tensors."""
+    return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.numel()}
