@@ -197,7 +197,7 @@ class Fleet:
             return "old"
         now = self.step_of(self.clock)
         step = min(self.step_of(report.time), now)
-        sent = next((each for each in reversed(self.told[uav]) if each.step < step), None)
+        sent = next((each for each in reversed(self.told[uav]) if each.time < report.time), None)
         filled = log.add(report, step, self._detected(report), sent and (sent.origin, sent.goal))
         self._note_flight(uav, filled)
         due = max(now, self.step)
