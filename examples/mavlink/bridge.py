@@ -203,6 +203,9 @@ class Bridge:
         self.flights: list[Flight] = []
         self.said: list[tuple[str, str]] = []
         """Answers and what the service has confirmed of them, in order."""
+        self.stops: deque[tuple[float, float]] = deque(maxlen=16)
+        """Where it was after each decision that it has followed, holding included, newest first [deg]."""
+        self._motions, self._spotted = 0, False
         self._facts: deque[tuple[str, str]] = deque()
         self._reports: deque[dict[str, Any]] = deque(maxlen=KEPT)
         self._target: tuple[int, int] | None = None
@@ -380,10 +383,18 @@ class Bridge:
             "FLA": max(position.relative_alt / 1e3, 0.1) if flies else 0.0,
             "track": self._track,
             "takeoff-landing time": self._turned if self._turned > 0 else None,
+            "previous": [*self.stops][1:],
+            "motions": self._motions,
             "sequence": self._number,
         }
+        self._spotted = bool(row["source spotted"])
         self._reported, self._number, self._has_reported = position.time_boot_ms, self._number + 1, True
         self._reports.append(row)
+
+    def _decided(self) -> None:
+        """Note that a decision has been followed."""
+        self.stops.appendleft(self.here)
+        self._motions = (0 if self._spotted else self._motions) + 1
 
     def _asked(self) -> dict[str, Any] | None:
         """What the service tells the vehicle now."""
@@ -414,6 +425,8 @@ class Bridge:
         if not self.on_ground:
             return
         now = self.clock()
+        if not self.stops:
+            self.stops.append(self.here)
         newer = self._boot > self._reported and now >= self._landed_at + self.listen
         if newer and self._is_due("report", self.period):
             self._report()
@@ -439,6 +452,8 @@ class Bridge:
         elif come == "accepted":
             self._follow(told)
             self._turn("takeoff")
+        elif come == "landed" and told["reason"] is None:  # it has chosen to hold
+            self._decided()
 
     def _follow(self, told: dict[str, Any]) -> None:
         """Take the goal of an answer."""
@@ -542,6 +557,7 @@ class Bridge:
 
     def _touch_down(self) -> None:
         """It stands on the ground: report where, as soon as it has listened."""
+        self._decided()
         self._landed_at = self._turned = self.clock()
         self._reported, self._has_reported = max(self._reported, self._boot), False
         self._due.pop("report", None)

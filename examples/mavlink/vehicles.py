@@ -146,6 +146,16 @@ class Copter:
 
     # Physics.
 
+    @property
+    def took_off(self) -> float:
+        """When it took off last [s]; when it was made, if it never did."""
+        return self._left[0]
+
+    @property
+    def start(self) -> tuple[float, float]:
+        """Latitude and longitude from where it took off last [deg]."""
+        return degrees(self._left[1:], self.home)
+
     def place(self) -> tuple[float, float]:
         """Latitude and longitude [deg]."""
         return degrees(self.position, self.home)

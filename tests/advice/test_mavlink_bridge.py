@@ -68,9 +68,8 @@ def test_times_places_and_batteries_are_converted():
     assert vehicle.time(50.0) == 2000.5
     assert [battery_of(SimpleNamespace(battery_remaining=left)) for left in (-1, 0, 55)] == [None, 0.0, 55.0]
     here = place_of(SimpleNamespace(lat=528110000, lon=-41283000))
-    south_east = 180 - math.degrees(math.atan2(30, 40))
     assert here == (52.811, -4.1283)
-    assert way(here, degrees((30.0, -40.0), here)) == pytest.approx((50.0, south_east), 1e-4)
+    assert way(here, degrees((30.0, -40.0), here)) == pytest.approx((50.0, 143.13), 1e-4)
 
 
 @pytest.mark.slow
@@ -85,9 +84,8 @@ def test_flights_in_wind_over_a_bad_radio_end_where_they_were_sent_and_are_said_
         said = [each for each in bridge.said if each[0] in flights]
         assert said == [(answer, status) for answer in flights for status in TOLD]
         for flight, (_, _, distance, _) in zip(bridge.flights, copter.flights, strict=False):
-            assert flight.said_distance == pytest.approx(60, abs=25)
-            assert flight.distance == pytest.approx(flight.said_distance, abs=10)
-            assert distance == pytest.approx(flight.distance, abs=3)
+            assert flight.said_distance == pytest.approx(flight.distance, abs=10)
+            assert flight.distance == pytest.approx(distance, abs=3)
             assert 1.0 < flight.time / flight.said_time < 2.5
         assert bridge.timing.booted == pytest.approx(copter.booted, abs=0.4)
 
@@ -144,5 +142,4 @@ def test_a_flight_that_is_ended_early_is_aborted_and_the_next_one_begins_there(f
     flying.ask("POST", "/fleets/north/command", {"command": "resume"})
     flying.field.wishes[0] = WEST
     assert flying.run(120, lambda: len(bridge.flights) == 2)
-    assert statuses(flying)[-3:] == TOLD
-    assert "aborted" in statuses(flying)
+    assert statuses(flying)[-4:] == ["aborted", *TOLD]
