@@ -197,7 +197,7 @@ class Fleet:
             return "old"
         now = self.step_of(self.clock)
         step = min(self.step_of(report.time), now)
-        sent = next((each for each in reversed(self.told[uav]) if each.step < step), None)
+        sent = next((each for each in reversed(self.told[uav]) if each.time < report.time), None)
         filled = log.add(report, step, self._detected(report), sent and (sent.origin, sent.goal))
         self._note_flight(uav, filled)
         due = max(now, self.step)
@@ -382,12 +382,13 @@ class Fleet:
     def _is_told(self, uav: int, reason: str) -> bool:
         """Whether a UAV in danger has been told so, and the answer still holds."""
         offer, order = self.offer(uav), self.decision(uav)
+        may_fly = self.commands[uav] != "hold"  # what a person wants ends a flight home, too
         if offer is not None and offer.status != LAPSED and self.clock <= offer.until:
             if offer.reason == reason or (offer.reason, reason) == ("home", "returning"):
-                return offer.status in (OFFERED, ACCEPTED, LANDED)
+                return offer.status in (OFFERED, ACCEPTED, TAKEN_OFF, LANDED) and (may_fly or not offer.moves)
             if offer.reason == "conflict" and offer.step == self.step:
                 return True
-        returns = order is not None and order.kind == "return" and order.reason == reason
+        returns = may_fly and order is not None and order.kind == "return" and order.reason == reason
         return returns and cast(Decision, order).is_open(self.clock)
 
     # Safety.

@@ -257,7 +257,12 @@ def test_a_uav_returns_on_its_reserve_if_it_reaches_home_and_no_flight_ends_belo
         assert (answer.lat is None) == (told[0] == "hold")
     field.now += 11
     field.report("A", there, battery=drain + 1)
-    assert field.ask("A").state == "return"
+    assert (answer := field.ask("A")).state == "return"
+    assert [field.say("A", answer.answer, each) for each in ("accepted", "taken off")][-1] == "taken off"
+    field.now += 0.1
+    field.report("A", there, battery=drain + 1, FLA=5.0)
+    assert field.fleet.logs[0].newest.sent == (there, 200), "of this flight, though it began in the same step"
+    assert field.ask("A", 1).state == "bound", "it has taken off for home, and is not told to hold"
     field.command("hold", ["A"])
     assert field.ask("A", 11).state == "hold", "a person wants it so"
 
