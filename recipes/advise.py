@@ -20,7 +20,7 @@ from tensordict.nn import TensorDictModuleBase
 
 import damian
 from damian.advice.clock import Clock
-from damian.advice.fitting import fit, read_log, summary, trace_rows
+from damian.advice.fitting import fit, law_summary, plot_delays, read_log, steps_of, summary, trace_rows
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.node import Node, for_uavs, scenario_of_service
 from damian.advice.rows import read_file
@@ -29,6 +29,7 @@ from damian.baselines.greedy import greedy_policy
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
+from damian.delays.law_fit import fit_laws
 from damian.runs.run_lock import locked
 from damian.settings.programs import AdviseConfig, check_token
 from damian.world.vehicles import MOTION_MODELS
@@ -100,13 +101,17 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
 
 
 def fit_delays(config: AdviseConfig, folder: Path) -> None:
-    """Write the delays of a log of reports as a trace, with a row for each message, and print a summary."""
+    """Write the delays of a log of reports as a trace, draw them, and print which law fits them best."""
     fitted = fit(read_log(Path(str(config.fit))))
     save_config(without_token(config), folder)
     trace = folder / "trace.csv"
     write_atomically(trace, "\n".join(["delay", *trace_rows(fitted), ""]))
     print(summary(fitted))
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
+    steps = steps_of(fitted, config.clock.dt)
+    laws = fit_laws(steps)
+    print(law_summary(*laws, steps, config.clock.dt))
+    plot_delays(fitted, *laws, folder / "delays.png")
 
 
 def advise(config: AdviseConfig, folder: Path) -> None:

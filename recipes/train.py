@@ -5,6 +5,7 @@ damian train resume=runs/first frames=600000
 """
 
 import shlex
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -28,10 +29,10 @@ from damian.replay.recompute import CORRECTED, server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt, end_interrupted
 from damian.runs.loggers import make_loggers
-from damian.runs.metrics import Evaluation
+from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
-from damian.runs.training_state import TrainingState, load_networks
+from damian.runs.training_state import RandomState, TrainingState, load_networks
 from damian.settings import TrainConfig
 from damian.settings.fields import leaves
 
@@ -60,17 +61,29 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     log = MetricsLog(
         folder, config.logger.tensorboard, config.logger.csv, state.progress.frames, loggers, settings
     )
-    with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
-        for batch in ticks(collector, clock, env.server) if not enough(config, state) else ():
-            numbers = update(config, learner, state, log, batch)
-            if watch:
-                watch(state.progress.frames, numbers)
-            show(bar, config, state)
-            if save_or_stop(config, state, log, interrupt):
-                break
-    if interrupt.asked:
-        end_interrupted(interrupt.asked, f"continue with resume={folder}")
-    evaluations = report(config, folder, make_eval_env(config), learner.actor)
+    eval_env = make_eval_env(config) if config.eval_every else None
+    with closing(log):
+        with closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
+            began = time.perf_counter()
+            for batch in ticks(collector, clock, env.server) if not enough(config, state) else ():
+                numbers, frames = update(config, learner, state, log, batch), state.progress.frames
+                log.show(frames, {"steps_per_second": batch.numel() / (time.perf_counter() - began)})
+                if eval_env and state.progress.updates % (config.eval_every or 1) == 0:
+                    kept = RandomState().state_dict()  # the training must draw as without evaluations
+                    eval_env.set_seed(config.eval_seed)
+                    log.show(frames, evaluate(eval_env, learner.actor, config.horizon).row("eval/"))
+                    RandomState().load_state_dict(kept)
+                began = time.perf_counter()
+                if watch:
+                    watch(frames, numbers)
+                show(bar, config, state)
+                if save_or_stop(config, state, log, interrupt):
+                    break
+        if interrupt.asked:
+            end_interrupted(interrupt.asked, f"continue with resume={folder}")
+        evaluations = report(config, folder, eval_env or make_eval_env(config), learner.actor)
+        log.show(state.progress.frames, evaluations[TRAINED].row("eval/"))
+        log.show(state.progress.frames, evaluations[TRAINED + DETERMINISTIC].row("eval_deterministic/"))
     module, _, name = config.learner.name.partition(":")
     title = f"{config.agents} UAVs, {name or module.upper()}"
     plot_learning_curve(log.rows, evaluations, folder / FIGURE, title)

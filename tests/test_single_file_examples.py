@@ -4,7 +4,9 @@ import runpy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from episodes import flight
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -50,3 +52,15 @@ def test_multi_agent_ppo_behind_delays_learns():
 def test_soft_actor_critic_with_back_updating_swings_the_pendulum_up():
     _, returns = load("sac_backupdating")["train"](frames=12_000)
     assert sum(returns[-10:]) / 10 > -400  # random actions return -1200
+
+
+def test_a_recording_for_rerun_has_the_places_and_the_detections_of_every_uav(tmp_path):
+    reader, rows = pytest.importorskip("rerun.chunk").RrdReader, {}
+    spotted = np.array([[False, False], [True, False], [True, False], [False, False]])
+    flown = flight(spotted=spotted, about={"uavs": ["A/1", "B"]})
+    load("rerun_episode")["save_recording"](flown, tmp_path / "flown.rrd")
+    for chunk in reader(tmp_path / "flown.rrd").stream():
+        if not chunk.is_static:
+            rows[chunk.entity_path] = chunk.to_record_batch().to_pydict().get("Points3D:positions")
+    assert [len(points) for points in rows[r"/detections/A\/1"]] == [0, 1, 1, 0]
+    assert rows["/uavs/B"] == [[[100.0, 100.0, 0.0]]] * 4

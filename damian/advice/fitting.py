@@ -1,8 +1,8 @@
-"""The delays of real reports, and those that never came in, as a trace that simulations can replay."""
+"""The delays of real reports, and those that never came in, as a trace to replay and as the law that fits."""
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +11,10 @@ import numpy as np
 from damian.advice.journal import SUFFIX, Received, read_head, read_lines
 from damian.advice.rows import Report, read_file
 from damian.common.errors import InputError
+from damian.common.plotting import COLOURS
 from damian.common.text_files import named
-from damian.delays.laws import LOST
+from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers, LawFit, autocorrelation
+from damian.delays.laws import LOST, in_steps
 
 REGULAR = 0.2
 """Share of a period by which the time between two reports may differ from whole periods."""
@@ -40,16 +42,6 @@ class Fit(NamedTuple):
     """Those of one UAV after those of another, each in the order of their generation."""
     losses: str
     """How lost messages were found."""
-
-    @property
-    def delays(self) -> np.ndarray:
-        """Delays of the messages that came in [s]."""
-        return np.array([max(m.received - m.time, 0.0) for m in self.messages if m.received is not None])
-
-    @property
-    def n_lost(self) -> int:
-        """Number of messages that never came in."""
-        return sum(message.received is None for message in self.messages)
 
 
 def read_log(path: Path) -> list[Report]:
@@ -115,22 +107,59 @@ def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
 
 def trace_rows(fitted: Fit) -> list[str]:
     """The column ``delay`` of a trace, a row for each message: times, which a simulation rounds up."""
-    rows = []
-    for message in fitted.messages:
-        delay = None if message.received is None else max(message.received - message.time, 0.0)
-        rows.append(LOST if delay is None else f"{delay:.6f}s" if delay >= 1e-6 else "0")
-    return rows
+    return [LOST if m.received is None else f"{max(m.received - m.time, 0):.6f}s" for m in fitted.messages]
+
+
+def steps_of(fitted: Fit, dt: float) -> Integers:
+    """Delays of the messages of each UAV in whole steps of ``dt`` seconds, for ``fit_laws``, [U, T]."""
+    steps = (LOST_STEPS if row == LOST else in_steps("delay", row, dt) for row in trace_rows(fitted))
+    by_uav = [[next(steps) for _ in own] for _, own in groupby(message.uav for message in fitted.messages)]
+    return np.array([*zip_longest(*by_uav, fillvalue=NO_MESSAGE)]).T
 
 
 def summary(fitted: Fit) -> str:
     """The fitted delays and losses as text, on two lines."""
-    delays, n = fitted.delays, len(fitted.messages)
-    uavs = {message.uav for message in fitted.messages}
-    times = [message.time for message in fitted.messages]
+    delays = np.array([max(m.received - m.time, 0) for m in fitted.messages if m.received is not None])
+    uavs, n = {message.uav for message in fitted.messages}, len(fitted.messages)
+    times, n_lost = [message.time for message in fitted.messages], n - len(delays)
     median, most, nearly_all = np.quantile(delays, [0.5, 0.9, 0.99])
     return (
-        f"{n} messages of {len(uavs)} UAVs over {max(times) - min(times):.0f} s; lost: {fitted.n_lost} "
-        f"({fitted.n_lost / n:.1%}), {fitted.losses}\n"
+        f"{n} messages of {len(uavs)} UAVs over {max(times) - min(times):.0f} s; lost: {n_lost} "
+        f"({n_lost / n:.1%}), {fitted.losses}\n"
         f"delay [s]: mean {delays.mean():.3f}, median {median:.3f}, 90 % {most:.3f}, 99 % {nearly_all:.3f}, "
         f"longest {delays.max():.3f}"
     )
+
+
+def law_summary(best: LawFit, own: LawFit, steps: Integers, dt: float) -> str:
+    """The law that ``fit_laws`` finds as settings, and what of the delays it does not repeat, as text."""
+    other, gain = np.abs(best.chances - own.chances).sum() / 2, (own.likelihood - best.likelihood) / best.n
+    law, loss = str(best.written).replace("'", ""), f" delay.loss={best.loss}" * (best.loss > 0)
+    text = f'best law: "delay.obs={law}"{loss} clock.simulation={dt:g}s\n'
+    text += (
+        f"it gives {other:.1%} of the messages another delay; {own.written} are likelier by {gain:.3f} nats "
+    )
+    text += f"a message; autocorrelation of delays {(alike := autocorrelation(steps)):.2f}"
+    if alike > max(0.1, 4 / best.n**0.5):
+        text += "\nlate messages come in bursts: no law without memory repeats them, only burst and the trace"
+    if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
+        text += "\na bad fit: take the trace"
+    return text
+
+
+def plot_delays(fitted: Fit, best: LawFit, own: LawFit, path: Path) -> None:
+    """Draw how often each delay was recorded, and how often the law has it; and the delays of each UAV."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, and a service needs none)
+
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    (shares, times), begin = figure.subplots(2), fitted.messages[0].time
+    shares.bar(range(len(own.chances)), own.chances, color="0.8")
+    shares.plot(best.chances, "o", color=COLOURS[0], markersize=4)
+    shares.set(xlabel="delay [steps]; the last bar: lost", ylabel="share of messages")
+    shares.set_title(f"recorded (bars), and {best.written}", fontsize=7)
+    for i, (uav, messages) in enumerate(groupby(fitted.messages, lambda message: message.uav)):
+        points = np.array([(m.time, m.received - m.time) for m in messages if m.received is not None])
+        times.scatter(*points.T - [[begin], [0]], s=3, color=COLOURS[i % len(COLOURS)], label=uav)
+    times.set(xlabel="time of the message [s]", ylabel="delay [s]")
+    times.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
+    figure.savefig(path, dpi=150)

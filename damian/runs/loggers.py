@@ -24,7 +24,7 @@ class Logger(Protocol):
         """Log a number.
 
         Args:
-            name: such as ``perceived_return``, ``reward/spotted``, or one of the learner's.
+            name: such as ``train/perceived_return``, ``reward/spotted``, or one of the learner's.
             value: the number; nan if it is not known yet.
             step: environment steps so far, over all worlds.
         """

@@ -44,9 +44,9 @@ class Evaluation:
     lost: float
     """Share of the messages that never arrive."""
 
-    def row(self) -> dict[str, float]:
+    def row(self, group: str = "") -> dict[str, float]:
         """The measures by the names that they have in every file; ``return`` is no name for a field."""
-        return dict(zip(EVALUATED, astuple(self), strict=True))
+        return dict(zip([group + name for name in EVALUATED], astuple(self), strict=True))
 
 
 EVALUATED = tuple(field.name.rstrip("_") for field in fields(Evaluation))

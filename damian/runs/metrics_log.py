@@ -45,10 +45,18 @@ class MetricsLog:
         self._events = SummaryWriter(str(folder), purge_step=purge_step) if tensorboard else None
         self._call("log_hparams", dict(self._settings))
 
+    def show(self, frames: int, numbers: Mapping[str, float]) -> None:
+        """Give numbers to TensorBoard and the loggers alone, by names in groups such as ``train/kl``."""
+        tags = {name if "/" in name else f"train/{name}": number for name, number in numbers.items()}
+        for tag, number in tags.items():
+            self._call("log_scalar", tag, number, frames)
+            if self._events:
+                self._add_settings(tags)
+                self._events.add_scalar(tag, number, frames)
+
     def add(self, frames: int, numbers: Mapping[str, float]) -> None:
         """Log numbers by name, after so many environment steps over all worlds."""
-        for name, number in numbers.items():
-            self._call("log_scalar", name, number, frames)
+        self.show(frames, numbers)
         row = {_FIRST_COLUMN: float(frames), **numbers}
         self.rows.append(row)
         new = [name for name in row if name not in self._columns]
@@ -58,10 +66,6 @@ class MetricsLog:
         elif self._path:
             with writing(self._path), self._path.open("a", newline="") as file:
                 file.write(self._text([row]))
-        if self._events:
-            self._add_settings(numbers)
-            for name, number in numbers.items():
-                self._events.add_scalar(name, number, frames)
 
     def sync(self) -> None:
         """Make the rows last, even if the machine stops; a checkpoint comes after its rows."""

@@ -57,6 +57,7 @@ class TrainConfig(ScenarioConfig):
         None, "Stop after this number of episodes, if that comes before ``frames``.", low=1, high=1e12
     )
     eval_episodes: int = setting(200, "Episodes of each evaluation.", low=1, high=checks.WORLDS)
+    eval_every: int | None = setting(None, "Updates between two evaluations on the way.", low=1, high=1e12)
     checkpoint_every: int = setting(
         20, "Updates between two checkpoints: what a killed run loses at most.", low=1, high=1e12
     )

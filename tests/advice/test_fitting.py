@@ -1,11 +1,13 @@
 """Delays of real reports become the trace that made them."""
 
 import json
+import shlex
 
 import pytest
 
 from damian.advice.fitting import fit, read_log, summary, trace_rows
 from damian.delays.laws import Trace
+from damian.recipes.cli import settings
 from damian.recipes.command import main
 
 DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
@@ -50,6 +52,7 @@ def test_a_law_reads_the_trace(log, tmp_path, capsys):
     out = tmp_path / "run" / "trace.csv"
     main(["advise", f"fit={log(table(True))}", f"hydra.run.dir={out.parent}"])
     printed = capsys.readouterr().out.splitlines()
+    assert (out.parent / "delays.png").stat().st_size > 10_000
     assert f'train with "delay.obs={{law: trace, path: {out}}}"' in printed
     sampler = Trace(str(out)).sampler()
     assert sampler.longest == 4
@@ -72,4 +75,16 @@ def test_a_uav_that_is_silent_in_flight_loses_nothing(log):
     lines = [f"A,{t},{t + 0.1},53.1,-4.5,{60 if t % 20 == 11.5 else 0}" for t in times]
     fitted = fit(read_log(log("\n".join(["ID,time,receive time,lat,lon,FLA", *lines]))))
     assert fitted.losses == "by their period of 1 s"
-    assert fitted.n_lost == 0
+    assert "lost" not in trace_rows(fitted)
+
+
+def test_the_law_of_the_delays_is_a_setting_and_bursts_are_named(log, tmp_path, capsys):
+    lines = [f"A,{i},{i + (5.5 if i % 25 < 5 else 0.5)},53.1,-4.5,{i}" for i in range(500) if i % 25]
+    path = log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))
+    main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+    *_, law, fits, bursts, bad, _ = capsys.readouterr().out.splitlines()
+    assert fits.endswith("autocorrelation of delays 0.72")
+    assert bursts.startswith("late messages come in bursts: no law without memory repeats them")
+    assert bad == "a bad fit: take the trace"  # bursts of the same length, in regular distances
+    delay = settings(*shlex.split(law.removeprefix("best law: "))).delay
+    assert (delay.obs["law"], delay.obs["good"], delay.obs["bad"]) == ("burst", 1, 6)

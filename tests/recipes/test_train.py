@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import check_refused
 from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
 from damian.envs.pipeline import make_env
@@ -104,6 +105,21 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     assert record["command"] == resumed["command"]
     assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
     assert resumed["resumed"][0]["command"] == f"damian train resume={same} frames=250 hydra.run.dir=second"
+
+
+def test_evaluations_on_the_way_are_seen_beside_the_training_and_change_nothing(run, trained):
+    folder = run(*TINY, "eval_every=1")
+    for name in ("metrics.csv", "result.csv"):
+        assert (folder / name).read_text() == (trained / name).read_text()
+    events = EventAccumulator(str(folder)).Reload()
+    tags = events.Tags()["scalars"]
+    assert {tag.partition("/")[0] for tag in tags} == {"train", "reward", "eval", "eval_deterministic"}
+    assert {"train/perceived_return", "train/steps_per_second", "eval/age", "eval/late", "eval/lost"} <= {
+        *tags
+    }
+    points, result = events.Scalars("eval/return"), (folder / "result.csv").read_text().splitlines()[3]
+    assert [point.step for point in points] == [128, 256, 256]
+    assert points[-1].value == pytest.approx(float(result.split(",")[4]))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,61 @@
+"""Laws and their parameters are found again in the delays that were drawn from them."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from damian.common import counter_rng
+from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, OWN, autocorrelation, fit_laws
+from damian.delays.laws import sampler_of
+
+UNIFORM = {"law": "uniform", "low": 3, "high": 7}
+BURST = {"law": "burst", "enter": 0.05, "leave": 0.2, "good": 1, "bad": UNIFORM, "bad_loss": 0.3}
+LAWS = [3, UNIFORM, {**UNIFORM, "probability": 0.15}, {"law": "geometric", "mean": 2.5, "longest": 6}]
+LOSSES = {**BURST, "good": 0, "bad": 0, "bad_loss": 1.0}
+
+
+def drawn(law, loss: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Delays of 200 messages of each of 30 senders, of which half send 50 fewer [steps]."""
+    sampler, streams = sampler_of(law, loss=loss), counter_rng.world_seeds(seed, 30)
+    memory, steps = sampler.initial_state(streams), []
+    for t in range(200):
+        delay, memory = sampler(streams, torch.full_like(streams, t), memory)
+        steps.append(torch.where(delay < sampler.lost, delay, LOST_STEPS))
+    found = torch.stack(steps, 1).numpy()
+    found[::2, 150:] = NO_MESSAGE
+    return found
+
+
+def check_alike(found, law) -> None:
+    """Check that settings are the same, probabilities and means about."""
+    if isinstance(law, dict):
+        assert found.keys() == law.keys()
+        for name in law:
+            check_alike(found[name], law[name])
+    else:
+        assert found == (pytest.approx(law, rel=0.15) if isinstance(law, float) else law)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("law", "loss"), [*product(LAWS, (0.0, 0.1)), (BURST, 0.0), (LOSSES, 0.0)], ids=str)
+def test_a_law_is_found_again(law, loss, seed):
+    steps, bursts = drawn(law, loss, seed), law in (BURST, LOSSES)
+    best, own = fit_laws(steps)
+    check_alike(best.written, law)
+    assert best.loss == pytest.approx(loss, rel=0.15)
+    assert best.bic <= own.bic
+    assert own.written == OWN[bursts]
+    assert autocorrelation(steps) > 0.5 if bursts else abs(autocorrelation(steps)) < 0.06
+
+
+def test_delays_that_no_law_repeats_are_likelier_by_their_own_frequencies():
+    twice = np.random.default_rng(0).choice([1, 2, 7, 8], (20, 100), p=[0.5, 0.1, 0.1, 0.3])
+    held = drawn({"law": "lag", "lag": UNIFORM, "hold_probability": 0.8})
+    for steps, likelier in [(held, OWN[1]), (twice, OWN[0])]:
+        best, own = fit_laws(steps)
+        longer = np.pad(steps, ((0, 0), (0, 9)), constant_values=NO_MESSAGE)
+        assert [fit.bic for fit in fit_laws(longer)] == [best.bic, own.bic]
+        assert own.bic < best.bic - 100
+        assert own.written == likelier
