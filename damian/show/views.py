@@ -165,7 +165,7 @@ def draw_messages(axis: Axes, episode: Episode, colours: list[str]) -> None:
     name_rows(axis, episode)
     axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
     marks = "dots arrive at once, bars are late, crosses are lost"
-    shares = "the stronger the colour, the more are late, the higher the black, the more are lost"
+    shares = "the stronger the colour, the more are late, the higher the bar, the more are lost"
     axis.set_xlabel(f"messages over time [s]: {shares if many else marks}")
 
 
