@@ -189,7 +189,7 @@ def _draw_shares(axis: Axes, episode: Episode, colours: list[str]) -> None:
     for uav, colour in enumerate(colours):
         sent = np.maximum(np.bincount(spans, episode.sent[:, uav], _BINS), 1)
         picture[uav, :, :3] = to_rgb(colour)
-        picture[uav, :, 3] = 0.08 + 0.92 * np.bincount(spans, episode.late[:, uav], _BINS) / sent
+        picture[uav, :, 3] = 0.1 + 0.9 * np.bincount(spans, episode.late[:, uav], _BINS) / sent
         lost = np.bincount(spans, episode.lost[:, uav], _BINS) / sent
         axis.bar(places, -0.9 * lost, end / _BINS, uav + 0.45, color=INK)
     axis.imshow(picture, extent=(0, end, len(colours) - 0.5, -0.5), aspect="auto", interpolation="nearest")

@@ -105,7 +105,7 @@ export class Lanes {
       if (!sent[at]) continue;
       const uav = Math.floor(at / spans);
       const [left, bottom] = [GUTTER + (at % spans) * SPAN, y(uav) + height / 2];
-      context.fillStyle = faint(theme.uav(uav), 0.08 + (0.92 * late[at]) / sent[at]);
+      context.fillStyle = faint(theme.uav(uav), 0.1 + (0.9 * late[at]) / sent[at]);
       context.fillRect(left, bottom - height, SPAN, height);
       const black = (height * lost[at]) / sent[at];
       context.fillStyle = theme.lost(uav);
