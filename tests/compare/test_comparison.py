@@ -182,6 +182,7 @@ def test_methods_of_an_experiment_look_different_and_keep_their_colours_without_
     for path in Path("conf/experiment").glob("*.yaml"):
         arms = {name: Arm(**given) for name, given in yaml.safe_load(path.read_text())["arms"].items()}
         looks = {name: look(Comparison([], arms), name) for name in arms}
-        assert len({*map(str, looks.values())}) == len(arms)
+        for style in ("linestyle", "marker"):
+            assert len({(each["color"], each[style]) for each in looks.values()}) == len(arms)
         for name, arm in arms.items():
             assert look(Comparison([], {name: arm}), name)["color"] == looks[name]["color"]
