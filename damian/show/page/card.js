@@ -41,6 +41,8 @@ export class Card {
     const note = make(messages, "p", "note");
     this.rows = make(messages, "div", "rows");
     this.rows.tabIndex = 0; // so that keys can scroll it
+    this.rows.setAttribute("role", "group");
+    this.rows.setAttribute("aria-label", "rows of messages");
     const rows = make(this.rows, "canvas", "lanes");
     describe(rows, "messages over time, in a row for each UAV");
     this.lanes = new Lanes(rows, note, episode, player);

@@ -131,7 +131,8 @@ export function listen(player, keys) {
     const writes =
       event.target.matches("select, .brush input") ||
       (event.key === " " && event.target.matches("button, summary"));
-    if (!press || writes || event.ctrlKey || event.altKey || event.metaKey) return;
+    const scrolls = /^Arrow(Up|Down)$/.test(event.key) && event.target.matches(".rows");
+    if (!press || writes || scrolls || event.ctrlKey || event.altKey || event.metaKey) return;
     event.preventDefault();
     press(event);
   });
