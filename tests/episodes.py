@@ -25,3 +25,10 @@ def flight(n_steps: int = 3, **changes) -> Episode:
     fixed = {"about": {}, "region": SQUARE, "origin": None, "landing_points": np.array([[150.0, -190.0]])}
     fixed |= {"radius": 50.0, "instant": True, "success": False}
     return Episode(**{**fixed, **columns, **changes})
+
+
+def crowd(n_steps: int = 3, **changes) -> Episode:
+    """An episode of 20 UAVs, ten at each of two places."""
+    few, names = flight(n_steps), "position target battery believed track age reward spotted sent delay"
+    columns = {name: np.repeat(getattr(few, name), 10, axis=1) for name in names.split()}
+    return flight(n_steps, **columns | changes)

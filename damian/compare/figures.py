@@ -1,9 +1,10 @@
 """Figures of a comparison: learning curves, J_norm of each arm, and scores over delays.
 
-An arm has the same colour in all figures of one comparison.
+A method has the same colour in all figures, whichever others are drawn.
 """
 
 import math
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -25,7 +26,7 @@ from damian.compare.comparison import (
     Estimate,
 )
 from damian.compare.statistics import Floats, bootstrap
-from damian.runs.run_folder import RANDOM, SCRIPT
+from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
 
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """Rows of ``metrics.csv`` of each seed, by task, delay and arm."""
@@ -40,8 +41,14 @@ PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
 """Axis labels of how far a training has come."""
 ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
 """Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
+_METHODS = (
+    f"undelayed {TRAINED},deployed_own rewards {SCRIPT},own_naive finetuned {RANDOM},history imitation,"
+    "naive unaware,oracle memory,learnt critic server,own backupdate,own_history both,deployed own_memory,"
+    "belief,untrained privileged"
+).split(",")
+"""The arms of our experiments, and the policies of a run, that have each of these colours."""
 _LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os^D"
-"""Of arms that train, of those that train nothing, and of points; later ones where colours repeat."""
+"""Of arms that train, of those that train nothing, and of points; later ones where two have one colour."""
 _POINTS = 200
 """Number of points of a learning curve."""
 _NORMS_IN_A_ROW = 4
@@ -123,7 +130,7 @@ def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Pa
             rows = [groups.index(name) + shift for name in found]
             value, low, high = np.array([*found.values()], dtype=float).reshape(-1, 3).T
             ends = np.nan_to_num([value - low, high - value])
-            axis.errorbar(value, rows, xerr=ends, fmt="o", color=ARM_COLOURS[place], label=policy)
+            axis.errorbar(value, rows, xerr=ends, fmt="o", color=colour_of(policy), label=policy)
         axis.set_yticks(range(len(groups)), groups)
         axis.invert_yaxis()
         axis.set_xlabel(label)
@@ -132,16 +139,22 @@ def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Pa
 
 
 def look(comparison: Comparison, arm: str) -> dict[str, Any]:
-    """Colour, line and marker of an arm, by its place among all arms of the comparison."""
-    again, index = divmod(list(comparison.arms).index(arm), len(ARM_COLOURS))
-    of_arm = comparison.arms[arm]
+    """Colour of an arm; line and marker, which tell it from those before it that have the same colour."""
+    before = list(comparison.arms)[: list(comparison.arms).index(arm)]
+    again, of_arm = sum(colour_of(other) == colour_of(arm) for other in before), comparison.arms[arm]
     trains = of_arm.policy_of is None and not (of_arm.untrained or of_arm.oracle)
     lines = _LINES if trains else _DOTTED
     return {
-        "color": ARM_COLOURS[index],
+        "color": colour_of(arm),
         "linestyle": lines[again % len(lines)],
         "marker": _MARKERS[again % len(_MARKERS)],
     }
+
+
+def colour_of(method: str) -> str:
+    """Colour of an arm or a policy, whichever others are drawn; your own has one that its name decides."""
+    known = [index for index, names in enumerate(_METHODS) if method in names.split()]
+    return ARM_COLOURS[known[0] if known else zlib.crc32(method.encode()) % len(ARM_COLOURS)]
 
 
 def _legend(place: Axes, panels: Iterable[Axes]) -> None:

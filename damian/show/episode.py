@@ -22,6 +22,7 @@ import damian
 from damian import keys
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
+from damian.common.plotting import COLOURS
 from damian.common.text_files import named, one_line, read_text
 from damian.envs.uav_env import UavEnv
 
@@ -31,8 +32,8 @@ DIGITS = 5
 TIME_DIGITS = 9
 """Those of times, which must differ from step to step in long episodes too."""
 
-LIKELY = 0.02
-"""Smallest probability of a cell worth showing, as a share of that of the most probable one."""
+LIKELY = 1e-4
+"""Smallest probability of a cell worth showing; colours are on a logarithmic scale from it to 1."""
 
 Floats = NDArray[np.floating]
 Flags = NDArray[np.bool_]
@@ -84,12 +85,21 @@ class Episode:
         return self.position.shape[1]
 
     @property
-    def names(self) -> list[str]:
-        """Names of the UAVs: their IDs if they are real ones, else their numbers."""
+    def ids(self) -> list[str]:
+        """The UAVs on a map: their IDs if they are real ones, else their numbers."""
         ids = self.about.get("uavs")
-        if isinstance(ids, list) and len(ids) == self.n_agents:
-            return [str(uav) for uav in ids]
-        return [f"UAV {uav}" for uav in range(self.n_agents)]
+        known = isinstance(ids, list) and len(ids) == self.n_agents
+        return [str(cast(list, ids)[uav] if known else uav) for uav in range(self.n_agents)]
+
+    @property
+    def names(self) -> list[str]:
+        """The UAVs in a text: their IDs if they are real ones, else as in ``UAV 0``."""
+        return self.ids if self.about.get("uavs") else [f"UAV {uav}" for uav in self.ids]
+
+    @property
+    def is_crowded(self) -> bool:
+        """Are there so many UAVs that less must be drawn of each?"""
+        return self.n_agents > len(COLOURS)
 
     @property
     def true(self) -> Floats:
@@ -126,11 +136,9 @@ class Episode:
         boxes = shapely.box(*(self.cells - half).T, *(self.cells + half).T)
         return np.asarray(shapely.intersection(boxes, self.region))
 
-    def likely_cells(self, step: int) -> Integers:
-        """Numbers of the cells in which the source may well be at an instant, [C]; none without a belief."""
-        if self.belief is None:
-            return np.zeros(0, int)
-        return np.flatnonzero(self.belief[step] > LIKELY * self.belief[step].max())
+    def entropy(self, step: int) -> float:
+        """Entropy of the belief at an instant [bit]."""
+        return float(sum(-p * np.log2(p) for p in np.asarray(self.belief)[step] if p > 0))
 
     def save(self, path: Path) -> None:
         """Write the episode as JSON."""
@@ -255,7 +263,7 @@ def fixed_of(env: UavEnv, about: Mapping[str, Any], region: int) -> dict[str, An
     """What an episode holds of the environment over one of its regions, beside the columns."""
     airspace = env.simulation.airspace
     return {
-        "about": {**about, "damian": damian.__version__},
+        "about": {**about, "region": airspace.regions[region].name, "damian": damian.__version__},
         "region": airspace.regions[region].polygon,
         "origin": airspace.regions[region].origin,
         "landing_points": np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),

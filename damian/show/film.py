@@ -17,12 +17,12 @@ from tensordict import TensorDictBase
 from damian.common.plotting import STYLE
 from damian.envs.uav_env import UavEnv
 from damian.show.episode import Episode, at_instant, episode_of
-from damian.show.frame import frame_of
-from damian.show.views import INK, MapView, SpaceView, draw_messages, legend_marks
+from damian.show.frame import INK, frame_of
+from damian.show.views import MapView, SpaceView, draw_messages, draw_scale, height_of_rows, legend_marks
 
 DPI = 100
-SIZE = (7.2, 7.0)
-"""Width and height of a film [inches]."""
+WIDTH, HEIGHTS = 7.2, {"2d": 4.6, "3d": 3.6}
+"""Width of a film, and height of the map and of the space [inches]."""
 STEPS_PER_SECOND = 4
 """Steps that a film shows in a second."""
 LAST_STEPS = 6
@@ -52,20 +52,24 @@ class Film:
         self.episode = episode
         self.colours = [uav.colour for uav in frame_of(episode, 0).uavs]
         with matplotlib.rc_context(_STYLE):
-            self.figure = Figure(figsize=SIZE, dpi=DPI)
+            rows, height = height_of_rows(episode.n_agents), HEIGHTS[view]
+            low, size = rows + 1.0, (WIDTH, round(rows + height + 1.4, 1))
+            self.figure = Figure(figsize=size, dpi=DPI)
             FigureCanvasAgg(self.figure)
-            heights = [2.5, 1.1, 1.1, min(episode.n_agents, 8) * 0.22 + 0.2]
-            sides = {"left": 0.085, "right": 0.975, "top": 0.945, "bottom": 0.075}
-            space = {"hspace": 0.5, "wspace": 0.16}
-            grid = self.figure.add_gridspec(
-                4, 2, height_ratios=heights, width_ratios=[3.1, 1], **sides, **space
-            )
-            self.map = self.figure.add_subplot(grid[:3, 0], projection="3d" if view == "3d" else None)
-            self.charts = [self.figure.add_subplot(grid[row, 1]) for row in (1, 2)]
-            self.lanes = self.figure.add_subplot(grid[3, :])
+
+            def axes(*place: float, projection: str | None = None) -> Any:
+                return self.figure.add_axes(tuple(np.divide(place, size * 2)), projection=projection)
+
+            place = (-0.05, low - 1.15, 5.5, 5.5) if view == "3d" else (0.65, low, 4.5, height)
+            self.map = axes(*place, projection="3d" if view == "3d" else None)
+            self.charts = [axes(5.55, low + up * height, 1.45, 0.19 * height) for up in (0.33, 0)]
+            self.lanes = axes(0.65, 0.5, 6.35, rows)
             self.view = (SpaceView if view == "3d" else MapView)(self.map, episode)
-            place = {"loc": "upper left", "bbox_to_anchor": (0.745, 0.95), "frameon": False}
-            self.figure.legend(handles=legend_marks(episode), **place)
+            top = (5.35 / size[0], (low + height + 0.1) / size[1])
+            style = {"loc": "upper left", "bbox_to_anchor": top, "frameon": False, "labelspacing": 0.3}
+            self.figure.legend(handles=legend_marks(episode), **style)
+            if episode.belief is not None:
+                draw_scale(axes(5.55, low + height - 1.25, 1.45, 0.09))
             self._draw_charts()
             draw_messages(self.lanes, episode, self.colours)
         self._moving: list[Any] = []
@@ -79,6 +83,8 @@ class Film:
             self._moving = [*self.view.draw(frame), *self._now(frame.time)]
         won = f"return {self.episode.reward[: step + 1].mean(-1).sum():.2f}"
         spots = f"{sum(uav.spots for uav in frame.uavs)} of {len(frame.uavs)} UAVs spot the source"
+        if self.episode.belief is not None:
+            spots += f"   ·   belief {self.episode.entropy(step):.1f} bit"
         self.figure.suptitle(f"{frame.time:g} s   ·   {won}   ·   {spots}", x=0.085, ha="left", fontsize=10)
         return self._moving
 
@@ -99,10 +105,14 @@ class Film:
         used = not np.allclose(episode.battery, episode.battery[:1])
         titles = ("return so far", "battery [%]" if used else "age of information [s]")
         self.charts[0].plot(episode.time, episode.reward.mean(-1).cumsum(), color=INK, linewidth=1.3)
-        for uav, colour in enumerate(self.colours):
-            values = episode.battery[:, uav] if used else episode.age[:, uav]
-            style = "default" if used else "steps-post"
-            self.charts[1].plot(episode.time, values, color=colour, linewidth=1.2, drawstyle=style)
+        colours, style = self.colours, "default" if used else "steps-post"
+        values = episode.battery if used else episode.age
+        if episode.is_crowded:  # lines of many UAVs would hide each other
+            titles = (titles[0], f"{'battery [%]' if used else 'age [s]'}, mean and range")
+            colours = ["0.8", "0.8", INK]
+            values = np.stack([values.min(-1), values.max(-1), values.mean(-1)], -1)
+        for line, colour in zip(values.T, colours, strict=True):
+            self.charts[1].plot(episode.time, line, color=colour, linewidth=1.2, drawstyle=style)
         for axis, title in zip(self.charts, titles, strict=True):
             axis.set_title(title, loc="left", fontsize=8.5)
             axis.margins(x=0)

@@ -5,19 +5,24 @@ from typing import Any
 
 import numpy as np
 
-from damian.common.plotting import COLOURS
-from damian.show.episode import Episode, Floats
+from damian.common.plotting import COLOURS, UAV_COLOURS
+from damian.show.episode import LIKELY, Episode, Floats
 
-TRAIL = 8
-"""Number of steps whose path is drawn behind a UAV."""
+TRAIL, CROWDED_TRAIL = 8, 3
+"""Number of steps whose path is drawn behind a UAV, and behind one of many."""
+INK = "#222222"
 
 
 @dataclass(frozen=True)
 class Uav:
     """A UAV at an instant."""
 
-    name: str
+    id: str
     colour: str
+    ink: str
+    """The colour of its texts, which is dark."""
+    edge: str
+    """The colour of its marks' edges, which tells it from an earlier one of the same colour."""
     path: Floats
     """Its latest places, the present one last: east, north, up [m], [P, 3]."""
     heading: float
@@ -47,11 +52,15 @@ class Frame:
 
 def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
     """An episode after ``step`` steps; paths reach ``trail`` steps back, or with None to the beginning."""
+    trail = CROWDED_TRAIL if episode.is_crowded else trail
     begin = 0 if trail is None else max(step - trail, 0)
+    belief = [] if episode.belief is None else episode.belief[step]
     uavs = [
         Uav(
-            name=episode.names[uav],
-            colour=COLOURS[uav % len(COLOURS)],
+            id=episode.ids[uav],
+            colour=UAV_COLOURS[uav % len(UAV_COLOURS)],
+            ink=UAV_COLOURS[len(COLOURS) + uav % len(COLOURS)],
+            edge=("white", INK)[uav // len(UAV_COLOURS) % 2],
             path=episode.position[begin : step + 1, uav],
             heading=float(episode.track[step, uav]),
             spots=bool(episode.spotted[step, uav]),
@@ -65,10 +74,7 @@ def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
         uavs=uavs,
         source=None if episode.source is None else episode.source[step],
         emits=episode.emits is not None and bool(episode.emits[step]),
-        cells=[
-            (episode.squares[k], float(np.asarray(episode.belief)[step, k]))
-            for k in episode.likely_cells(step)
-        ],
+        cells=[(area, float(p)) for area, p in zip(episode.squares, belief, strict=True) if p > LIKELY],
     )
 
 

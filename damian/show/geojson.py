@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,12 @@ def save_geojson(episode: Episode, path: Path) -> None:
 def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     """An episode up to an instant as a FeatureCollection.
 
-    The property ``kind`` of a feature says what it is: ``region``, ``landing points``, ``track`` (of a UAV,
-    with ``times`` [s] of its points), ``source track`` (if it is known), ``footprint`` and ``coverage`` (what
-    its footprints have covered) of a UAV, ``believed position`` (with ``age_s``), and ``belief`` (a cell,
-    with the ``probability`` that the source is in it). Across the antimeridian, longitudes go beyond 180.
+    The property ``kind`` of a feature says what it is: ``region`` (with its ``name``), ``landing points``,
+    ``track`` (of a UAV, with ``times`` [s] of its points, ``times_utc`` if known, and ``altitudes_m`` above
+    the ground; in coordinates they would be above the ellipsoid), ``source track`` (if it is known),
+    ``footprint`` and ``coverage`` (what its footprints have covered) of a UAV, ``believed position`` (with
+    ``age_s``), and ``belief`` (a cell, with the ``probability`` that the source is in it). Across the
+    antimeridian, longitudes go beyond 180.
     """
     origin = origin_of(episode)
     features = [
@@ -52,20 +55,24 @@ def origin_of(episode: Episode) -> tuple[float, float]:
 
 def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Geometries in local metres, each with its properties."""
-    yield episode.region, {"kind": "region"}
+    yield episode.region, {"kind": "region", "name": episode.about.get("region")}
     yield shapely.MultiPoint(episode.landing_points), {"kind": "landing points"}
-    times, frame = episode.time[: step + 1].tolist(), frame_of(episode, step, trail=None)
+    frame, times = frame_of(episode, step), {"times": episode.time[: step + 1].tolist()}
+    if isinstance(began := episode.about.get("began"), str):  # a journal's, whose clock is the calendar's
+        begin = datetime.fromisoformat(began)
+        times["times_utc"] = [(begin + timedelta(seconds=time)).isoformat() for time in times["times"]]
     for number, uav in enumerate(frame.uavs):
-        path, label = uav.path[:, :2], {"uav": number, "name": uav.name}
+        path, label = episode.true[: step + 1, number], {"uav": number, "name": episode.names[number]}
+        up = {"altitudes_m": episode.position[: step + 1, number, 2].round(2).tolist()}
         places: Any = shapely.points(path)
         footprints: Any = shapely.buffer(places, episode.radius, quad_segs=_CORNERS)
         covered = shapely.intersection(shapely.union_all(footprints), episode.region)
-        yield _path(path), {"kind": "track", **label, "times": times}
+        yield _path(path), {"kind": "track", **label, **times, **up}
         yield footprints[-1], {"kind": "footprint", **label, "spotted": uav.spots}
         yield covered, {"kind": "coverage", **label}
         yield shapely.Point(uav.believed), {"kind": "believed position", **label, "age_s": uav.age}
     if episode.source is not None:
-        yield _path(episode.source[: step + 1]), {"kind": "source track", "times": times}
+        yield _path(episode.source[: step + 1]), {"kind": "source track", **times}
     for area, probability in frame.cells:
         yield area, {"kind": "belief", "probability": round(probability, 5)}
 

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 from damian.common.atomic_files import write_atomically
-from damian.common.plotting import COLOURS
+from damian.common.plotting import UAV_COLOURS
 from damian.show.episode import LIKELY, Episode
 
 _PAGE = Path(__file__).parent / "page"
@@ -35,7 +35,7 @@ def page(episodes: Sequence[Episode]) -> str:
     """The text of a page that plays episodes."""
     shared, names = titles(episodes)
     shown = [{"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)]
-    replay = {"colours": COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}
+    replay = {"colours": UAV_COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}
     modules = {  # as data URLs, by the names by which they import each other
         "libraries" if file.name == _LIBRARIES else f"page/{file.stem}": (
             f"data:text/javascript;charset=utf-8,{quote(_text(file.name), safe=_PLAIN)}"

@@ -5,40 +5,49 @@ from typing import Any
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PatchCollection
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, PathPatch, Rectangle
+from matplotlib.patches import Circle, PathPatch
 from matplotlib.path import Path
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-from damian.show.episode import Episode, Floats
-from damian.show.frame import Frame, Uav, limits
+from damian.show.episode import LIKELY, Episode, Floats
+from damian.show.frame import INK, Frame, Uav, limits
 
 TURN = 0.7
 """Angle by which the space turns in each step [deg]."""
-INK = "#222222"
 HEAT = LinearSegmentedColormap.from_list("belief", [(0.45, 0.2, 0.6, 0.0), (0.45, 0.2, 0.6, 0.75)])
 """Colours of the belief about the source."""
+_NORM = LogNorm(LIKELY, 1.0)
 DART = Path([[0.0, 1.0], [0.62, -0.8], [0.0, -0.42], [-0.62, -0.8], [0.0, 1.0]])
 """Outline of a UAV that flies to the north."""
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
 _CORNERS = 48
 """Corners of a footprint in space."""
+_HALO = [withStroke(linewidth=1.8, foreground="white")]
+_NAME = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points", "path_effects": _HALO}
+_AROUND = np.array([(1, 0.5), (1, -0.5), (-1, 0.5), (-1, -0.5), (0, 1), (0, -1), (1, 1), (-1, -1)])
+"""Where a name may stand beside its mark."""
+MOST_STEPS, _BINS = 200, 100
+"""Largest number of steps whose messages are drawn one by one, and number of spans of the time beyond it."""
 
 
 class MapView:
     """The region from above."""
 
     def __init__(self, axis: Axes, episode: Episode) -> None:
-        self.axis, self.radius = axis, episode.radius
+        self.axis, self.radius, self.crowded = axis, episode.radius, episode.is_crowded
         style = {"facecolor": _LAND, "edgecolor": _EDGE, "linewidth": 1.2, "zorder": 0}
         axis.add_patch(PathPatch(_outline(episode.region), **style))
         axis.plot(*episode.landing_points.T, ".", color=_POINT, markersize=2, zorder=1)
         (west, south), (east, north) = limits(episode)
-        axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="W")
+        axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
         axis.set(xlabel="east [m]", ylabel="north [m]")
         axis.xaxis.set_major_locator(MaxNLocator(6))
         axis.yaxis.set_major_locator(MaxNLocator(6))
@@ -47,30 +56,29 @@ class MapView:
         """Draw a frame; returns the artists that were drawn."""
         drawn: list[Any] = []
         if frame.cells:
-            areas = [PathPatch(_outline(area)) for area, _ in frame.cells]
-            heat = PatchCollection(areas, facecolor=_shades(frame), edgecolor="none", zorder=0.5)
+            areas = [PathPatch(_outline(area), fc=HEAT(_NORM(p)), ec="none") for area, p in frame.cells]
+            heat = PatchCollection(areas, match_original=True, zorder=0.5)
             drawn.append(self.axis.add_collection(heat))
         drawn += _draw_source(self.axis, frame, (), {"markersize": 13, "zorder": 6})
-        return drawn + [artist for uav in frame.uavs for artist in self._uav(uav)]
+        drawn += [artist for uav in frame.uavs for artist in self._uav(uav)]
+        return drawn + _draw_names(self.axis, frame, lambda at: at)
 
     def _uav(self, uav: Uav) -> list[Any]:
         """Draw a UAV with its path and footprint, and where the server believes it to be."""
         colour, axis, true = uav.colour, self.axis, uav.path[-1, :2]
-        strength, edge = (0.26, 1.6) if uav.spots else (0.07, 0.5)
+        strength, edge = (0.26, 1.6) if uav.spots else (0.0 if self.crowded else 0.07, 0.5)
         inside = Circle(tuple(true), self.radius, facecolor=colour, alpha=strength, linewidth=0, zorder=2)
         ring = Circle(tuple(true), self.radius, fill=False, edgecolor=colour, linewidth=edge, zorder=2.1)
         parts, fading = _trail(uav.path[:, :2])
         trail = LineCollection(parts, colors=colour, alpha=fading, linewidths=1.6, zorder=3)
         drawn: list[Any] = [axis.add_collection(trail), axis.add_patch(inside), axis.add_patch(ring)]
         dart = DART.transformed(Affine2D().rotate(-uav.heading))
-        style = {"markersize": 13, "markeredgecolor": "white", "markeredgewidth": 0.6, "zorder": 5}
+        style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
         drawn += axis.plot(*true, marker=dart, color=colour, **style)
         if uav.age > 0:
             drawn += axis.plot(*np.stack([true, uav.believed]).T, ":", color=colour, linewidth=1.1, zorder=3)
             hollow = {"markerfacecolor": "none", "markersize": 12, "markeredgewidth": 1.5, "zorder": 4}
             drawn += axis.plot(*uav.believed, "o", color=colour, **hollow)
-            style = {"fontsize": 7.5, "color": colour, "zorder": 7, "textcoords": "offset points"}
-            drawn.append(axis.annotate(f"{uav.age:g} s", tuple(uav.believed), (8, 7), **style))
         return drawn
 
 
@@ -78,7 +86,7 @@ class SpaceView:
     """The region and the space above it, which turns slowly."""
 
     def __init__(self, axis: Any, episode: Episode) -> None:
-        self.axis, self.radius = axis, episode.radius
+        self.axis, self.radius, self.crowded = axis, episode.radius, episode.is_crowded
         self.dt = float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
         axis.computed_zorder = False  # the middle of the large ground says nothing about what it hides
         for part in shapely.get_parts(episode.region):
@@ -90,19 +98,18 @@ class SpaceView:
         (west, south), (east, north) = limits(episode)
         height = 1.1 * max(float(episode.position[..., 2].max()), 1.0)
         axis.set(xlim=(west, east), ylim=(south, north), zlim=(0, height))
-        size, share = np.array([east - west, north - south]), 0.35
+        size, share = np.array([east - west, north - south]), 0.35 if episode.position[..., 2].any() else 0.01
         axis.set_box_aspect((*size / size.max(), share), zoom=1.3)
-        axis.set_position((-0.04, 0.2, 0.80, 0.74))
         axis.set_axis_off()
         scale = f"{size[0]:.0f} m x {size[1]:.0f} m, heights {share * size.max() / height:.0f} times as large"
-        axis.text2D(0.08, 0.02, scale, transform=axis.transAxes, fontsize=7.5, color="0.4")
+        axis.text2D(0.08, 0.2, scale, transform=axis.transAxes, fontsize=7.5, color="0.4")
 
     def draw(self, frame: Frame) -> list[Any]:
         """Draw a frame; returns the artists that were drawn."""
         self.axis.view_init(elev=34, azim=-65 + TURN * frame.time / self.dt)
         pieces = [
-            (_on_ground(shapely.get_coordinates(part.exterior)), shade)
-            for (area, _), shade in zip(frame.cells, _shades(frame), strict=True)
+            (_on_ground(shapely.get_coordinates(part.exterior)), HEAT(_NORM(probability)))
+            for area, probability in frame.cells
             for part in _polygons(area)
         ]
         drawn: list[Any] = []
@@ -111,14 +118,18 @@ class SpaceView:
             heat = Poly3DCollection(corners, facecolor=colours, zorder=0.5)
             drawn.append(self.axis.add_collection3d(heat))
         drawn += _draw_source(self.axis, frame, (0,), {"markersize": 12, "zorder": 5})
-        return drawn + [artist for uav in frame.uavs for artist in self._uav(uav)]
+        drawn += [artist for uav in frame.uavs for artist in self._uav(uav)]
+        seen = self.axis.get_proj()
+        return drawn + _draw_names(
+            self.axis, frame, lambda at: proj_transform(at[0], at[1], at[2:].sum(), seen)
+        )
 
     def _uav(self, uav: Uav) -> list[Any]:
         """Draw a UAV with its path, what it stands above, and where the server believes it to be."""
         colour, axis, (x, y, z) = uav.colour, self.axis, uav.path[-1]
         turns = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
         circle = uav.path[-1, :2] + self.radius * np.stack([np.cos(turns), np.sin(turns)], -1)
-        strength = 0.35 if uav.spots else 0.12
+        strength = 0.35 if uav.spots else 0.05 if self.crowded else 0.12
         footprint = Poly3DCollection([_on_ground(circle)], facecolor=colour, alpha=strength, zorder=2)
         drawn: list[Any] = [axis.add_collection3d(footprint)]
         drawn += axis.plot([x, x], [y, y], [0, z], color=colour, lw=0.8, zorder=6)
@@ -126,20 +137,21 @@ class SpaceView:
         if parts:
             trail = Line3DCollection(parts, colors=colour, alpha=fading, linewidths=1.6, zorder=6)
             drawn.append(axis.add_collection3d(trail))
-        style = {"markersize": 8, "markeredgecolor": "white", "markeredgewidth": 0.6, "zorder": 7}
+        style = {"markersize": 8, "markeredgecolor": uav.edge, "markeredgewidth": 0.8, "zorder": 7}
         drawn += axis.plot(x, y, z, "o", color=colour, **style)
         if uav.age > 0:
             hollow = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 1.5, "zorder": 4}
             drawn += axis.plot(*uav.believed, 0, "o", color=colour, **hollow)
-            style = {"fontsize": 7.5, "color": colour, "zorder": 8}
-            drawn.append(axis.text(*uav.believed, 0, f"   {uav.age:g} s", **style))
         return drawn
 
 
 def draw_messages(axis: Axes, episode: Episode, colours: list[str]) -> None:
-    """Draw a row for each UAV with its messages, from left to right over the time of sending."""
+    """Draw a row for each UAV with its messages over the time of sending; shares in spans of a long time."""
+    many = episode.n_steps > MOST_STEPS
     dt = float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
-    for uav, colour in enumerate(colours):
+    if many:
+        _draw_shares(axis, episode, colours)
+    for uav, colour in enumerate([] if many else colours):
         sent = np.flatnonzero(episode.sent[:, uav])
         begin, delay = episode.time[sent], episode.delay[sent, uav]
         late, lost = delay > 0, delay < 0
@@ -150,11 +162,43 @@ def draw_messages(axis: Axes, episode: Episode, colours: list[str]) -> None:
         axis.plot(at_once, np.full(len(at_once), uav), ".", color=colour, markersize=3)
         axis.plot(ends[:, 1], np.full(len(ends), uav), ">", color=colour, markersize=3.5)
         axis.plot(begin[lost], np.full(lost.sum(), uav), "x", color=INK, markersize=4.5)
-    axis.set_yticks(range(episode.n_agents), [_short(name) for name in episode.names])
+    name_rows(axis, episode)
     axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
-    axis.set_xlabel("messages over time [s]: dots arrive at once, bars are late, crosses are lost")
+    marks = "dots arrive at once, bars are late, crosses are lost"
+    shares = "the stronger the colour, the more are late, the higher the bar, the more are lost"
+    axis.set_xlabel(f"messages over time [s]: {shares if many else marks}")
+
+
+def name_rows(axis: Axes, episode: Episode) -> None:
+    """Name the UAVs at the rows of an axis."""
+    size = min(8.0, 50 * height_of_rows(episode.n_agents) / episode.n_agents)
+    axis.set_yticks(range(episode.n_agents), [_short(name) for name in episode.names], fontsize=size)
     axis.spines["left"].set_visible(False)
     axis.tick_params(left=False)
+
+
+def height_of_rows(n_agents: int) -> float:
+    """Height of a row for each UAV [inches]."""
+    return 0.2 + 0.22 * min(n_agents, 8) + 0.14 * min(max(n_agents - 8, 0), 60)
+
+
+def _draw_shares(axis: Axes, episode: Episode, colours: list[str]) -> None:
+    """Draw the share of late messages as colours in spans of the time, and that of lost ones as bars."""
+    spans, end = np.arange(episode.n_steps + 1) * _BINS // (episode.n_steps + 1), float(episode.time[-1])
+    places, picture = (np.arange(_BINS) + 0.5) * end / _BINS, np.zeros((len(colours), _BINS, 4))
+    for uav, colour in enumerate(colours):
+        sent = np.maximum(np.bincount(spans, episode.sent[:, uav], _BINS), 1)
+        picture[uav, :, :3] = to_rgb(colour)
+        picture[uav, :, 3] = 0.1 + 0.9 * np.bincount(spans, episode.late[:, uav], _BINS) / sent
+        lost = np.bincount(spans, episode.lost[:, uav], _BINS) / sent
+        axis.bar(places, -0.9 * lost, end / _BINS, uav + 0.45, color=INK)
+    axis.imshow(picture, extent=(0, end, len(colours) - 0.5, -0.5), aspect="auto", interpolation="nearest")
+
+
+def draw_scale(axis: Axes) -> None:
+    """Draw the scale of the belief into an axis of its own."""
+    axis.figure.colorbar(ScalarMappable(_NORM, HEAT), cax=axis, orientation="horizontal")
+    axis.set_title("belief: source in a cell", loc="left", fontsize="medium")
 
 
 def legend_marks(episode: Episode) -> list[Any]:
@@ -166,8 +210,6 @@ def legend_marks(episode: Episode) -> list[Any]:
     if episode.source is not None:
         for does, style in (("emits", {}), ("silent", {"markerfacecolor": "white"})):
             marks.append(_mark(f"source, {does}", marker="*", color=INK, markersize=11, **style))
-    if episode.belief is not None:
-        marks.append(Rectangle((0, 0), 1, 1, facecolor=HEAT(1.0), label="belief about\nthe source"))
     return marks
 
 
@@ -179,10 +221,28 @@ def _draw_source(axis: Any, frame: Frame, height: tuple[float, ...], style: dict
     return axis.plot(*frame.source, *height, "*", color=INK, markerfacecolor=fill, **style)
 
 
-def _shades(frame: Frame) -> Floats:
-    """Colours of the areas in which the source may be, [C, 4]."""
-    share = np.array([probability for _, probability in frame.cells])
-    return np.asarray(HEAT((share / max(share.max(initial=0.0), 1e-9)) ** 0.7))
+def _draw_names(axis: Axes, frame: Frame, flat: Any) -> list[Any]:
+    """Name UAVs and rings where their names cover least; ``flat`` tells where the picture shows a place."""
+    axis.apply_aspect()
+    rings = [(uav, uav.believed, f"{_short(uav.id)}, {uav.age:g} s") for uav in frame.uavs if uav.age > 0]
+    named = [*((uav, uav.path[-1], _short(uav.id)) for uav in frame.uavs), *rings]
+    shown = np.array([flat(place)[:2] for _, place, _ in named])
+    points = axis.transData.transform(shown) * 72 / axis.figure.dpi
+    covered = [np.stack([points - 5, points + 5], 1)]
+    drawn: list[Any] = []
+    for (uav, _, text), anchor, place in zip(named, shown, points, strict=True):
+        half = np.array([2.4 * len(text), 4.0])
+        middles = place + np.concatenate([_AROUND * (half + near) for near in (5, 13, 24)])
+        middles = middles.clip(half, np.multiply(axis.figure.bbox.size, 72 / axis.figure.dpi) - half)
+        boxes = np.stack([middles - half, middles + half], 1)
+        low, high = np.concatenate(covered).transpose(1, 0, 2)
+        common = np.minimum(boxes[:, None, 1], high) - np.maximum(boxes[:, None, 0], low)
+        best = int(common.clip(0).prod(-1).sum(-1).round().argmin())
+        covered.append(boxes[best : best + 1])
+        line = {"arrowstyle": "-", "color": uav.ink, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 3}
+        style: dict[str, Any] = {"color": uav.ink, "arrowprops": line, "ha": "center", "va": "center"}
+        drawn.append(axis.annotate(text, tuple(anchor), tuple(middles[best] - place), **style, **_NAME))
+    return drawn
 
 
 def _trail(path: Floats) -> tuple[list[Floats], Floats | None]:

@@ -1,7 +1,10 @@
 """Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables of them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 from damian.compare.comparison import (
     ALL_MESSAGES,
@@ -13,6 +16,7 @@ from damian.compare.comparison import (
     Arm,
     Comparison,
 )
+from damian.compare.figures import look
 from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
 
@@ -172,3 +176,13 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
     assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
     assert comparison.compared("t", "late")["aware"]["recovery"].value == pytest.approx((22 / 3 - 4) / 6)
+
+
+def test_methods_of_an_experiment_look_different_and_keep_their_colours_without_the_others():
+    for path in Path("conf/experiment").glob("*.yaml"):
+        arms = {name: Arm(**given) for name, given in yaml.safe_load(path.read_text())["arms"].items()}
+        looks = {name: look(Comparison([], arms), name) for name in arms}
+        for style in ("linestyle", "marker"):
+            assert len({(each["color"], each[style]) for each in looks.values()}) == len(arms)
+        for name, arm in arms.items():
+            assert look(Comparison([], {name: arm}), name)["color"] == looks[name]["color"]

@@ -1,6 +1,7 @@
 """Episodes as data: recorded from a rollout, written to files and read again."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,6 +53,7 @@ def test_rewards_and_beliefs_are_those_of_the_rollout_after_each_step(flown):
         np.testing.assert_allclose(sum(episode.reward_terms.values()), reward, atol=1e-5)
         assert np.array_equal(episode.belief[1:], after[keys.BELIEF].numpy())
         assert episode.belief.shape[1] == len(episode.cells)
+        assert replace(episode, belief=np.full((1, 8), 1 / 8)).entropy(0) == 3
         assert episode.perceived_return == pytest.approx(reward.mean(-1).sum())
 
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from episodes import flight
+from episodes import crowd, flight
 from matplotlib.colors import to_rgb
 from PIL import Image
 
 from damian.common.plotting import COLOURS
 from damian.show.film import Film, save_film
+from damian.show.frame import frame_of
 
 
 @pytest.mark.parametrize(
@@ -31,3 +32,23 @@ def test_a_film_of_the_space_shows_a_uav_above_the_place_where_it_stands():
     colours = [(np.abs(film.frame(0) / 255 - to_rgb(COLOURS[1])).max(-1) < 0.02) for film in (low, high)]
     heights = [np.nonzero(colour[:450, :500])[0].min() for colour in colours]
     assert heights[1] < heights[0] - 20
+
+
+@pytest.mark.parametrize("view", ["2d", "3d"])
+def test_each_of_many_uavs_and_rings_has_a_mark_and_a_name_beside_the_others(view):
+    film = Film(crowd(age=np.ones((4, 20))), view)
+    names = [artist for artist in film.draw(0) if hasattr(artist, "xyann")]
+    texts = [*map(str, range(20)), *(f"{uav}, 1 s" for uav in range(20))]
+    assert [name.get_text() for name in names] == texts
+    assert len({tuple(np.round((*name.xy, *name.xyann), 2)) for name in names}) == 40
+    assert len({(uav.colour, uav.edge) for uav in frame_of(film.episode, 0).uavs}) == 20
+
+
+def test_rows_of_a_long_episode_show_the_shares_of_late_and_of_lost_messages():
+    delay = np.zeros((400, 20), int)
+    delay[:200, 3], delay[200:, 4] = 1, -1
+    lanes = Film(crowd(399, sent=np.ones((400, 20), bool), delay=delay)).lanes
+    strength = np.asarray(lanes.images[0].get_array())[..., 3]
+    assert strength[3] == pytest.approx(np.repeat([1.0, 0.1], 50))
+    bars = np.array([bar.get_height() for bar in lanes.patches]).reshape(20, -1)
+    assert bars[3:5] == pytest.approx(np.stack([np.zeros(100), np.repeat([0, -0.9], 50)]))

@@ -28,7 +28,7 @@ def episode():
     )
     torch.manual_seed(0)  # a fixture of the module is made before the seed of each test is set
     env = make_env(scenario, 1, seed=1, extras=["message", "state", "reward_terms"])
-    return record(env.rollout(10, random_policy(env)), env.uav_env, {})[0]
+    return record(env.rollout(10, random_policy(env)), env.uav_env, {"began": "2023-11-14T22:13:59.500Z"})[0]
 
 
 def by_kind(collection: dict) -> dict[str, list[dict]]:
@@ -76,10 +76,13 @@ def test_an_episode_is_valid_and_lies_where_it_was_flown(episode):
         moved = (flown != flown[0]).any()
         np.testing.assert_allclose(local(track, episode.origin), flown if moved else flown[:1], atol=0.02)
         assert track["properties"]["times"] == episode.time[:8].tolist()
+        assert track["properties"]["altitudes_m"] == episode.position[:8, uav, 2].round(2).tolist()
+        assert track["properties"]["times_utc"][1] == "2023-11-14T22:14:00.500000+00:00"
         distance = np.linalg.norm(local(now, episode.origin) - episode.true[7, uav], axis=-1)
         np.testing.assert_allclose(distance, episode.radius, atol=0.02)
         np.testing.assert_allclose(local(held, episode.origin)[0], episode.true[4, uav], atol=0.02)
         assert held["properties"]["age_s"] == 3.0
+    assert kinds["region"][0]["properties"]["name"] == "LlanbedrTest"
     assert kinds["source track"][0]["geometry"]["type"] == "Point"  # it does not move
     source = local(kinds["source track"][0], episode.origin)
     np.testing.assert_allclose(source, episode.source[:1], atol=0.02)

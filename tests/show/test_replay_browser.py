@@ -3,15 +3,13 @@
 Run by `make test-browser`. Selenium is imported where it is used, so that the other tests do not need it.
 """
 
-import io
 from contextlib import contextmanager
 from importlib import import_module
 from shutil import which
 
 import numpy as np
 import pytest
-from episodes import flight
-from PIL import Image
+from episodes import crowd, flight
 
 from damian.show.replay_page import save_page
 
@@ -116,10 +114,6 @@ class Page:
     def map(self, card=0):
         return self.run("return document.querySelectorAll('canvas.map')[arguments[0]].toDataURL()", card)
 
-    def picture(self, selector):
-        """An element as pixels [height, width, 3]."""
-        return np.asarray(Image.open(io.BytesIO(self.one(selector).screenshot_as_png)).convert("RGB"))
-
 
 @pytest.fixture
 def opened(browser, tmp_path):
@@ -207,3 +201,42 @@ def test_the_slider_the_keys_and_a_click_in_a_chart_go_to_an_instant(opened):
             step = round(page.time() / 2)
             assert 8 <= step <= 12
             check_numbers(page, episode, step)
+
+
+def test_a_click_on_a_uav_or_on_its_number_dims_the_others(opened):
+    with opened(flight(position=np.tile([[-100.0, 100, 0], [0, 0, 0]], (4, 1, 1)))) as page:
+        dim = "return document.querySelector('.numbers tbody th').style.getPropertyValue('--uav')"
+        before, button = page.run(dim), page.all(".numbers tbody button")[1]
+        for press in (page.one("canvas.map").click, lambda: button.send_keys(" ")):
+            press()
+            page.settle()
+            assert (button.get_attribute("aria-pressed"), page.run(dim) == before) == ("true", False)
+            page.press("ESCAPE")
+            assert page.run(dim) == before
+
+
+def test_a_drag_shows_a_part_of_the_time_which_follows_the_present(opened):
+    with opened(late_flight()) as page:
+        handles = "return [...document.querySelectorAll('.brush input')].map((each) => Number(each.value))"
+        pictures = "return ['.lanes', 'figure canvas'].map((c) => document.querySelector(c).toDataURL())"
+        for selector in ("[data-chart=age] .u-over", "canvas.lanes"):
+            before = page.run(pictures)
+            drag = page.actions().move_to_element_with_offset(page.one(selector), -60, 0).click_and_hold()
+            drag.move_by_offset(120, 0).release().perform()
+            page.settle()
+            first, last = page.run(handles)
+            assert 0 < first <= page.time() <= last < 2 * LAST
+            assert not {*before} & {*page.run(pictures)}
+            page.press("END")
+            assert page.run(handles)[1] == pytest.approx(2 * LAST)
+            page.press("a")
+
+
+def test_rows_of_many_uavs_scroll_and_show_shares_of_a_long_time(opened):
+    with opened(crowd(300, cells=np.array([[-9.0, 0], [9, 0]]), belief=np.full((301, 2), 0.5))) as page:
+        assert (page.shown("belief"), page.one(".scale").is_displayed()) == ("belief 1.0 bit", True)
+        notes = [page.one(".note").text, page.press("t") or page.one(".note").text]
+        assert ["more are late" in notes[0], "bars are late" in notes[1]] == [True, True]
+        page.all(".numbers tbody button")[-1].send_keys(" ")
+        page.settle()
+        assert page.run("return document.querySelector('.rows').scrollTop") > 0

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 from episodes import flight
 
-from damian.common.plotting import COLOURS
+from damian.common.plotting import UAV_COLOURS
 from damian.show.replay_page import page, save_page
 
 EVIL = "scenario=</script><script>alert('&\"\ud800')</script><!--"
@@ -48,7 +48,7 @@ def test_a_page_holds_the_episodes_as_their_files_do(tmp_path):
     shown = flown_with(["delay=none", "agents=2"], ["delay=burst", "agents=2"])
     save_page(shown, tmp_path / "page.html")
     replay = json.loads(Parts((tmp_path / "page.html").read_text()).text("script", id="replay"))
-    assert replay["colours"] == list(COLOURS)
+    assert replay["colours"] == list(UAV_COLOURS)
     for episode, held in zip(shown, replay["episodes"], strict=True):
         episode.save(tmp_path / "episode.json")
         assert {**json.loads((tmp_path / "episode.json").read_text()), "title": held["title"]} == held

@@ -2,11 +2,15 @@
 
 import { ChartView } from "page/charts";
 import { spoken } from "page/geography";
+import { OPACITY } from "page/ground";
 import { Lanes } from "page/lanes";
 import { MapView } from "page/map";
 import { Readout } from "page/readout";
 import { SpaceView } from "page/space";
 import { listenToZoom } from "page/zoom";
+
+/** Largest distance from a UAV at which a click chooses it [px]. */
+const REACH = 14;
 
 export class Card {
   /**
@@ -33,17 +37,21 @@ export class Card {
     this.map = new MapView(this.layers[0], episode, likely, zoom);
     listenToZoom(this.map, zoom, () => player.changed());
     this.#followPointer();
-    const rows = make(body, "canvas", "lanes");
-    describe(
-      rows,
-      "messages over time: for each UAV dots that arrive at once, bars that are late, crosses that are lost",
-    );
-    this.lanes = new Lanes(rows, episode, player);
+    const messages = make(body, "div", "messages");
+    const note = make(messages, "p", "note");
+    this.rows = make(messages, "div", "rows");
+    this.rows.tabIndex = 0; // so that keys can scroll it
+    this.rows.setAttribute("role", "group");
+    this.rows.setAttribute("aria-label", "rows of messages");
+    const rows = make(this.rows, "canvas", "lanes");
+    describe(rows, "messages over time, in a row for each UAV");
+    this.lanes = new Lanes(rows, note, episode, player);
+    if (episode.belief) this.#addScale(likely);
     this.figures = make(body, "div", "charts");
     this.charts = [];
     const table = make(make(body, "div", "numbers"), "table");
     table.createCaption().textContent = "UAVs at this instant";
-    this.readout = new Readout(this.line, table, episode);
+    this.readout = new Readout(this.line, table, episode, (uav) => theme.choose(uav));
   }
 
   /** Add the charts, with the ranges of their values by key. */
@@ -57,6 +65,8 @@ export class Card {
   draw({ layers, view }) {
     const now = this.episode.at(this.player.time);
     this.view.dataset.view = view;
+    if (this.scale) this.scale.hidden = !layers.has("belief");
+    if (this.chosen !== this.theme.chosen) this.#showRow();
     if (view === "3d") this.#space()?.draw(now, layers, this.theme);
     else this.map.draw(now, layers, this.theme);
     this.lanes.draw(now, this.theme);
@@ -82,15 +92,47 @@ export class Card {
     return this.space;
   }
 
-  /** Say which place is under the pointer. */
+  /** The scale of the belief's colours. */
+  #addScale(likely) {
+    this.scale = make(this.view, "p", "scale");
+    const ends = [likely, 1].map((end) => (make(this.scale, "span").textContent = String(end)));
+    this.scale.style.setProperty("--strongest", `${100 * OPACITY}%`);
+    this.scale.title = `belief: probability of a cell, from ${ends[0]} to ${ends[1]}, on a logarithmic scale`;
+  }
+
+  /** Scroll to the row of the chosen UAV. */
+  #showRow() {
+    this.chosen = this.theme.chosen;
+    if (this.chosen !== null)
+      this.rows.scrollTop = (this.chosen + 0.5) * this.lanes.row - this.rows.clientHeight / 2;
+  }
+
+  /** Say which UAV and which place is under the pointer; a click on a UAV or a ring chooses it. */
   #followPointer() {
-    this.view.addEventListener("pointermove", (event) => {
+    const at = (event) => {
       const border = this.view.getBoundingClientRect();
-      const view = this.view.dataset.view === "3d" ? this.space : this.map;
-      const place = view?.place(event.clientX - border.left, event.clientY - border.top);
-      this.hint.textContent = place ? spoken(place, this.episode.origin) : "";
+      return [event.clientX - border.left, event.clientY - border.top];
+    };
+    const view = () => (this.view.dataset.view === "3d" ? this.space : this.map);
+    const uavAt = (event) => {
+      const [x, y] = at(event);
+      const far = (shown) => Math.hypot(shown.at[0] - x, shown.at[1] - y);
+      const nearest = (view()?.shown ?? []).toSorted((one, other) => far(one) - far(other))[0];
+      return nearest && far(nearest) < REACH ? nearest.uav : null;
+    };
+    this.view.addEventListener("pointermove", (event) => {
+      const [place, uav] = [view()?.place(...at(event)), uavAt(event)];
+      const name = uav === null ? "" : `${this.episode.names[uav]}: `;
+      this.hint.textContent = place ? name + spoken(place, this.episode.origin) : "";
+      this.view.classList.toggle("at-uav", uav !== null);
     });
     this.view.addEventListener("pointerleave", () => (this.hint.textContent = ""));
+    let pressed = [0, 0];
+    this.view.addEventListener("pointerdown", (event) => (pressed = at(event)), { capture: true });
+    this.view.addEventListener("click", (event) => {
+      const [x, y] = at(event);
+      if (Math.hypot(x - pressed[0], y - pressed[1]) < REACH / 3) this.theme.choose(uavAt(event));
+    });
   }
 }
 

@@ -4,7 +4,7 @@ import { uPlot } from "libraries";
 
 /** Width of the axis beside a chart, and the margin on its other side [px]. */
 export const [GUTTER, MARGIN] = [52, 14];
-/** Largest number of UAVs that a legend names. */
+/** Largest number of lines that a legend names; of more UAVs it names the chosen one. */
 const NAMED = 6;
 const FONT = "11px system-ui, sans-serif";
 
@@ -12,7 +12,7 @@ const FONT = "11px system-ui, sans-serif";
  * What a chart shows. The value of an instant is that of the step before it (rewards), or holds until the
  * next one (ages); others change evenly.
  * @typedef {{key: string, title: string, lines: {name: string, values: number[], colour: Function}[],
- *   held: "before" | "after" | "no", digits: number}} Chart
+ *   held: "before" | "after" | "no", digits: number, isByUav?: boolean}} Chart
  */
 const ALIGN = { before: -1, after: 1 };
 
@@ -46,7 +46,14 @@ export function chartsOf(episode, theme, showsBattery) {
       held: "before",
       lines: terms.length ? terms : [all],
     },
-    { key: "age", title: "age of information [s]", digits: 1, held: "after", lines: byUav(episode.age) },
+    {
+      key: "age",
+      title: "age of information [s]",
+      digits: 1,
+      held: "after",
+      lines: byUav(episode.age),
+      isByUav: true,
+    },
   ];
   const battery = {
     key: "battery",
@@ -54,6 +61,7 @@ export function chartsOf(episode, theme, showsBattery) {
     digits: 1,
     held: "no",
     lines: byUav(episode.battery),
+    isByUav: true,
   };
   return showsBattery ? [...charts, battery] : charts;
 }
@@ -79,23 +87,36 @@ export class ChartView {
   constructor(parent, episode, chart, range, { player, theme }) {
     this.figure = document.createElement("figure");
     this.caption = document.createElement("figcaption");
+    this.isCrowded = chart.lines.length > NAMED;
     this.caption.append(chart.title);
     this.figure.dataset.chart = chart.key;
     this.figure.append(this.caption);
     parent.append(this.figure);
-    Object.assign(this, { episode, chart });
+    Object.assign(this, { episode, chart, player, theme });
     const data = [episode.time, ...chart.lines.map((line) => line.values)];
     this.plot = new uPlot(this.#options(range, player, theme), data, this.figure);
     this.future = document.createElement("div");
     this.future.className = "future";
     this.plot.over.append(this.future);
-    this.plot.over.addEventListener("click", (event) => player.seek(this.plot.posToVal(event.offsetX, "x")));
+    this.plot.over.addEventListener("pointerdown", () => (this.dragged = false));
+    this.plot.over.addEventListener("click", (event) => {
+      if (!this.dragged) player.seek(this.plot.posToVal(event.offsetX, "x"));
+    });
     this.plot.over.addEventListener("pointerleave", () => (this.hovered = false));
     this.plot.over.addEventListener("pointerenter", () => (this.hovered = true));
   }
 
   /** Mark a time, and show the numbers of its instant. */
   draw(now) {
+    if (this.shown !== this.player.shown) {
+      this.shown = this.player.shown;
+      const [min, max] = this.shown;
+      this.plot.batch(() => this.plot.setScale("x", { min, max }));
+    }
+    if (this.isCrowded)
+      this.caption.querySelectorAll(".u-series").forEach((row, i) => {
+        row.style.display = this.chart.isByUav && i - 1 === this.theme.chosen ? "" : "none";
+      });
     const width = this.plot.over.clientWidth;
     const at = Math.min(Math.max(this.plot.valToPos(now.time, "x"), 0), width);
     this.future.style.transform = `translateX(${at}px)`;
@@ -117,6 +138,15 @@ export class ChartView {
     return Number(getComputedStyle(this.figure).getPropertyValue("--chart-height"));
   }
 
+  /** Show the part of the time that a drag has chosen. */
+  #select(plot) {
+    const { left, width } = plot.select;
+    if (!width) return;
+    this.dragged = true;
+    this.player.show(plot.posToVal(left, "x"), plot.posToVal(left + width, "x"));
+    plot.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+  }
+
   #options(range, player, theme) {
     const axis = { stroke: () => theme.muted, font: FONT, ticks: { show: false } };
     const grid = { stroke: () => theme.line, width: 1 };
@@ -125,7 +155,7 @@ export class ChartView {
     const series = this.chart.lines.map((line) => ({
       label: line.name,
       stroke: line.colour,
-      width: 1.6,
+      width: this.isCrowded ? 1 : 1.6,
       value,
       points: { show: false },
       paths: align ? uPlot.paths.stepped({ align }) : uPlot.paths.linear(),
@@ -135,19 +165,25 @@ export class ChartView {
       height: this.#height(),
       padding: [6, MARGIN, 0, 0],
       legend: {
-        show: this.chart.lines.length <= NAMED,
         mount: (_, legend) => this.caption.append(legend),
         markers: { width: 0, fill: (_, i) => this.chart.lines[i - 1]?.colour() },
       },
-      cursor: { sync: { key: "time" }, drag: { x: false, y: false }, points: { size: 5 }, y: false },
-      scales: { x: { time: false, range: [0, Math.max(player.end, this.episode.dt)] }, y: { range } },
+      cursor: {
+        sync: { key: "time" },
+        drag: { x: true, y: false, setScale: false, dist: 5 },
+        bind: { dblclick: () => () => player.showAll() },
+        points: { size: 5 },
+        y: false,
+      },
+      hooks: { setSelect: [(plot) => this.#select(plot)] },
+      scales: { x: { time: false, range: () => player.shown }, y: { range } },
       axes: [
         {
           ...axis,
           grid: { ...grid, show: false },
           size: 26,
           gap: 6,
-          values: (_, ticks) => ticks.map((tick) => `${tick} s`),
+          values: (_, ticks) => ticks.map((tick) => `${Number(tick.toFixed(6))} s`),
         },
         { ...axis, grid, size: GUTTER, gap: 4, space: 26 },
       ],

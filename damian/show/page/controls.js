@@ -1,5 +1,6 @@
 /** Buttons, the slider of the time, and keys. */
 
+import { addBrush } from "page/brush";
 import { plain } from "page/marks";
 import { SPEEDS } from "page/player";
 
@@ -94,7 +95,11 @@ export function addTransport(parent, player) {
     player.speed = Number(speed.value);
     player.changed();
   });
-  parent.append(buttons, slider, time, speed);
+  const times = document.createElement("div");
+  times.className = "times";
+  times.append(slider);
+  parent.append(buttons, times, time, speed);
+  addBrush(times, player);
   player.onChange(() => {
     play.setAttribute("aria-label", player.playing ? "pause (Space)" : "play (Space)");
     play.querySelector("path").setAttribute("d", player.playing ? ICONS.pause : ICONS.play);
@@ -117,13 +122,17 @@ export function listen(player, keys) {
     ArrowDown: () => player.hurry(-1),
     Home: () => player.seek(0),
     End: () => player.seek(player.end),
+    t: (event) => player.nearer(event.shiftKey ? 0.5 : 2),
+    a: () => player.showAll(),
     ...keys,
   };
   addEventListener("keydown", (event) => {
     const press = presses[event.key.length === 1 ? event.key.toLowerCase() : event.key];
     const writes =
-      event.target.matches("select") || (event.key === " " && event.target.matches("button, summary"));
-    if (!press || writes || event.ctrlKey || event.altKey || event.metaKey) return;
+      event.target.matches("select, .brush input") ||
+      (event.key === " " && event.target.matches("button, summary"));
+    const scrolls = /^Arrow(Up|Down)$/.test(event.key) && event.target.matches(".rows");
+    if (!press || writes || scrolls || event.ctrlKey || event.altKey || event.metaKey) return;
     event.preventDefault();
     press(event);
   });

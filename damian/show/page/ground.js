@@ -2,8 +2,8 @@
 
 import { faint } from "page/theme";
 
-/** Strongest colour of the belief, and the power that shows weaker cells. */
-const [OPACITY, POWER] = [0.62, 0.7];
+/** Colour of a cell in which the source surely is; others are fainter, on a logarithmic scale. */
+export const OPACITY = 0.75;
 
 /** Paints the ground into a canvas of its own, again only when it changes. */
 export class Ground {
@@ -12,7 +12,7 @@ export class Ground {
 
   /**
    * @param {import("page/episode").Episode} episode
-   * @param {number} likely smallest probability of a cell worth showing, as a share of the largest one
+   * @param {number} likely smallest probability of a cell worth showing
    */
   constructor(episode, likely) {
     this.episode = episode;
@@ -95,15 +95,14 @@ export class Ground {
   }
 
   #belief(context, frame, step, theme) {
-    const row = this.episode.belief[step];
-    const largest = Math.max(...row, 1e-9);
     const size = this.edge * frame.scale;
-    row.forEach((probability, cell) => {
-      if (probability <= this.likely * largest) return;
+    this.episode.belief[step].forEach((probability, cell) => {
+      if (probability <= this.likely) return;
+      const strength = 1 - Math.log(probability) / Math.log(this.likely);
       const [x, y] = frame.pixel(this.episode.cells[cell]);
       const [left, top] = [Math.round(x - size / 2), Math.round(y - size / 2)];
       const [right, bottom] = [Math.round(x + size / 2), Math.round(y + size / 2)];
-      context.fillStyle = faint(theme.belief, (OPACITY * (probability / largest) ** POWER).toFixed(3));
+      context.fillStyle = faint(theme.belief, (OPACITY * strength).toFixed(3));
       context.fillRect(left, top, right - left, bottom - top);
     });
   }

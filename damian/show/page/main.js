@@ -27,7 +27,7 @@ const cards = episodes.map(
 addCharts();
 addTransport(document.getElementById("transport"), player);
 const keys = addTools(document.getElementById("tools"), settings, hasBelief, () => player.changed());
-listen(player, { ...keys, ...zoomKeys() });
+listen(player, { ...keys, ...zoomKeys(), Escape: () => theme.choose(null) });
 player.onChange(() => cards.forEach((card) => card.draw(settings)));
 new ResizeObserver(redraw).observe(parent);
 theme.onChange(redraw);

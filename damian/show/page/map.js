@@ -17,6 +17,7 @@ export class MapView {
   constructor(canvas, episode, likely, zoom) {
     Object.assign(this, { canvas, episode, zoom });
     this.ground = new Ground(episode, likely);
+    this.places = new Map();
   }
 
   /** Draw what there is at a time; the canvas has the size [px] that its element has. */
@@ -32,7 +33,8 @@ export class MapView {
     this.frame = new Frame(limits, width, height);
     if (layers.has("truth")) this.#footprintsAndTrails(context, now, theme);
     const pixel = (place) => this.frame.pixel(place);
-    drawMarks({ context, episode: this.episode, now, layers, theme, pixel, darts: true, rise: 0 });
+    const { episode, places } = this;
+    this.shown = drawMarks({ context, episode, now, layers, theme, pixel, darts: true, rise: 0, places });
     this.#scaleBar(context, theme);
   }
 
@@ -43,11 +45,12 @@ export class MapView {
 
   #footprintsAndTrails(context, now, theme) {
     const { episode, frame } = this;
+    const isCrowded = episode.nAgents > theme.few;
     for (let uav = 0; uav < episode.nAgents; uav++) {
       const [colour, spotted] = [theme.uav(uav), episode.spotted[now.step][uav]];
       context.beginPath();
       context.arc(...frame.pixel(episode.place(uav, now)), episode.radius * frame.scale, 0, 2 * Math.PI);
-      context.fillStyle = faint(colour, spotted ? 0.26 : 0.07);
+      context.fillStyle = faint(colour, spotted ? 0.26 : isCrowded ? 0 : 0.07);
       context.strokeStyle = faint(colour, spotted ? 1 : 0.6);
       context.lineWidth = spotted ? 2 : 0.8;
       context.fill();
@@ -56,7 +59,7 @@ export class MapView {
     context.lineWidth = 2;
     context.lineCap = "round";
     for (let uav = 0; uav < episode.nAgents; uav++) {
-      const path = episode.trail(uav, now).map((place) => frame.pixel(place));
+      const path = episode.trail(uav, now, isCrowded).map((place) => frame.pixel(place));
       path.slice(1).forEach((to, i) => {
         context.strokeStyle = faint(theme.uav(uav), 0.1 + (0.6 * (i + 1)) / path.length);
         context.beginPath();

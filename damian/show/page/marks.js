@@ -2,6 +2,8 @@
 
 import { faint } from "page/theme";
 
+const FONT = "600 11px system-ui, sans-serif";
+
 /** Outline of a UAV that flies to the north, as in films: east, north. */
 export const DART = [
   [0, 1],
@@ -11,7 +13,7 @@ export const DART = [
 ];
 
 /** A UAV, turned to its heading [rad, clockwise from north]. */
-export function dart(context, [x, y], heading, colour, theme, size = 10) {
+export function dart(context, [x, y], heading, colour, rim, size = 10) {
   context.save();
   context.translate(x, y);
   context.rotate(heading);
@@ -19,7 +21,7 @@ export function dart(context, [x, y], heading, colour, theme, size = 10) {
   DART.forEach(([east, north], i) => context[i ? "lineTo" : "moveTo"](east * size, -north * size));
   context.closePath();
   context.fillStyle = colour;
-  context.strokeStyle = theme.paper;
+  context.strokeStyle = rim;
   context.lineWidth = 1.2;
   context.lineJoin = "round";
   context.fill();
@@ -27,14 +29,13 @@ export function dart(context, [x, y], heading, colour, theme, size = 10) {
   context.restore();
 }
 
-/** A ring where the server believes a UAV to be, with the age [s] of what it knows if that is old. */
-export function ghost(context, [x, y], age, colour, theme) {
+/** A ring where the server believes a UAV to be. */
+export function ghost(context, [x, y], colour) {
   context.strokeStyle = colour;
   context.lineWidth = 2;
   context.beginPath();
   context.arc(x, y, 9, 0, 2 * Math.PI);
   context.stroke();
-  if (age > 0) label(context, [x + 12, y - 11], `${plain(age)} s`, colour, theme);
 }
 
 /** The dotted way from where a UAV is to where it is believed to be. */
@@ -68,19 +69,19 @@ export function star(context, [x, y], emits, theme) {
 }
 
 /** A message under way: a dot in a circle that closes until it arrives, with the share of its way. */
-export function parcel(context, [x, y], share, colour, theme) {
+export function parcel(context, [x, y], share, colour, theme, size = 6) {
   context.beginPath();
-  context.arc(x, y, 6, 0, 2 * Math.PI);
+  context.arc(x, y, size, 0, 2 * Math.PI);
   context.fillStyle = faint(theme.paper, 0.85);
   context.fill();
   context.strokeStyle = faint(colour, 0.3);
   context.lineWidth = 2;
   context.stroke();
   context.beginPath();
-  context.arc(x, y, 6, -Math.PI / 2, (2 * share - 0.5) * Math.PI);
+  context.arc(x, y, size, -Math.PI / 2, (2 * share - 0.5) * Math.PI);
   context.strokeStyle = colour;
   context.stroke();
-  dot(context, [x, y], 2.2, colour);
+  dot(context, [x, y], size / 2.7, colour);
 }
 
 export function dot(context, [x, y], radius, colour) {
@@ -127,9 +128,70 @@ export function battery(context, [x, y], level, colour, theme) {
   context.fillRect(left, top, (width * Math.max(level, 0)) / 100, height);
 }
 
+/** Where a name may stand beside its mark, the best places first. */
+const AROUND = [1, 2, 4].flatMap((far) =>
+  [
+    [1, 0.6],
+    [1, -0.6],
+    [-1, 0.6],
+    [-1, -0.6],
+    [0, 1],
+    [0, -1],
+    [1, 1],
+    [-1, -1],
+  ].map((toward) => ({ toward, near: 3 + 6 * far })),
+);
+/** Area [px²] that a name may cover rather than move, so that names do not dance. */
+const CALM = 60;
+
+/**
+ * Names beside their marks, where they cover least.
+ * @param {{key: string, at: number[], text: string, colour: string}[]} named
+ * @param {number[][]} others places that names should not cover
+ * @param {Map<string, number>} before the places of the names in the picture before, which are changed
+ */
+export function names(context, named, others, before, theme) {
+  const { clientWidth: width, clientHeight: height } = context.canvas;
+  const marked = [...named.map(({ at }) => at), ...others];
+  const covered = marked.map(([x, y]) => [x - 7, y - 7, x + 7, y + 7]);
+  context.font = FONT;
+  for (const { key, at, text, colour } of named) {
+    const half = [context.measureText(text).width / 2 + 1, 6];
+    const boxes = AROUND.map(({ toward, near }) => {
+      const [x, y] = at.map((value, axis) => value + toward[axis] * (half[axis] + near));
+      return [x - half[0], y - half[1], x + half[0], y + half[1]];
+    });
+    const costs = boxes.map((box, i) => {
+      const outside = box[0] < 0 || box[1] < 0 || box[2] > width || box[3] > height;
+      const calm = before.get(key) === i ? -CALM : 0;
+      return covered.reduce((sum, other) => sum + common(box, other), outside ? 500 : calm);
+    });
+    const best = costs.indexOf(Math.min(...costs));
+    const [left, top, right, bottom] = boxes[best];
+    before.set(key, best);
+    covered.push(boxes[best]);
+    if (best >= 8) {
+      context.strokeStyle = colour;
+      context.lineWidth = 1;
+      context.beginPath();
+      context.moveTo(...at);
+      context.lineTo((left + right) / 2, (top + bottom) / 2);
+      context.stroke();
+    }
+    label(context, [left + 1, (top + bottom) / 2], text, colour, theme);
+  }
+}
+
+/** Area that two boxes have in common. */
+function common(one, other) {
+  const width = Math.min(one[2], other[2]) - Math.max(one[0], other[0]);
+  const height = Math.min(one[3], other[3]) - Math.max(one[1], other[1]);
+  return Math.max(width, 0) * Math.max(height, 0);
+}
+
 /** A short text that stays readable on any ground. */
 export function label(context, [x, y], text, colour, theme) {
-  context.font = "600 11px system-ui, sans-serif";
+  context.font = FONT;
   context.textBaseline = "middle";
   context.lineJoin = "round";
   context.lineWidth = 3;

@@ -17,39 +17,49 @@ import { faint } from "page/theme";
  * @property {function(number[]): number[]} pixel of a place east, north, up [m]
  * @property {boolean} darts whether UAVs are drawn as marks
  * @property {number} rise height to which messages rise [m]
+ * @property {Map<string, number>} places of the names in the picture before
  */
 
-/** @param {Scene} scene */
+/**
+ * Draws all marks, the chosen UAV on top; returns the UAVs and rings.
+ * @param {Scene} scene
+ * @returns {{uav: number, at: number[]}[]}
+ */
 export function drawMarks(scene) {
-  const { episode, layers } = scene;
-  const uavs = [...Array(episode.nAgents).keys()];
+  const { context, episode, layers, theme } = scene;
+  const uavs = [...Array(episode.nAgents).keys()].sort(
+    (one, other) => (one === theme.chosen) - (other === theme.chosen),
+  );
   if (layers.has("messages")) drawMessages(scene);
-  if (layers.has("truth")) drawSource(scene);
-  if (layers.has("believed")) for (const uav of uavs) drawBelieved(scene, uav);
-  if (layers.has("truth")) for (const uav of uavs) drawUav(scene, uav);
+  const source = layers.has("truth") && episode.source ? [drawSource(scene)] : [];
+  const rings = layers.has("believed") ? uavs.map((uav) => drawBelieved(scene, uav)) : [];
+  const darts = layers.has("truth") ? uavs.map((uav) => drawUav(scene, uav)) : [];
+  const shown = [...darts, ...rings.filter(Boolean)].reverse(); // the chosen one is named first
+  marks.names(context, shown, source, scene.places, theme);
+  return shown;
 }
 
-/** A UAV, its number if there are more of them than colours, and its battery if it is used. */
+/** A UAV, and its battery if it is used. */
 function drawUav({ context, episode, now, theme, pixel, darts }, uav) {
   const [at, colour] = [pixel(episode.place(uav, now)), theme.uav(uav)];
-  if (darts) marks.dart(context, at, episode.heading(uav, now), colour, theme);
-  if (episode.nAgents > theme.uavs.length) {
-    marks.label(context, [at[0] + 9, at[1] + 9], episode.ids[uav], colour, theme);
-  }
+  if (darts) marks.dart(context, at, episode.heading(uav, now), colour, theme.rim(uav));
   if (episode.usesBattery) marks.battery(context, at, episode.battery[now.step][uav], colour, theme);
+  return { uav, at, key: `dart ${uav}`, text: episode.ids[uav], colour: theme.text(uav) };
 }
 
 /** Where the server believes a UAV to be, if it differs in time from the truth or the truth is not shown. */
 function drawBelieved({ context, episode, now, layers, theme, pixel }, uav) {
   const [age, colour] = [episode.age[now.step][uav], theme.uav(uav)];
-  const held = pixel([...episode.believed[now.step][uav], 0]);
-  if (age > 0 && layers.has("truth")) marks.error(context, pixel(episode.place(uav, now)), held, colour);
-  if (age > 0 || !layers.has("truth")) marks.ghost(context, held, age, colour, theme);
+  const at = pixel([...episode.believed[now.step][uav], 0]);
+  if (age > 0 && layers.has("truth")) marks.error(context, pixel(episode.place(uav, now)), at, colour);
+  if (age === 0 && layers.has("truth")) return undefined;
+  marks.ghost(context, at, colour);
+  const text = age > 0 ? `${episode.ids[uav]}, ${marks.plain(age)} s` : episode.ids[uav];
+  return { uav, at, key: `ring ${uav}`, text, colour: theme.text(uav) };
 }
 
-/** The source, if it is known, with a wave that spreads over the step while it emits. */
+/** The source, with a wave that spreads over the step while it emits. */
 function drawSource({ context, episode, now, theme, pixel }) {
-  if (!episode.source) return;
   const at = pixel([...episode.sourcePlace(now), 0]);
   if (episode.emits[now.step]) {
     context.strokeStyle = faint(theme.ink, 0.45 * (1 - now.share));
@@ -59,6 +69,7 @@ function drawSource({ context, episode, now, theme, pixel }) {
     context.stroke();
   }
   marks.star(context, at, episode.emits[now.step], theme);
+  return at;
 }
 
 /** Messages under way where they were sent, and crosses for those that were just lost. */
@@ -66,8 +77,17 @@ function drawMessages({ context, episode, now, theme, pixel, rise }) {
   for (const { uav, step, sent, arrives, lost } of episode.underWay(now)) {
     const [east, north, up] = episode.position[step][uav];
     const share = lost ? 0.5 : (now.time - sent) / (arrives - sent);
-    const at = pixel([east, north, up + share * rise]);
-    if (lost) marks.cross(context, at, theme.ink);
-    else marks.parcel(context, at, share, theme.uav(uav), theme);
+    const [from, at] = [0, share * rise].map((above) => pixel([east, north, up + above]));
+    if (lost) {
+      marks.cross(context, at, theme.lost(uav));
+      continue;
+    }
+    context.strokeStyle = faint(theme.uav(uav), 0.5);
+    context.lineWidth = 1;
+    context.beginPath();
+    context.moveTo(...from);
+    context.lineTo(...at);
+    context.stroke();
+    marks.parcel(context, at, share, theme.uav(uav), theme, episode.nAgents > theme.few ? 4 : 6);
   }
 }

@@ -2,6 +2,8 @@
 
 /** Steps in a second of playing. */
 export const SPEEDS = [1, 2, 4, 8, 16, 32];
+/** Least number of steps that rows and charts show. */
+const LEAST = 5;
 
 export class Player {
   /** @type {number} time [s] */
@@ -17,6 +19,43 @@ export class Player {
     this.instants = [...new Set(episodes.flatMap((episode) => episode.time))].sort((a, b) => a - b);
     this.end = this.instants.at(-1);
     this.dt = Math.min(...episodes.map((episode) => episode.dt));
+    /** Length of all of the time [s]. */
+    this.span = Math.max(this.end, this.dt);
+    /** First and last time that rows and charts show [s]. */
+    this.shown = [0, this.span];
+    /** First and last time that a drag is about to choose [s], or null. */
+    this.chosen = null;
+  }
+
+  get isZoomed() {
+    return this.shown[1] - this.shown[0] < this.span;
+  }
+
+  /** Show a part of the time, which has at least a few steps, in rows and charts. */
+  show(one, other) {
+    const least = Math.min(LEAST * this.dt, this.span);
+    const width = Math.min(Math.max(Math.abs(other - one), least), this.span);
+    const begin = Math.min(Math.max((one + other - width) / 2, 0), this.span - width);
+    this.shown = [begin, begin + width];
+    if (this.time < begin || this.time > begin + width)
+      this.time = this.instants.find((instant) => instant >= begin);
+    this.changed();
+  }
+
+  showAll() {
+    this.show(0, this.span);
+  }
+
+  /** Show a part of the time about the present, so many times as short. */
+  nearer(factor) {
+    const half = (this.shown[1] - this.shown[0]) / factor / 2;
+    this.show(this.time - half, this.time + half);
+  }
+
+  /** Say what a drag is about to choose, or null. */
+  choose(one, other) {
+    this.chosen = one === null ? null : [Math.min(one, other), Math.max(one, other)];
+    this.changed();
   }
 
   /** Call a function after each change, at most once for each picture of the screen. */
@@ -69,6 +108,8 @@ export class Player {
       this.time = Math.min(this.time + passed * this.speed * this.dt, this.end);
       this.playing = this.time < this.end;
     }
+    const [from, to] = this.shown;
+    if (this.time < from || this.time > to) this.show(this.time, this.time + to - from);
     for (const listener of this.#listeners) listener();
     if (this.playing) this.changed();
   }

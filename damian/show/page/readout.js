@@ -11,8 +11,9 @@ export class Readout {
    * @param {HTMLElement} line for the line about the episode
    * @param {HTMLTableElement} table
    * @param {import("page/episode").Episode} episode
+   * @param {function(number): void} choose what a click on a UAV does
    */
-  constructor(line, table, episode) {
+  constructor(line, table, episode, choose) {
     Object.assign(this, { line, episode });
     this.columns = [...Object.keys(UNITS), "spots"].filter((name) => name !== "up" || episode.highest > 0);
     const head = table.createTHead().insertRow();
@@ -23,13 +24,13 @@ export class Readout {
       head.append(cell);
     }
     const body = table.createTBody();
-    this.rows = episode.ids.map((id) => row(body, id, this.columns));
+    this.rows = episode.ids.map((id, uav) => row(body, id, this.columns, () => choose(uav)));
   }
 
   /** Show the numbers of the instant before a time. */
   draw({ step, ended }, theme) {
     const { episode } = this;
-    const key = [step, ended, theme.dark].join();
+    const key = [step, ended, theme.dark, theme.chosen].join();
     if (key === this.shown) return;
     this.shown = key;
     const spots = episode.spotters(step).length;
@@ -38,6 +39,7 @@ export class Readout {
       ["return", `return ${episode.returns[step].toFixed(2)}`],
       ["spots", `${spots} of ${episode.nAgents} spot the source`],
       ["age", `mean age ${episode.meanAge[step].toFixed(1)} s`],
+      ["belief", episode.belief ? `belief ${episode.entropy(step).toFixed(1)} bit` : ""],
       ["ended", ended ? (episode.success ? "ended with success" : "ended") : ""],
     ];
     this.line.replaceChildren(
@@ -58,6 +60,7 @@ export class Readout {
       cells.get("spots").textContent = spots ? FILLED : HOLLOW;
       cells.get("spots").setAttribute("aria-label", spots ? "yes" : "no");
       cells.get("UAV").style.setProperty("--uav", theme.uav(uav));
+      cells.get("UAV").firstChild.setAttribute("aria-pressed", String(theme.chosen === uav));
       cells.get("age").classList.toggle("old", numbers.age > 0);
     });
   }
@@ -72,11 +75,14 @@ function written(value) {
 }
 
 /** A row of the table; returns its cells by name. */
-function row(body, id, columns) {
+function row(body, id, columns, choose) {
   const line = body.insertRow();
   const head = document.createElement("th");
   head.scope = "row";
-  head.textContent = id;
+  const button = document.createElement("button");
+  Object.assign(button, { type: "button", textContent: id, title: `dim the others than ${id}` });
+  button.addEventListener("click", choose);
+  head.append(button);
   line.append(head);
   const cells = columns.map((name) => {
     const cell = line.insertCell();

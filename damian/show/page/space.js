@@ -42,6 +42,7 @@ export class SpaceView {
     const sun = new three.DirectionalLight("#ffffff", 2.2);
     sun.position.set(-1, 2, 1);
     this.scene.add(new three.AmbientLight("#ffffff", 1.4), sun);
+    this.places = new Map();
     this.#addGround(likely);
     this.uavs = episode.position[0].map((_, uav) => new SpaceUav(this, uav));
     this.#addCamera(changed);
@@ -64,7 +65,8 @@ export class SpaceView {
     const context = fitted(this.marks, width, height);
     const pixel = (place) => this.pixel(place);
     const rise = (RISE * this.size) / this.enlarged;
-    drawMarks({ context, episode: this.episode, now, layers, theme, pixel, darts: false, rise });
+    const { episode, places } = this;
+    this.shown = drawMarks({ context, episode, now, layers, theme, pixel, darts: false, rise, places });
     this.#words(context, theme);
   }
 

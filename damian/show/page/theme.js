@@ -3,29 +3,67 @@
 const DARK = matchMedia("(prefers-color-scheme: dark)");
 /** Share of white that colours get on a dark screen. */
 const LIGHTER = 0.32;
+/** Share of paper that the colours of UAVs get while another one is chosen. */
+const DIM = 0.72;
 
 export class Theme {
-  /** @param {string[]} colours of the UAVs, as #rrggbb; a seventh UAV has the first one again */
+  /** The UAV that the reader has chosen, whose colours alone are not dim; null if all are the same. */
+  chosen = null;
+  #listeners = [];
+
+  /** @param {string[]} colours of the UAVs, as #rrggbb: the usual ones, and the same darkened */
   constructor(colours) {
     this.colours = colours;
+    /** Largest number of UAVs of which everything can be drawn. */
+    this.few = colours.length / 2;
     this.#read();
-  }
-
-  /** Call a function when the screen turns dark or light. */
-  onChange(listener) {
     DARK.addEventListener("change", () => {
       this.#read();
-      listener();
+      this.#changed();
     });
   }
 
-  /** Colour of a UAV, or of a reward's term. */
+  /** Call a function when the screen turns dark or light, or another UAV is chosen. */
+  onChange(listener) {
+    this.#listeners.push(listener);
+  }
+
+  /** Choose a UAV, or none with null; the chosen one again: none. */
+  choose(uav) {
+    this.chosen = uav === this.chosen ? null : uav;
+    this.#changed();
+  }
+
+  /** Colour of a UAV. */
   uav(number) {
-    return this.uavs[number % this.uavs.length];
+    return this.#dimmed(number, this.uavs[number % this.uavs.length]);
+  }
+
+  /** Colour of its texts: the darker one, on a dark screen the lighter one. */
+  text(number) {
+    return this.#dimmed(number, this.uavs[(this.dark ? 0 : this.few) + (number % this.few)]);
+  }
+
+  /** Colour of its lost messages. */
+  lost(number) {
+    return this.#dimmed(number, this.ink);
+  }
+
+  /** Colour of its mark's edge, which tells it from an earlier one of the same colour. */
+  rim(number) {
+    return Math.floor(number / this.uavs.length) % 2 ? this.#dimmed(number, this.ink) : this.paper;
   }
 
   term(number) {
     return this.terms[number % this.terms.length];
+  }
+
+  #dimmed(number, colour) {
+    return this.chosen === null || this.chosen === number ? colour : mixed(colour, this.paper, DIM);
+  }
+
+  #changed() {
+    for (const listener of this.#listeners) listener();
   }
 
   #read() {
@@ -47,7 +85,7 @@ export class Theme {
     }
     this.dark = DARK.matches;
     this.terms = [0, 1, 2, 3, 4, 5].map((number) => value(`term-${number}`));
-    this.uavs = this.colours.map((colour) => (this.dark ? lighter(colour) : colour));
+    this.uavs = this.colours.map((colour) => (this.dark ? mixed(colour, "#ffffff", LIGHTER) : colour));
   }
 }
 
@@ -56,9 +94,10 @@ export function faint(colour, opacity) {
   return `rgb(${channels(colour).join(" ")} / ${opacity})`;
 }
 
-function lighter(colour) {
-  const mixed = channels(colour).map((value) => Math.round(value + LIGHTER * (255 - value)));
-  return `#${mixed.map((value) => value.toString(16).padStart(2, "0")).join("")}`;
+/** A colour with a share of another one. */
+function mixed(colour, other, share) {
+  const parts = channels(other).map((to, i) => channels(colour)[i] * (1 - share) + to * share);
+  return `#${parts.map((value) => Math.round(value).toString(16).padStart(2, "0")).join("")}`;
 }
 
 /** Red, green and blue of #rrggbb, in [0, 255]. */
