@@ -6,12 +6,13 @@ damian advise checkpoint=runs/first port=8000 journal=journals   (several fleets
 
 import copy
 import gc
+import json
 import logging
 import os
 import secrets
 import socket
 import time
-from contextlib import closing, nullcontext
+from contextlib import closing
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -23,14 +24,13 @@ from damian.advice.clock import Clock
 from damian.advice.fitting import fit, law_summary, plot_delays, read_log, steps_of, summary, trace_rows
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.node import Node, for_uavs, scenario_of_service
-from damian.advice.rows import read_file
-from damian.advice.session import AdviceSession, read_inbox, write_answer
+from damian.advice.rows import as_csv, as_rows, read_file
+from damian.advice.session import AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.delays.law_fit import fit_laws
-from damian.runs.run_lock import locked
 from damian.settings.programs import AdviseConfig, check_token
 from damian.world.vehicles import MOTION_MODELS
 
@@ -45,7 +45,7 @@ HANDLES = BACKLOG + 64
 """File handles that the service keeps for itself, and for those that it turns away."""
 MOST_CONNECTIONS = 4000
 FLEET = "main"
-"""Name of the only fleet of a table or a folder."""
+"""Name of the only fleet of a table."""
 
 
 def without_token(config: AdviseConfig) -> AdviseConfig:
@@ -97,7 +97,9 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
         except Waiting as error:
             raise InputError(str(error)) from None
     save_config(without_token(config), folder)
-    print(write_answer(folder, answer), end="")
+    write_atomically(folder / "advice.json", json.dumps(as_rows(answer), indent=1))
+    write_atomically(folder / "advice.csv", table := as_csv(answer))
+    print(table, end="")
 
 
 def fit_delays(config: AdviseConfig, folder: Path) -> None:
@@ -127,19 +129,10 @@ def advise(config: AdviseConfig, folder: Path) -> None:
     if config.reports is not None:
         answer_table(config, folder)
         return
-    inbox = None if config.folder is None else Path(config.folder)
-    if inbox is not None and not inbox.is_dir():
-        raise InputError(f"folder: {inbox} is not there")
     journals = Path(config.journal) if config.journal else folder / "journals"
-    alone = locked(inbox, "folder") if inbox else nullcontext()
-    with alone, closing(make_session(config, journals)) as session:
-        if inbox:
-            session.create(FLEET, config.uavs)
+    with closing(make_session(config, journals)) as session:
         save_config(without_token(config), folder)
-        if inbox:
-            watch(inbox, session)
-        else:
-            serve(config, session)
+        serve(config, session)
 
 
 def serve(config: AdviseConfig, session: AdviceSession) -> None:
@@ -194,18 +187,6 @@ def most_connections() -> int:
     if soft < HANDLES + 16:
         raise InputError(f"port: {soft} file handles are too few: allow {HANDLES + 16} at least (ulimit -n)")
     return min(soft - HANDLES, MOST_CONNECTIONS)
-
-
-def watch(inbox: Path, session: AdviceSession) -> None:
-    """Answer every table that comes into a folder, until the program is stopped."""
-    print(f"watching {inbox}", flush=True)
-    clock = Clock(session.latest)
-    while True:
-        clock.watch()
-        if not read_inbox(session, FLEET, inbox, clock()):
-            for _ in session.upkeep(clock):
-                pass
-            time.sleep(0.2)
 
 
 def run() -> None:

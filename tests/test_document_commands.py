@@ -110,7 +110,6 @@ def trained(tmp_path_factory) -> Path:
     park = {"type": "Feature", "properties": {"name": "park"}, "geometry": shape}
     (folder / "park.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [park]}))
     (folder / "table.csv").write_text(TABLE)
-    (folder / "inbox").mkdir()
     for file in (ROOT / "examples" / "extending").glob("*.py"):
         shutil.copy(file, folder)
     return folder

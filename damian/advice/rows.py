@@ -200,13 +200,8 @@ Rows = list[tuple[str, Report]]
 
 def read_file(path: Path) -> Rows:
     """Reports of a file: JSON if its name ends with ``.json``, or else CSV."""
-    return reports_of(rows_of_file(path))
-
-
-def rows_of_file(path: Path) -> Found:
-    """Rows of a file, of any kind."""
     text = read_text(path)
-    return rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text)
+    return reports_of(rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text))
 
 
 def rows_of_csv(text: str) -> Found:

@@ -1,11 +1,10 @@
-"""Several fleets with their journals: what all sources of reports (tables, folders, HTTP) have in common.
+"""Several fleets with their journals: what all sources of reports (tables, HTTP) have in common.
 
 Each request checks, writes the line of the journal, and then changes the fleet: nothing is acknowledged that
 the journal does not say, and a request that fails changes nothing.
 """
 
 import io
-import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -17,7 +16,7 @@ import torch
 
 import damian
 from damian import keys
-from damian.advice.fleet import Fleet, Waiting
+from damian.advice.fleet import Fleet
 from damian.advice.journal import (
     SUFFIX,
     About,
@@ -41,21 +40,16 @@ from damian.advice.rows import (
     Advice,
     Report,
     Rows,
-    acknowledgements_of,
-    as_csv,
-    as_rows,
-    reports_of,
-    rows_of_file,
     validated,
 )
-from damian.common.atomic_files import UNFINISHED, write_atomically, writing
+from damian.common.atomic_files import UNFINISHED, writing
 from damian.common.errors import InputError, RunError, described
 from damian.common.text_files import named, show
 from damian.runs.run_lock import locked
 from damian.settings.programs import FieldRules
 
 MAY_DIFFER = {
-    *("reports", "folder", "port", "host", "token", "uavs", "journal"),
+    *("reports", "port", "host", "token", "uavs", "journal"),
     *("policy", "checkpoint", "agents", "device", "frames", "episodes", "eval_episodes", "hydra"),
     *("reserve", "oldest_report", "clearance", "instant"),
 }
@@ -388,44 +382,3 @@ def check_same(then: About, now: About) -> None:
     ]
     if differ:
         raise InputError(f"it is of other settings: {'; '.join(differ)}: give the same")
-
-
-# A folder as a source of reports: every table that is put into it is read once, and answered there.
-
-ANSWERS = ("advice.csv", "advice.json")
-DONE, REFUSED, REASON = ".done", ".refused", ".refused.txt"
-"""Added to the name of a table that was read, or refused, and to that of the file that says why."""
-
-
-def read_inbox(session: AdviceSession, name: str, folder: Path, now: float) -> bool:
-    """Read the tables that have come into a folder, in the order of their names, and answer them, if any.
-
-    A table, complete when it appears, becomes ``NAME.done``, or if it is wrong and so changes nothing
-    ``NAME.refused`` beside ``NAME.refused.txt``.
-    """
-    tables = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in (".csv", ".json")]
-    tables = [each for each in tables if each.name not in ANSWERS and each.is_file()]
-    for path in tables:
-        end = DONE
-        try:
-            rows = rows_of_file(path)
-            first = rows[0][1] if rows and isinstance(rows[0][1], dict) else {}
-            if any(name.strip().lower() == "answer" for name in first):
-                session.acknowledge(name, acknowledgements_of(rows), now)
-            else:
-                session.report(name, reports_of(rows), now)
-        except InputError as error:
-            end = REFUSED
-            write_atomically(path.with_name(path.name + REASON), f"{error}\n")
-        path.replace(path.with_name(path.name + end))
-    if tables:
-        with suppress(Waiting):
-            write_answer(folder, session.advise(name, now))
-    return bool(tables)
-
-
-def write_answer(folder: Path, answer: list[Advice]) -> str:
-    """Write the advice of a fleet into a folder, as ``ANSWERS``; returns its table."""
-    write_atomically(folder / "advice.json", json.dumps(as_rows(answer), indent=1))
-    write_atomically(folder / "advice.csv", table := as_csv(answer))
-    return table

@@ -184,7 +184,6 @@ class AdviseConfig(FlownPolicyConfig, FieldRules):
 
     policy: str | None = setting(None, "deterministic (default with checkpoint), sampled, or script.")
     reports: str | None = setting(None, "Table of reports to answer once, CSV or JSON.")
-    folder: str | None = setting(None, "Folder in which each table of reports is answered.")
     port: int | None = setting(None, "Port of the service over HTTP; 0: a free one.", low=0, high=65535)
     fit: str | None = setting(
         None, "Journal, or table with receive times: only write its delays as a trace, ``trace.csv``."
@@ -193,7 +192,7 @@ class AdviseConfig(FlownPolicyConfig, FieldRules):
     token: str | None = setting(
         None, "Password of the service; DAMIAN_TOKEN of the environment, or made and printed, if not given."
     )
-    uavs: list[str] = setting([], "IDs of the UAVs of a table or a folder; those of the table if not given.")
+    uavs: list[str] = setting([], "IDs of the UAVs of a table; those in it if not given.")
     journal: str | None = setting(None, "Folder of the journals; in the run folder if not given.")
 
     policies: ClassVar[tuple[str, ...]] = ("deterministic", "sampled", "script")
@@ -204,11 +203,11 @@ class AdviseConfig(FlownPolicyConfig, FieldRules):
 
     def check_source(self) -> None:
         """Require exactly one source of reports."""
-        given = [name for name in ("reports", "folder", "port", "fit") if getattr(self, name) is not None]
-        problem = "is not the only one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE: give one"
+        given = [name for name in ("reports", "port", "fit") if getattr(self, name) is not None]
+        problem = "is not the only one of reports=FILE, port=NUMBER, fit=FILE: give one"
         checks.require(len(given) == 1, "reports", " and ".join(given) or "nothing", problem)
         unread = self.journal and given[0] in ("reports", "fit")
-        self.refuse(unread, "journal", "is for a service or a folder: leave it out")
+        self.refuse(unread, "journal", "is for a service: leave it out")
 
 
 def check_token(key: str, token: str | None) -> None:

@@ -1,4 +1,4 @@
-"""The program that advises real UAVs, run by its command line: tables, folders and HTTP, and its refusals."""
+"""The program that advises real UAVs, run by its command line: tables and HTTP, and its refusals."""
 
 import csv
 import json
@@ -8,11 +8,8 @@ from pathlib import Path
 import pytest
 from helpers import check_refused
 
-from damian.advice.session import AdviceSession, read_inbox
-from damian.recipes.advise import AdviseConfig, make_session
 from damian.recipes.advise import run as main
 from damian.recipes.train import run as train
-from damian.world.regions.config import RegionConfig
 
 HEAD = "ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"
 TABLE = f"""{HEAD}
@@ -106,40 +103,3 @@ def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
     assert {*kept} == {"config.yaml", "run.json", "north.jsonl"}
     assert not [name for name, text in kept.items() if TOKEN in text]
     assert "token=..." in kept["run.json"]
-
-
-def session_of(folder: Path) -> AdviceSession:
-    region = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
-    return make_session(AdviseConfig(policy="script", region=region, reserve=0.0), folder)
-
-
-@pytest.fixture
-def inbox(tmp_path):
-    (tmp_path / "inbox").mkdir()
-    return tmp_path / "inbox"
-
-
-def test_tables_in_a_folder_are_answered_and_wrong_ones_put_aside(inbox, tmp_path):
-    session = session_of(tmp_path / "journals")
-    session.create("main", ["A", "B", "C"])
-    points = session.fleet("main").ground.place
-    for name, uavs in (("1.csv", "AB"), ("2.csv", "C"), ("3.csv", "Z")):
-        rows = [f"{uav},{points(30 * i)[0]},{points(30 * i)[1]},{1e9 + i}" for i, uav in enumerate(uavs)]
-        (inbox / name).write_text("\n".join(["ID,lat,lon,time", *rows]))
-    (inbox / ".hidden.csv").write_text("not yet")
-    (inbox / "4.json").write_text("[" * 10_000)
-    assert read_inbox(session, "main", inbox, 1e9 + 10)
-    names = {path.name for path in inbox.iterdir()}
-    refused = {f"{name}.refused{end}" for name in ("3.csv", "4.json") for end in ("", ".txt")}
-    assert names == {"1.csv.done", "2.csv.done", ".hidden.csv", "advice.csv", "advice.json", *refused}
-    assert "line 2: ID: 'Z' is no UAV" in (inbox / "3.csv.refused.txt").read_text()
-    assert [row["ID"] for row in json.loads((inbox / "advice.json").read_text())] == ["A", "B", "C"]
-    answers = json.loads((inbox / "advice.json").read_text())
-    said = [f"{each['ID']},{each['answer']},accepted" for each in answers if each["answer"]]
-    (inbox / "5.csv").write_text("\n".join(["ID,Answer,status", *said]))
-    assert read_inbox(session, "main", inbox, 1e9 + 10.5)
-    assert [row["state"] for row in json.loads((inbox / "advice.json").read_text())] == ["bound"] * 3
-    assert not read_inbox(session, "main", inbox, 1e9 + 11)
-    session.close()
-    again = session_of(tmp_path / "journals").fleet("main")
-    assert [list(told) for told in again.told] == [list(told) for told in session.fleet("main").told]
