@@ -254,7 +254,11 @@ def test_tensorboard_shows_numbers_and_settings_up_to_where_a_run_resumed(tmp_pa
             log.add(each, {"loss": float(each + resumed)})
         log.close()
     events = EventAccumulator(str(tmp_path)).Reload()
-    assert [(each.step, each.value) for each in events.Scalars("loss")] == [(10, 10), (20, 30), (30, 40)]
+    assert [(each.step, each.value) for each in events.Scalars("train/loss")] == [
+        (10, 10),
+        (20, 30),
+        (30, 40),
+    ]
     assert "_hparams_/session_start_info" in events.summary_metadata
 
 
