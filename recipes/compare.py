@@ -24,14 +24,13 @@ from damian.compare.comparison import (
 from damian.compare.figures import plot_curves, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
-from damian.envs.pipeline import has_message_delay
 from damian.runs.interrupt import end_interrupted, number_of
 from damian.settings.programs import SEEDS, CompareConfig
 
-from . import cli, oracle
+from . import cli
 from .evaluate import fly, fly_untrained
 from .shared.comparison_results import FIGURE, MARKDOWN, ROWS, Results, results_of, stored_results, write_csv
-from .shared.many_runs import LOG, Run, SlurmJobs, check_stored, perform_all
+from .shared.many_runs import LOG, Run, check_stored, perform_all
 from .shared.runs import check_policy_fits
 from .shared.settings import check_learning, late
 from .train import train
@@ -74,9 +73,8 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     """The runs of one task, delay and arm, which the folder names."""
     task, delay, name = folder.parts[-3:]
     arm, arms = config.experiment.arms[name], config.experiment.arms
-    flies_alone = arm.oracle or arm.untrained
     away = task != trained_in  # a held-out task, where nothing is trained
-    flown = arm.policy_of or (name if away and not flies_alone else None)
+    flown = arm.policy_of or (name if away and not arm.untrained else None)
     source = flown or arm.source
     overrides = ["logger=csv", *overrides, *arm.overrides, *config.overrides]
     try:
@@ -86,17 +84,12 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
             return  # a held-out delay, under which the undelayed arm is not flown
         should = "delays this arm, with which others are compared: put delays under experiment.delays"
         checks.require(not late_by, ", ".join(late_by), "its value", should)
-        flies_script = arm.oracle and unseeded.seeks_source and has_message_delay(unseeded)
-        if flies_script:
-            oracle.check(unseeded)
-        elif flown is None and not flies_alone:
+        if flown is None and not arm.untrained:
             able = not arm.teacher or hasattr(unseeded.learner, "teacher")
             checks.require(able, "learner", unseeded.learner.name, "has no setting teacher")
             check_learning(unseeded)
     except InputError as error:
         raise InputError(f"{task}/{delay}/{name}: {error}") from None
-    if arm.oracle and not flies_script:
-        return  # nothing is won by finding the source, as the script does, or no message is late
     for seed in config.every_seed:
         policy, seed_folder = None, f"seed_{seed}"
         seeded = replace(unseeded, seed=seed, overrides=[*overrides, f"seed={seed}"])
@@ -107,7 +100,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
                 seeded = replace(seeded, checkpoint=str(policy))
             else:
                 seeded = replace(seeded, learner=replace(seeded.learner, teacher=str(policy)))
-        program = oracle.fly if arm.oracle else fly_untrained if arm.untrained else fly if flown else train
+        program = fly_untrained if arm.untrained else fly if flown else train
         yield Run(task, delay, name, seeded, folder / seed_folder, program, program is train, policy)
 
 
@@ -127,7 +120,7 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     comparison = Comparison(results.rows, config.chosen("arms"), config.score, POLICIES[config.policy])
     write_csv(folder / TABLE, [line.cells() for line in comparison.lines])
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results, missing)))
-    plot_curves(comparison, results.curves, config.experiment.best, folder / CURVES)
+    plot_curves(comparison, results.curves, folder / CURVES)
     plot_norms(comparison, folder / FIGURE)
 
 
@@ -146,8 +139,7 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
         "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (R0, or R1 "
         "and R2), 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
-        "one of the strongest naive method, with its score interval; n compared: seeds that all of these "
-        "have; of oracle: J over that of the script which knows all messages on time",
+        "one of the strongest naive method, with its score interval; n compared: seeds that all have",
     ]
     if min(map(len, by_arm.values())) < SEEDS or episodes[0] < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")
@@ -185,8 +177,7 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
         check_stored(run)
     try:
         if not config.report_only:
-            slurm = SlurmJobs(folder / "slurm", config.slurm or {}) if config.launcher == "slurm" else None
-            failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score), slurm)
+            failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score))
     except KeyboardInterrupt as error:
         end_interrupted(number_of(error), "run the same command again to continue")
     for run in failed:

@@ -52,19 +52,14 @@ PLAIN = {
 LOGGERS = {"wandb": "damian.runs.loggers:wandb"}
 """Loggers of DAMIAN that stand in settings by their paths."""
 SYNONYMS = {
-    "lr": "learner.lr",
     "learning_rate": "learner.lr",
-    "gamma": "learner.gamma",
     "belief": "aware=belief",
-    "history": "delay.history",
     "latency": "delay.obs",
     "num_envs": "worlds",
     "n_envs": "worlds",
     "total_frames": "frames",
     "total_timesteps": "frames",
     "timesteps": "frames",
-    "n_agents": "agents",
-    "num_agents": "agents",
     "uavs": "agents",
     "algo": "learner",
     "algorithm": "learner",

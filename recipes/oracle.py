@@ -17,7 +17,6 @@ from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.compare.comparison import KNOWN_ON_TIME
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.runs.metrics import Evaluation, evaluate
@@ -27,6 +26,9 @@ from damian.settings import TrainConfig
 
 from . import cli
 from .shared.runs import save_config
+
+KNOWN_ON_TIME = ("what has arrived", "its own messages", "all messages", "the source's place")
+"""What the script knows on time in each row of the results."""
 
 
 def fly(config: TrainConfig, folder: Path) -> None:

@@ -6,7 +6,6 @@ damian train resume=runs/first frames=600000
 
 import shlex
 import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import cast
@@ -42,12 +41,9 @@ from .shared.collectors import learning_env, make_collector, ticks
 from .shared.runs import names_own_code, run_folder, save_config, stored_config
 from .shared.settings import backupdates, check_learning, learning_setup, longest_wait
 
-Watch = Callable[[int, dict[str, float]], None]
-"""Gets the environment steps so far and the numbers of each update; what it raises stops the training."""
 
-
-def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None:
-    """Train, evaluate, and fill the run folder; after each update ``watch`` gets its numbers."""
+def train(config: TrainConfig, folder: Path) -> None:
+    """Train, evaluate, and fill the run folder."""
     check_learning(config)
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
@@ -66,7 +62,8 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
         with closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
             began = time.perf_counter()
             for batch in ticks(collector, clock, env.server) if not enough(config, state) else ():
-                numbers, frames = update(config, learner, state, log, batch), state.progress.frames
+                update(config, learner, state, log, batch)
+                frames = state.progress.frames
                 log.show(frames, {"steps_per_second": batch.numel() / (time.perf_counter() - began)})
                 if eval_env and state.progress.updates % (config.eval_every or 1) == 0:
                     kept = RandomState().state_dict()  # the training must draw as without evaluations
@@ -74,8 +71,6 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
                     log.show(frames, evaluate(eval_env, learner.actor, config.horizon).row("eval/"))
                     RandomState().load_state_dict(kept)
                 began = time.perf_counter()
-                if watch:
-                    watch(frames, numbers)
                 show(bar, config, state)
                 if save_or_stop(config, state, log, interrupt):
                     break
@@ -161,7 +156,7 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
 
 def update(
     config: TrainConfig, learner: Learner, state: TrainingState, log: MetricsLog, batch: TensorDictBase
-) -> dict[str, float]:
+) -> None:
     """Make one update from a batch [B, T], and log its numbers."""
     progress, episodes = state.progress, state.episodes
     episodes.add(batch)
@@ -179,10 +174,9 @@ def update(
         torch.set_num_threads(threads)
     means = {"episodes": float(episodes.finished), **episodes.means()}
     terms = cast(TensorDictBase, batch[next_key(keys.REWARD_TERMS)])
-    numbers = {**means, **{f"reward/{name}": x.mean().item() for name, x in terms.items()}, **losses}
-    log.add(progress.frames, numbers)
+    rewards = {f"reward/{name}": x.mean().item() for name, x in terms.items()}
+    log.add(progress.frames, {**means, **rewards, **losses})
     check_convergence(config, state, losses)
-    return numbers
 
 
 def check_convergence(config: TrainConfig, state: TrainingState, losses: dict[str, float]) -> None:

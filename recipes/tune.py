@@ -6,9 +6,7 @@ damian tune aware=both "search.learner.gamma.choices=[0.9,0.99]" "+search.delay.
 All trials have the same seed: what they find must be shown with other seeds (damian compare).
 """
 
-import functools
 import json
-import math
 import shlex
 import sys
 from collections.abc import Iterator, Mapping
@@ -51,8 +49,6 @@ FOLDER, CHOSEN, OVERRIDES = "folder", "chosen", "overrides"
 """What is stored with a trial: its folder, and the settings that it varies; with a search: its overrides."""
 SHOWN = 10
 """Trials in the table."""
-WARM_UP = 5
-"""Trials before one may be pruned."""
 OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields(TrainConfig)}
 """Settings that a training does not have."""
 
@@ -92,13 +88,9 @@ class Search:
     def __init__(self, config: TuneConfig, overrides: list[str], folder: Path) -> None:
         self.config, self.overrides, self.folder = config, overrides, folder
         self.space = read_space(config.search)
-        self.storage = f"sqlite:///{(folder / 'search.db').resolve()}"  # opened anew in each process
-        median = optuna.pruners.MedianPruner(WARM_UP, n_warmup_steps=config.frames // 4)
-        self.pruner = median if config.prune else optuna.pruners.NopPruner()
         self.study = optuna.create_study(
             study_name=NAME,
-            storage=self.storage,
-            pruner=self.pruner,
+            storage=f"sqlite:///{(folder / 'search.db').resolve()}",
             direction="maximize" if config.sign > 0 else "minimize",
             load_if_exists=True,
         )
@@ -115,8 +107,8 @@ class Search:
 
     @property
     def n_finished(self) -> int:
-        """Number of trainings that have ended, pruned ones included."""
-        return len(self.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED)))
+        """Number of trainings that have ended."""
+        return len(self.study.get_trials(states=(TrialState.COMPLETE,)))
 
     def runs(self) -> Iterator[Run]:
         """The trainings that are still to be done, each asked for when the ones before have been told."""
@@ -135,9 +127,7 @@ class Search:
                 self.study.tell(trial, state=TrialState.FAIL)
                 continue
             config.overrides = words
-            options = {"storage": self.storage, "number": trial.number, "pruner": self.pruner}
-            program = functools.partial(train_watched, **options)
-            run = Run("tune", "", "", config, self.folder / folder, program)
+            run = Run("tune", "", "", config, self.folder / folder, train)
             self.trials[run.folder] = trial
             yield run
 
@@ -147,41 +137,19 @@ class Search:
         return [*others, *(f"{key}={value}" for key, value in chosen.items())]
 
     def tell(self, run: Run, error: BaseException | None) -> float | None:
-        """Store the end of a trial; returns its value, or None if it was pruned or failed."""
+        """Store the end of a trial; returns its value, or None if it failed."""
         trial = self.trials.pop(run.folder)
         if error is not None or not run.finished:
-            self.study.tell(trial, state=TrialState.PRUNED if error is None else TrialState.FAIL)
+            self.study.tell(trial, state=TrialState.FAIL)
             return None
         value = run.score(POLICIES[self.config.policy], self.config.score)
         self.study.tell(trial, value)
         return value
 
 
-def train_watched(
-    config: TrainConfig, folder: Path, storage: str, number: int, pruner: optuna.pruners.BasePruner
-) -> None:
-    """Train for a trial, and stop when it is pruned."""
-    opened = optuna.storages.RDBStorage(storage)
-    study = optuna.load_study(study_name=NAME, storage=opened, pruner=pruner)
-    trial = opened.get_trial_id_from_study_id_trial_number(opened.get_study_id_from_name(NAME), number)
-    watched, sign = Trial(study, trial), 1 if study.direction == optuna.study.StudyDirection.MAXIMIZE else -1
-
-    def watch(frames: int, numbers: dict[str, float]) -> None:
-        value = numbers["perceived_return"]
-        if not math.isnan(value):
-            watched.report(sign * value, frames)  # a return, whatever the score
-            if watched.should_prune():
-                raise optuna.TrialPruned
-
-    try:
-        train(config, folder, watch)
-    except optuna.TrialPruned:
-        print("pruned")
-
-
 def report(found: Search) -> None:
     """Write the table, and print how to train with the best settings."""
-    trials = found.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL))
+    trials = found.study.get_trials(states=(TrialState.COMPLETE, TrialState.FAIL))
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     if not complete:
         raise RunError(f"no trial of {found.folder} has a value: see the log.txt of each")
@@ -193,11 +161,9 @@ def report(found: Search) -> None:
 
     head = ["trial", "state", found.config.score, *found.space]
     write_atomically(found.folder / "trials.csv", csv_table([head, *map(row, trials)]))
-    n_pruned = sum(trial.state == TrialState.PRUNED for trial in trials)
     lines = [
         f"`{cli.command()}`",
-        f"{len(trials)} trials: {len(complete)} with a value, {n_pruned} pruned, "
-        f"{len(trials) - len(complete) - n_pruned} failed or interrupted. All have the seed "
+        f"{len(trials)} trials: {len(complete)} with a value, the others failed. All have the seed "
         f"{found.config.seed}, and the value of the best is flattered by having been chosen.",
         markdown_table(head, [row(trial) for trial in complete[:SHOWN]]),
         f"The best: `damian train {shlex.join(found.words(complete[0].user_attrs[CHOSEN]))}`",

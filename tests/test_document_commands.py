@@ -39,7 +39,6 @@ INSTEAD = {
     "port=8000": "port=0",
     "span=[600,900]": "span=[10,20]",
     "experiment=delays": "experiment=usecase2",
-    "slurm={slurm_partition: cpu, timeout_min: 600, mem_gb: 4}": "slurm={cluster: local, timeout_min: 600}",
     "hydra/launcher=submitit_slurm": "hydra/launcher=submitit_local",
     "hydra.launcher.partition=cpu": "hydra.launcher.timeout_min=60",
 }

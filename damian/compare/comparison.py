@@ -28,14 +28,6 @@ OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED_DETERMINISTIC)
 """Policies of an arm: its network after the training and before the first update."""
 UNTRAINED_OF: dict[str, str] = dict(zip(OF_ARM[:2], OF_ARM[2:], strict=True))
 """The policy of an untrained arm that stands for the trained one of other arms."""
-ALL_MESSAGES = "all messages"
-KNOWN_ON_TIME = {
-    "what has arrived": "R0",
-    "its own messages": "R0",
-    ALL_MESSAGES: "R3",
-    "the source's place": "R3",
-}
-"""What the script of ``damian oracle`` knows on time in each row of its results, and the regimes."""
 HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
@@ -73,12 +65,10 @@ COMPARED = (
     Column("J_norm", "J_norm"),
     Column("recovery", "recovery"),
     Column("improvement", "P > naive"),
-    Column("of_oracle", "of oracle"),
 )
 """What ``Comparison.compared`` finds of an arm: J_norm is 0 for the random policy, 1 for the undelayed arm;
 recovery is 0 for the strongest naive arm of the same track and 1 for the undelayed one; improvement: the
-probability that a run beats one of that naive arm; of_oracle: the score over that of the script which knows
-all messages on time, if an arm flies it."""
+probability that a run beats one of that naive arm."""
 MEASURES = tuple(column.name for column in MEASURED)
 BOUNDS = {column.name: column.bounds for column in MEASURED}
 
@@ -184,15 +174,10 @@ class Comparison:
         keys = ("task", "delay", "arm", "seed")
         return list({tuple(row[key] for key in keys): row for row in reversed(self.rows)}.values())[::-1]
 
-    @property
-    def oracle(self) -> str | None:
-        """Name of the arm that flies the script with ever more known on time, if there is one."""
-        return next((name for name, arm in self.arms.items() if arm.oracle), None)
-
     def present(self, task: str, delay: str) -> list[str]:
         """Arms with a policy of their own that have a finished run of a task under a delay."""
         found = {row["arm"] for row in self.rows if (row["task"], row["delay"]) == (task, delay)}
-        return [name for name, arm in self.arms.items() if name in found and not arm.oracle]
+        return [name for name in self.arms if name in found]
 
     def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
         """Values of a measure by seed; an untrained arm has none but those of its untrained network."""
@@ -225,13 +210,10 @@ class Comparison:
     def compared(self, task: str, delay: str) -> dict[str, Compared]:
         """Each delayed arm, over the seeds that it and all arms that it is compared with have finished."""
         scores = self.scores(task, delay)
-        oracle = self.values(task, delay, self.oracle or "", ALL_MESSAGES, self.score)
-        found = {name: self._compared(scores, oracle, name) for name in list(scores)[2:]}
+        found = {name: self._compared(scores, name) for name in list(scores)[2:]}
         return {name: result for name, result in found.items() if result.seeds}
 
-    def _compared(
-        self, scores: Mapping[str, Mapping[int, float]], oracle: Mapping[int, float], arm: str
-    ) -> Compared:
+    def _compared(self, scores: Mapping[str, Mapping[int, float]], arm: str) -> Compared:
         others = [name for name in list(scores)[2:] if track(self.arms, name) == track(self.arms, arm)]
         naive = [name for name in others if self.arms[name].naive]
         names = [*list(scores)[:2], *(name for name in naive if name != arm), arm]
@@ -243,7 +225,7 @@ class Comparison:
             probability = float(_improvement(array))
             found["improvement"] = Estimate(probability, *improvement_interval(probability, len(seeds)))
             found["recovery"] = _recovery(array)
-        return Compared(seeds, {**found, "of_oracle": _ratio(scores[arm], oracle)})
+        return Compared(seeds, found)
 
     def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
         """Probability that a run of one delayed arm beats one of another, over their common seeds."""
@@ -289,14 +271,6 @@ def _paired(runs: Sequence[Mapping[int, float]]) -> tuple[list[int], Floats]:
     """Seeds that all runs have, and their scores, [1, runs, seeds]."""
     seeds = sorted(set.intersection(*map(set, runs)))
     return seeds, np.array([[[scores[seed] for seed in seeds] for scores in runs]])
-
-
-def _ratio(scores: Mapping[int, float], others: Mapping[int, float]) -> Estimate:
-    """Mean score over the mean of others, over the seeds of both; unknown unless both are positive."""
-    seeds, array = _paired([others, dict.fromkeys(others, 0.0), scores])
-    if not seeds or array.mean(-1)[0, -1] <= 0:
-        return UNKNOWN
-    return _estimates(_norms, array)[0]
 
 
 def _norms(scores: Floats) -> Floats:
@@ -376,10 +350,6 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
                     # The script does not fly in every region.
                     if comparison.values(task, delay, arm, policy, comparison.score):
                         yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
-            for known, information in KNOWN_ON_TIME.items():
-                if comparison.values(task, delay, comparison.oracle or "", known, comparison.score):
-                    line = _line(comparison, task, delay, str(comparison.oracle), known)
-                    yield replace(line, regime=information)
 
 
 def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) -> Line:

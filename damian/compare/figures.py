@@ -43,7 +43,7 @@ ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", 
 """Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
 _METHODS = (
     f"undelayed {TRAINED},deployed_own rewards {SCRIPT},own_naive finetuned {RANDOM},history imitation,"
-    "naive unaware,oracle memory,learnt critic server,own backupdate,own_history both,deployed own_memory,"
+    "naive unaware,memory,learnt critic server,own backupdate,own_history both,deployed own_memory,"
     "belief,untrained privileged"
 ).split(",")
 """The arms of our experiments, and the policies of a run, that have each of these colours."""
@@ -56,13 +56,13 @@ _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
 
-def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
+def plot_curves(comparison: Comparison, curves: Curves, path: Path) -> None:
     """Draw learning curves over environment steps; over episodes if not all runs made as many steps.
 
     One task has a row of panels for each delay, with return and, where it can succeed, success rate and
     steps; of several tasks, each has a row with its returns under each delay. A curve is the mean over seeds,
-    with its 95 % band. Dashed lines: the random policy and the ``best`` possible values; dash-dotted: the
-    undelayed script; dotted: arms that train nothing.
+    with its 95 % band. Dashed lines: the random policy; dash-dotted: the undelayed script; dotted: arms that
+    train nothing.
     """
     grid = [row for row in _panels(comparison, curves) if row]
     if not grid:
@@ -76,8 +76,6 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
         for row, contents in zip(axes, grid, strict=True):
             for axis, (task, delay, name) in zip(row, contents, strict=False):
                 _curve_panel(axis, comparison, curves, (task, delay, name), progress)
-                if name in best:
-                    axis.axhline(best[name], label="best possible", **{**_LEVEL, "color": "0.2"})
                 title, label = f"{task}, delay {delay}", f"{LABELS[name]}, perceived"
                 axis.set(xlabel=PROGRESS[progress], ylabel=label, title=title)
                 axis.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -95,7 +93,7 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
         return
     width = min(len(norms), _NORMS_IN_A_ROW)
     height = math.ceil(len(norms) / width)
-    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.oracle]
+    arms = [name for name, arm in comparison.arms.items() if arm.delayed]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.0 * width + 1.2, 3.0 * height), layout="constrained")
         axes = figure.subplots(height, width, squeeze=False, sharey=True)
@@ -142,7 +140,7 @@ def look(comparison: Comparison, arm: str) -> dict[str, Any]:
     """Colour of an arm; line and marker, which tell it from those before it that have the same colour."""
     before = list(comparison.arms)[: list(comparison.arms).index(arm)]
     again, of_arm = sum(colour_of(other) == colour_of(arm) for other in before), comparison.arms[arm]
-    trains = of_arm.policy_of is None and not (of_arm.untrained or of_arm.oracle)
+    trains = of_arm.policy_of is None and not of_arm.untrained
     lines = _LINES if trains else _DOTTED
     return {
         "color": colour_of(arm),

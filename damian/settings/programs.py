@@ -223,9 +223,8 @@ class TuneConfig(TrainConfig):
     search: dict[str, Any] = setting(
         {}, "What to vary, each setting as {low: 1, high: 8, log: true, step: 1} or {choices: [...]}."
     )
-    trials: int = setting(30, "Number of trainings, pruned ones included.", low=1, high=1_000_000)
+    trials: int = setting(30, "Number of trainings.", low=1, high=1_000_000)
     processes: int = setting(1, "Trainings at the same time, of one thread each.", low=1, high=1024)
-    prune: bool = setting(True, "Whether to stop trainings that are worse than the median.")
     score: str = setting("return", SCORE_MEANS, choices=SCORES)
     policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
 
@@ -254,7 +253,6 @@ class Arm(Settings):
     starts_from: str | None = setting(None, "Arm from whose policies, of the same seed, its training starts.")
     teacher: str | None = setting(None, "Arm whose policies its learner imitates: its ``learner.teacher``.")
     untrained: bool = setting(False, "Whether the networks fly as they are before the first update.")
-    oracle: bool = setting(False, "Whether the script flies with ever more known on time (damian oracle).")
     tasks: list[str] | None = setting(None, "Tasks that the arm does; all of them if not given.")
     regime: str = setting(
         "",
@@ -287,7 +285,6 @@ class Experiment(Settings):
     arms: dict[str, Arm] = setting({}, "Ways to train or fly; one of them has ``delayed: false``.")
     held_out: dict[str, HeldOut] = setting({}, "Changed tasks, TASK@NAME, to evaluate all policies in.")
     first_seed: int = setting(0, "The seeds of every arm count from this one.", low=0)
-    best: dict[str, float] = setting({}, "Best possible value of a measure, drawn in its learning curves.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -304,8 +301,6 @@ class Experiment(Settings):
         for name, held_out in self.held_out.items():
             for task in held_out.tasks or ():
                 checks.one_of(f"experiment.held_out.{name}.tasks", task, self.tasks)
-        for name in self.best:
-            checks.one_of("experiment.best", name, PERCEIVED_SCORES)
 
     def _check_arms(self) -> None:
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
@@ -314,11 +309,9 @@ class Experiment(Settings):
         never = not self.delays and len(self.arms) > len(undelayed)
         self.refuse(never, "delays", "is empty, but there are delayed arms")
         for name, arm in self.arms.items():
-            key, flies_others = f"experiment.arms.{name}", arm.policy_of is not None
+            key, good = f"experiment.arms.{name}", arm.delayed and arm.policy_of is None
             should = "goes with neither policy_of nor delayed=false"
-            checks.require((arm.delayed and not flies_others) or not arm.oracle, key, "oracle", should)
-            good = (arm.delayed and not flies_others and not arm.oracle) or not arm.untrained
-            checks.require(good, key, "untrained", f"{should} nor oracle")
+            checks.require(good or not arm.untrained, key, "untrained", should)
             source = self.arms.get(arm.source or "", arm)
             for task in self.tasks if arm.tasks is None else arm.tasks:
                 options = self.tasks if source.tasks is None else source.tasks
@@ -334,14 +327,6 @@ class CompareConfig(Settings):
         None, "Number of seeds; if not given 10, or with ``report_only`` all stored ones.", low=1, high=10_000
     )
     processes: int = setting(1, "Runs at the same time, of one thread each.", low=1, high=1024)
-    launcher: str = setting(
-        "local",
-        "Where runs are carried out: in processes, or as Slurm jobs (docs/scaling.md).",
-        choices=("local", "slurm"),
-    )
-    slurm: Any = setting(
-        None, "Parameters of submitit's executor, such as {slurm_partition: cpu, timeout_min: 600}."
-    )
     tasks: list[str] | None = setting(None, "Tasks to run; all of the experiment's if not given.")
     delays: list[str] | None = setting(None, "Delays to run; all of the experiment's if not given.")
     arms: list[str] | None = setting(None, "Arms to run; all of the experiment's if not given.")
@@ -356,10 +341,6 @@ class CompareConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        unread = self.slurm is not None and self.launcher != "slurm"
-        self.refuse(unread, "slurm", "means nothing without launcher=slurm")
-        mapping = self.slurm is None or isinstance(self.slurm, dict)
-        self.refuse(not mapping, "slurm", "is no mapping such as {slurm_partition: cpu}")
         for word in self.overrides:
             ours = word.lstrip("+~").partition("=")[0].partition(".")[0] in SET_BY_COMPARISON
             problem = "cannot be the same for every run: the comparison sets it; leave it out"
@@ -370,7 +351,7 @@ class CompareConfig(Settings):
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))
         arms = self.chosen("arms")
-        trained = [n for n, a in arms.items() if not (a.policy_of or a.oracle or a.untrained)]
+        trained = [n for n, a in arms.items() if not (a.policy_of or a.untrained)]
         for name, arm in arms.items():
             for kind in ("policy_of", "starts_from", "teacher"):
                 if getattr(arm, kind) is not None:

@@ -1,7 +1,6 @@
 """Carry out many runs, several at a time, each in its own folder with its output in log.txt.
 
-Finished runs are not repeated, and interrupted ones continue from their checkpoints. The runs are carried out
-in processes of this machine, or as Slurm jobs.
+Finished runs are not repeated, and interrupted ones continue from their checkpoints.
 """
 
 import csv
@@ -10,19 +9,16 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
-    Executor,
     Future,
     ProcessPoolExecutor,
-    ThreadPoolExecutor,
     wait,
 )
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -39,7 +35,7 @@ from damian.runs.run_record import read_record
 from damian.settings import TrainConfig
 from damian.settings.fields import leaves
 
-from ..cli import Work, reason
+from ..cli import Work
 from .runs import POLICY, perform, stored_config
 
 LOG = "log.txt"
@@ -115,38 +111,12 @@ def check_stored(run: Run) -> None:
             )
 
 
-class SlurmJobs:
-    """Carries out runs as Slurm jobs, or with ``cluster: local`` as processes, through submitit."""
-
-    def __init__(self, folder: Path, parameters: Mapping[str, Any]) -> None:
-        options = {"cluster": "slurm", "cpus_per_task": 1, "name": "damian", **parameters}
-        try:
-            submitit = import_module("submitit")
-            self._executor = submitit.AutoExecutor(folder, cluster=options.pop("cluster"))
-            self._executor.update_parameters(**options)
-        except (ImportError, NameError, RuntimeError, TypeError, ValueError) as error:
-            raise InputError(f"slurm: {reason(error)} (submitit: pip install 'damian[cluster]')") from error
-        self._jobs: list[Any] = []
-
-    def carry_out(self, run: Run) -> None:
-        """Carry out a run, and wait for its end."""
-        self._jobs.append(self._executor.submit(perform_run, run))
-        self._jobs[-1].result()
-
-    def cancel(self) -> None:
-        """Cancel all jobs with a signal at which trainings write their checkpoints."""
-        for job in self._jobs:
-            job.cancel()
-
-
-def perform_all(
-    runs: Sequence[Run], processes: int, told: tuple[str, str], slurm: SlurmJobs | None = None
-) -> list[Run]:
+def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> list[Run]:
     """Carry out the runs that are not finished; returns those that failed. The bar shows ``told``."""
     todo, failed = [run for run in runs if not run.finished], []
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
         for stage in range(3):
-            for run, error in perform_each([r for r in todo if r.stage == stage], processes, slurm):
+            for run, error in perform_each([r for r in todo if r.stage == stage], processes):
                 bar.update()
                 if error:
                     failed.append(run)
@@ -155,21 +125,15 @@ def perform_all(
     return failed
 
 
-def perform_each(
-    runs: Iterable[Run], processes: int, slurm: SlurmJobs | None = None
-) -> Iterator[tuple[Run, BaseException | None]]:
+def perform_each(runs: Iterable[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
     """Carry out runs, taken one by one as processes become free; yields each with its error, or None.
 
     After Ctrl-C or SIGTERM it raises ``KeyboardInterrupt``, when every training has written a checkpoint.
     """
     before = signal.signal(signal.SIGTERM, interrupt)  # batch systems send it
     try:
-        if slurm is not None:
-            yield from _in_pool(runs, processes, ThreadPoolExecutor(processes), slurm.carry_out, slurm.cancel)
-        elif processes > 1:
-            spawn = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(processes, spawn, _begin)
-            yield from _in_pool(runs, processes, pool, perform_run, _interrupt_workers)
+        if processes > 1:
+            yield from _in_pool(runs, processes)
         else:
             for run in runs:
                 try:
@@ -184,19 +148,13 @@ def perform_each(
         signal.signal(signal.SIGTERM, before)
 
 
-def _in_pool(
-    runs: Iterable[Run],
-    processes: int,
-    pool: Executor,
-    carry_out: Callable[[Run], None],
-    cancel: Callable[[], None],
-) -> Iterator[tuple[Run, BaseException | None]]:
+def _in_pool(runs: Iterable[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
     waiting, futures = iter(runs), dict[Future[None], Run]()
-    with pool:
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin) as pool:
         try:
             while True:
                 for run in islice(waiting, processes - len(futures)):
-                    futures[pool.submit(carry_out, run)] = run
+                    futures[pool.submit(perform_run, run)] = run
                 if not futures:
                     return
                 for future in wait(futures, return_when=FIRST_COMPLETED).done:
@@ -205,7 +163,7 @@ def _in_pool(
                         raise error
                     yield futures.pop(future), error
         except KeyboardInterrupt:
-            cancel()
+            _interrupt_workers()
             raise
 
 

@@ -7,7 +7,6 @@ import pytest
 import yaml
 
 from damian.compare.comparison import (
-    ALL_MESSAGES,
     RANDOM,
     TRAINED,
     TRAINED_DETERMINISTIC,
@@ -162,20 +161,6 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     assert aware.seeds == []  # only the trained policy of an arm is compared with others
     assert prior["J_norm"].value == pytest.approx(2.5 / 10)
     assert prior["recovery"].value == pytest.approx((2.5 - 4) / 6)
-
-
-def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
-    arms = ARMS | {"script": Arm(oracle=True)}
-    rows = rows_of("t", "late", THREE)
-    for known, value in (("its own messages", 8.0), (ALL_MESSAGES, 10.0)):
-        rows += [row("t", "late", "script", seed, value, known) for seed in range(3)]
-    comparison = Comparison(rows, arms)
-    compared = comparison.compared("t", "late")
-    assert set(compared) == {"blind", "flown", "aware"}
-    assert compared["aware"]["of_oracle"].value == pytest.approx((22 / 3) / 10)
-    script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
-    assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
-    assert comparison.compared("t", "late")["aware"]["recovery"].value == pytest.approx((22 / 3 - 4) / 6)
 
 
 def test_methods_of_an_experiment_look_different_and_keep_their_colours_without_the_others():

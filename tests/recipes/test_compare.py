@@ -12,7 +12,7 @@ import pytest
 from helpers import check_refused
 from hydra import initialize_config_dir
 
-from damian.compare.comparison import KNOWN_ON_TIME, TRAINED, Arm
+from damian.compare.comparison import TRAINED, Arm
 from damian.recipes.compare import plan
 from damian.recipes.compare import run as main
 from damian.recipes.known import CONF
@@ -224,16 +224,6 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
     assert "missing: usecase2/none/undelayed/seed_8" in (folder / "other" / "table.md").read_text()
 
 
-@pytest.mark.slow
-def test_slurm_jobs_give_the_same_results_as_this_process(compare):
-    pytest.importorskip("submitit")
-    words = [*TWO[:1], "seeds=1", "arms=[undelayed,unaware,deployed]", TWO[3]]
-    slurm = ["launcher=slurm", "slurm={cluster: local}"]
-    expected = measured(compare(*words))
-    compare(*words, "processes=2", *slurm, "hydra.run.dir=runs/usecase2/other")
-    assert measured(Path("runs/usecase2/other")) == expected
-
-
 @pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("overrides", "message"),
@@ -270,21 +260,19 @@ def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp
 
 
 @pytest.mark.slow
-def test_a_comparison_flies_policies_in_held_out_tasks_and_the_script_that_knows_ever_more(compare, tmp_path):
+def test_a_comparison_flies_policies_in_held_out_tasks(compare, tmp_path):
     (tmp_path / "mine/experiment").mkdir(parents=True)
     (tmp_path / "mine/experiment/script.yaml").write_text(
         """tasks:
   follow: [scenario=delaybench/tracking]
 delays: {late: [delay.obs=2]}
-arms: {best: {delayed: false}, naive: {naive: true}, known: {oracle: true}}
+arms: {best: {delayed: false}, naive: {naive: true}}
 held_out: {two: {overrides: [agents=2], tasks: [follow]}}
 """
     )
     words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
     compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
     text = (tmp_path / "runs/script/table.md").read_text()
-    for known, information in KNOWN_ON_TIME.items():
-        assert text.count(f"| known | {information} | {known} | 1 |") == 2
     assert "## follow@two, delay late\n\nPolicies of another task." in text
     results = tmp_path / "runs/script"
     for delay, arm in (("none", "best"), ("late", "naive")):

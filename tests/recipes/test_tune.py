@@ -80,18 +80,6 @@ def test_a_killed_search_goes_on_with_the_trial_that_it_was_training(search):
 
 
 @pytest.mark.slow
-def test_a_trial_that_is_worse_than_others_is_pruned(search, monkeypatch):
-    hopeless = optuna.pruners.ThresholdPruner(lower=1e9)
-    monkeypatch.setattr(tune.optuna.pruners, "MedianPruner", lambda *_, **__: hopeless)
-    monkeypatch.setattr(tune, "report", lambda _: None)
-    folder = search("trials=2", "episode.max_steps=4")
-    assert [trial.state for trial in trials_in(folder)] == [TrialState.PRUNED, TrialState.PRUNED]
-    assert not (folder / "trial_0" / "result.csv").exists()
-    folder = search("trials=3", "episode.max_steps=4", "prune=false")
-    assert trials_in(folder)[2].state == TrialState.COMPLETE
-
-
-@pytest.mark.slow
 def test_settings_that_are_refused_and_trainings_that_fail_are_told_and_the_search_goes_on(
     search, capsys, monkeypatch
 ):
