@@ -132,7 +132,8 @@ class UavEnv(EnvBase):
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Put the worlds into the state of a ``state_dict``, of as many worlds and the same scenario."""
         own = self.worlds._asdict()
-        self.worlds = PackedState(**{name: torch.empty_like(own[name]).copy_(state[name]) for name in own})
+        loaded = {name: state[name].view_as(own[name]).to(own[name], copy=True) for name in own}
+        self.worlds = PackedState(**loaded)
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own random stream, [B] integers; the next reset begins its first episode.
