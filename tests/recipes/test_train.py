@@ -185,18 +185,19 @@ def test_the_use_case_scenarios_have_the_settings_of_the_reference_data(case):
 
 @pytest.mark.parametrize("overrides", [["delay.obs=2", "aware=belief"], SAC], ids=["belief", "sac"])
 def test_the_untrained_actor_of_an_evaluation_is_that_of_the_training_before_its_first_update(
-    overrides, tmp_path
+    overrides, tmp_path, monkeypatch
 ):
     class Stop(Exception):
         pass
 
-    def stop(frames: int, numbers: dict[str, float]) -> None:
+    def stop(*_):
         raise Stop
 
+    monkeypatch.setattr(train_recipe, "update", stop)
     config = composed_config(*TINY, *overrides, "seed=3", "checkpoint_every=100")
     seed_generators(config.seed)
     with pytest.raises(Stop):  # the checkpoint is of before the first update
-        train_recipe.train(config, tmp_path, stop)
+        train_recipe.train(config, tmp_path)
     seed_generators(99)  # as in another process
     actor = evaluate.untrained_actor(config, train_recipe.make_eval_env(config)).state_dict()
     first = weights(tmp_path, "actor")
