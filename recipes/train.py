@@ -65,11 +65,8 @@ def train(config: TrainConfig, folder: Path) -> None:
                 update(config, learner, state, log, batch)
                 frames = state.progress.frames
                 log.show(frames, {"steps_per_second": batch.numel() / (time.perf_counter() - began)})
-                if eval_env and state.progress.updates % (config.eval_every or 1) == 0:
-                    kept = RandomState().state_dict()  # the training must draw as without evaluations
-                    eval_env.set_seed(config.eval_seed)
-                    log.show(frames, evaluate(eval_env, learner.actor, config.horizon).row("eval/"))
-                    RandomState().load_state_dict(kept)
+                if eval_env and state.progress.updates % cast(int, config.eval_every) == 0:
+                    log.show(frames, evaluate_meanwhile(config, eval_env, learner).row("eval/"))
                 began = time.perf_counter()
                 show(bar, config, state)
                 if save_or_stop(config, state, log, interrupt):
@@ -84,6 +81,15 @@ def train(config: TrainConfig, folder: Path) -> None:
     plot_learning_curve(log.rows, evaluations, folder / FIGURE, title)
     print(f"learning curve: {folder / FIGURE}")
     print(f"fly this policy: {best_flight(evaluations, folder)}{' trust=true' * names_own_code(config)}")
+
+
+def evaluate_meanwhile(config: TrainConfig, env: DelayedEnv, learner: Learner) -> Evaluation:
+    """Evaluate the policy during its training, which afterwards draws the same as without."""
+    kept = RandomState().state_dict()
+    env.set_seed(config.eval_seed)
+    found = evaluate(env, learner.actor, config.horizon)
+    RandomState().load_state_dict(kept)
+    return found
 
 
 def best_flight(evaluations: dict[str, Evaluation], folder: Path) -> str:

@@ -34,6 +34,11 @@ class Message(NamedTuple):
     received: float | None
     """When it came in first [s]; None if it never did."""
 
+    @property
+    def delay(self) -> float:
+        """How late it came in [s]; nan if it never did."""
+        return math.nan if self.received is None else max(self.received - self.time, 0.0)
+
 
 class Fit(NamedTuple):
     """Delays of messages."""
@@ -107,7 +112,7 @@ def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
 
 def trace_rows(fitted: Fit) -> list[str]:
     """The column ``delay`` of a trace, a row for each message: times, which a simulation rounds up."""
-    return [LOST if m.received is None else f"{max(m.received - m.time, 0):.6f}s" for m in fitted.messages]
+    return [LOST if m.received is None else f"{m.delay:.6f}s" for m in fitted.messages]
 
 
 def steps_of(fitted: Fit, dt: float) -> Integers:
@@ -119,7 +124,7 @@ def steps_of(fitted: Fit, dt: float) -> Integers:
 
 def summary(fitted: Fit) -> str:
     """The fitted delays and losses as text, on two lines."""
-    delays = np.array([max(m.received - m.time, 0) for m in fitted.messages if m.received is not None])
+    delays = np.array([m.delay for m in fitted.messages if m.received is not None])
     uavs, n = {message.uav for message in fitted.messages}, len(fitted.messages)
     times, n_lost = [message.time for message in fitted.messages], n - len(delays)
     median, most, nearly_all = np.quantile(delays, [0.5, 0.9, 0.99])
@@ -158,7 +163,7 @@ def plot_delays(fitted: Fit, best: LawFit, own: LawFit, path: Path) -> None:
     shares.set(xlabel="delay [steps]; the last bar: lost", ylabel="share of messages")
     shares.set_title(f"recorded (bars), and {best.written}", fontsize=7)
     for i, (uav, messages) in enumerate(groupby(fitted.messages, lambda message: message.uav)):
-        points = np.array([(m.time, m.received - m.time) for m in messages if m.received is not None])
+        points = np.array([(m.time, m.delay) for m in messages])
         times.scatter(*points.T - [[begin], [0]], s=3, color=COLOURS[i % len(COLOURS)], label=uav)
     times.set(xlabel="time of the message [s]", ylabel="delay [s]")
     times.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)

@@ -11,9 +11,10 @@ from damian.settings.training import TrainConfig
 MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
 
-PERCEIVED_SCORES = ("perceived_return", "perceived_success_rate", "perceived_steps")
-"""Measures of an evaluation, as the server perceived them."""
-SCORES = ("return", "success_rate", "steps", *PERCEIVED_SCORES)
+SCORES = (
+    *("return", "success_rate", "steps"),
+    *("perceived_return", "perceived_success_rate", "perceived_steps"),
+)
 """Measures by which arms can be compared; the first ones are from messages without delay."""
 LESS_IS_BETTER = ("steps", "perceived_steps")
 """Scores for which lower values are better."""

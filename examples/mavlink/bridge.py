@@ -157,10 +157,15 @@ def place_of(position: Any) -> tuple[float, float]:
     return position.lat / 1e7, position.lon / 1e7
 
 
+def metres(place: tuple[float, float], home: tuple[float, float]) -> tuple[float, float]:
+    """East and north of home [m] of a latitude and longitude [deg], which are near."""
+    east = math.radians(place[1] - home[1]) * EARTH * math.cos(math.radians(home[0]))
+    return east, math.radians(place[0] - home[0]) * EARTH
+
+
 def way(origin: tuple[float, float], goal: tuple[float, float]) -> tuple[float, float]:
     """Distance [m] and heading, clockwise from north [deg], between near latitudes and longitudes [deg]."""
-    north = math.radians(goal[0] - origin[0]) * EARTH
-    east = math.radians(goal[1] - origin[1]) * EARTH * math.cos(math.radians(origin[0]))
+    east, north = metres(goal, origin)
     return math.hypot(east, north), math.degrees(math.atan2(east, north)) % 360
 
 

@@ -20,12 +20,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 os.environ.setdefault("MAVLINK20", "1")
+from bridge import EARTH, GUIDED, LAND, metres
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-GUIDED, LAND, STABILIZE = 4, 9, 0
-"""Custom modes of ArduCopter."""
-EARTH = 6_378_137.0
-"""Radius by which metres become degrees [m]."""
+STABILIZE = 0
+"""Custom mode of ArduCopter in which it stands at first."""
 TICK = 0.1
 """Longest step of the physics [s]."""
 PERIODS = {"heartbeat": 1.0, "position": 0.25, "landed": 0.5, "battery": 1.0, "time": 2.0, "spotted": 1.0}
@@ -315,12 +314,6 @@ def degrees(place, home: tuple[float, float]) -> tuple[float, float]:
     """Latitude and longitude [deg] of a place east and north of home [m], which is near."""
     lat = home[0] + math.degrees(place[1] / EARTH)
     return lat, home[1] + math.degrees(place[0] / (EARTH * math.cos(math.radians(home[0]))))
-
-
-def metres(place: tuple[float, float], home: tuple[float, float]) -> tuple[float, float]:
-    """East and north of home [m] of a latitude and longitude [deg], which are near."""
-    east = math.radians(place[1] - home[1]) * EARTH * math.cos(math.radians(home[0]))
-    return east, math.radians(place[0] - home[0]) * EARTH
 
 
 def main() -> None:
