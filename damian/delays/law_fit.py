@@ -11,7 +11,7 @@ from damian.delays.laws import sampler_of
 LOST_STEPS, NO_MESSAGE = -1, -2
 """Marks among delays: a message that never arrives, and none, after the end of a sequence."""
 OWN = ("recorded frequencies", "recorded frequencies of pairs")
-"""What laws are compared with: each delay as often as it was recorded, at all or after the one before it."""
+"""Laws are compared with these: the recorded frequency of each delay, and that given the delay before it."""
 Integers, Floats = NDArray[np.integer], NDArray[np.floating]
 
 
@@ -53,7 +53,7 @@ def fit_laws(steps: Integers) -> tuple[LawFit, LawFit]:
 
 
 def autocorrelation(steps: Integers) -> float:
-    """Correlation of a message's delay with that of the message before it; a loss counts as the longest."""
+    """Lag-1 autocorrelation of the delays; a loss counts as one step more than the longest delay."""
     delay, there = np.where(steps == LOST_STEPS, steps.max() + 1, steps), steps[:, 1:] != NO_MESSAGE
     pairs = np.stack([delay[:, :-1][there], delay[:, 1:][there]])
     return float(np.corrcoef(pairs)[0, 1]) if pairs.size and pairs.std(1).all() else 0.0

@@ -17,7 +17,7 @@ LOSSES = {**BURST, "good": 0, "bad": 0, "bad_loss": 1.0}
 
 
 def drawn(law, loss: float = 0.0, seed: int = 0) -> np.ndarray:
-    """Delays of 200 messages of each of 30 senders, of which half send 50 fewer [steps]."""
+    """Delays [steps] of the messages of 30 senders: 15 send 200 messages each, the others 150."""
     sampler, streams = sampler_of(law, loss=loss), counter_rng.world_seeds(seed, 30)
     memory, steps = sampler.initial_state(streams), []
     for t in range(200):
