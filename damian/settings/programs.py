@@ -10,11 +10,8 @@ from damian.settings.training import TrainConfig
 
 MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
-
-SCORES = (
-    *("return", "success_rate", "steps"),
-    *("perceived_return", "perceived_success_rate", "perceived_steps"),
-)
+_MEASURES = ("return", "success_rate", "steps")
+SCORES = (*_MEASURES, *(f"perceived_{name}" for name in _MEASURES))
 """Measures by which arms can be compared; the first ones are from messages without delay."""
 LESS_IS_BETTER = ("steps", "perceived_steps")
 """Scores for which lower values are better."""
