@@ -93,7 +93,7 @@ pictures: $(VENV)/base
 	cp build/flight/episode_0.gif docs/images/flight.gif
 	$(PY) docs/figures.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
-	$(VENV)/bin/damian compare experiment=delaybench3 report_only=true hydra.run.dir=docs/results/delaybench3 > build/delaybench3.md
+	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench > build/delaybench.md
 
 # The documentation site, in build/site.
 docs: $(VENV)/docs

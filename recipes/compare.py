@@ -119,7 +119,8 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     """Write the tables and the figures."""
     comparison = Comparison(results.rows, config.chosen("arms"), config.score, POLICIES[config.policy])
     write_csv(folder / TABLE, [line.cells() for line in comparison.lines])
-    write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results, missing)))
+    notes = _notes(config, results, missing)
+    write_atomically(folder / MARKDOWN, markdown(comparison, results.curves, notes))
     plot_curves(comparison, results.curves, folder / CURVES)
     plot_norms(comparison, folder / FIGURE)
 

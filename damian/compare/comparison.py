@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -226,17 +225,6 @@ class Comparison:
             found["improvement"] = Estimate(probability, *improvement_interval(probability, len(seeds)))
             found["recovery"] = _recovery(array)
         return Compared(seeds, found)
-
-    def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
-        """Probability that a run of one delayed arm beats one of another, over their common seeds."""
-        scores = dict(list(self.scores(task, delay).items())[2:])
-        found = {}
-        for one, other in permutations(scores, 2):
-            seeds, array = _paired([scores[other], scores[one]])
-            if seeds:
-                value = float(probability_of_improvement(array[0, 1], array[0, 0]))
-                found[one, other] = Estimate(value, *improvement_interval(value, len(seeds)))
-        return found
 
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.

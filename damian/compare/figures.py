@@ -5,7 +5,7 @@ A method has the same colour in all figures, whichever others are drawn.
 
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
@@ -43,7 +43,7 @@ ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", 
 """Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
 _METHODS = (
     f"undelayed {TRAINED},deployed_own rewards {SCRIPT},own_naive finetuned {RANDOM},history imitation,"
-    "naive unaware,memory,learnt critic server,own backupdate,own_history both,deployed own_memory,"
+    "naive,memory,learnt critic server,own backupdate,own_history both,deployed own_memory,"
     "belief,untrained privileged"
 ).split(",")
 """The arms of our experiments, and the policies of a run, that have each of these colours."""
@@ -51,25 +51,28 @@ _LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os^D"
 """Of arms that train, of those that train nothing, and of points; later ones where two have one colour."""
 _POINTS = 200
 """Number of points of a learning curve."""
-_NORMS_IN_A_ROW = 4
+_CURVES_IN_A_ROW, _NORMS_IN_A_ROW = 2, 4
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
 
 def plot_curves(comparison: Comparison, curves: Curves, path: Path) -> None:
-    """Draw learning curves over environment steps; over episodes if not all runs made as many steps.
+    """Draw learning curves over environment steps; over episodes if the runs made different numbers of steps.
 
     One task has a row of panels for each delay, with return and, where it can succeed, success rate and
-    steps; of several tasks, each has a row with its returns under each delay. A curve is the mean over seeds,
-    with its 95 % band. Dashed lines: the random policy; dash-dotted: the undelayed script; dotted: arms that
-    train nothing.
+    steps; of several tasks, each has a row with its returns under each delay, or, under one delay, a panel.
+    A curve is the mean over seeds, with its 95 % band. Dashed lines: the random policy; dash-dotted: the
+    undelayed script; dotted: arms that train nothing.
     """
     grid = [row for row in _panels(comparison, curves) if row]
     if not grid:
         path.unlink(missing_ok=True)  # an older one would show other runs
         return
-    width, ends = max(map(len, grid)), {run[-1].get("frames") for runs in curves.values() for run in runs}
-    progress = "frames" if len(ends) == 1 and None not in ends else "episodes"
+    if all(len(row) == 1 for row in grid):
+        panels = [panel for (panel,) in grid]
+        grid = [panels[i : i + _CURVES_IN_A_ROW] for i in range(0, len(panels), _CURVES_IN_A_ROW)]
+    width, ends = max(map(len, grid)), [run[-1].get("frames", 0) for runs in curves.values() for run in runs]
+    progress = "frames" if min(ends) > 0.95 * max(ends) else "episodes"  # batches end a little later
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.2 * width + 1.2, 2.6 * len(grid)), layout="constrained")
         axes = figure.subplots(len(grid), width, squeeze=False)
@@ -81,7 +84,7 @@ def plot_curves(comparison: Comparison, curves: Curves, path: Path) -> None:
                 axis.xaxis.set_major_formatter(EngFormatter(sep=""))
             for axis in row[len(contents) :]:
                 axis.set_axis_off()
-            _legend(row[len(contents) - 1], row)
+        _legend(figure)
         figure.savefig(path, dpi=150)
 
 
@@ -113,7 +116,7 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
                 axis.axhline(level, **_LEVEL)
         for axis in axes[:, 0]:
             axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
-        _legend(axes[0, -1], axes.flat)
+        _legend(figure)
         figure.savefig(path, dpi=150)
 
 
@@ -132,7 +135,7 @@ def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Pa
         axis.set_yticks(range(len(groups)), groups)
         axis.invert_yaxis()
         axis.set_xlabel(label)
-        _legend(axis, [axis])
+        _legend(figure)
         figure.savefig(path, dpi=150)
 
 
@@ -155,12 +158,12 @@ def colour_of(method: str) -> str:
     return ARM_COLOURS[known[0] if known else zlib.crc32(method.encode()) % len(ARM_COLOURS)]
 
 
-def _legend(place: Axes, panels: Iterable[Axes]) -> None:
-    """Name what any of the panels shows, to the right of one of them."""
+def _legend(figure: Figure) -> None:
+    """Name what any of the panels shows, to the right of them."""
     drawn: dict[str, Any] = {}
-    for axis in panels:
+    for axis in figure.axes:
         drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    place.legend([*drawn.values()], [*drawn], loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    figure.legend([*drawn.values()], [*drawn], loc="outside right upper", frameon=False)
 
 
 def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str, str]]]:
@@ -184,9 +187,10 @@ def _curve_panel(
         run = (task, delay if arm.delayed else NOT_LATE, name)
         style: dict[str, Any] = look(comparison, name) | {"marker": "", "label": name}
         if run in curves:
-            place, mean, low, high = _band(curves[run], measure, progress)
-            axis.plot(place, mean, linewidth=1.2, **style)
-            axis.fill_between(place, low, high, color=style["color"], alpha=0.2, linewidth=0)
+            place, values = curve(curves[run], measure, progress)
+            low, high = bootstrap(lambda v: v.mean(-1), values[None], draws=500, bounds=BOUNDS[measure])
+            axis.plot(place, values.mean(-1), linewidth=1.2, **style)
+            axis.fill_between(place, low[0], high[0], color=style["color"], alpha=0.2, linewidth=0)
         elif values := comparison.values(*run, comparison.policy, measure):
             axis.axhline(fmean(values.values()), **style)
     for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, f"{SCRIPT}, undelayed", "-.")):
@@ -195,21 +199,18 @@ def _curve_panel(
             axis.axhline(fmean(values.values()), label=label, **level)
 
 
-def _band(
-    runs: Sequence[Sequence[Mapping[str, float]]], name: str, progress: str
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Steps or episodes (``progress``) that all seeds reached, mean over seeds, ends of its 95 % interval."""
+def curve(
+    runs: Sequence[Sequence[Mapping[str, float]]], name: str, progress: str = "frames"
+) -> tuple[Floats, Floats]:
+    """Steps or episodes (``progress``) that all seeds reached, [points]; a measure there, [points, seeds]."""
     points = [np.array([(r[progress], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
     points = [run for run in points if len(run)]
     first = max((run[0, 0] for run in points), default=np.inf)
     last = min((run[-1, 0] for run in points), default=-np.inf)
     if first > last:
-        unknown = np.full(_POINTS, np.nan)
-        return unknown, unknown, unknown, unknown
+        return np.full(_POINTS, np.nan), np.full((_POINTS, 1), np.nan)
     place = np.linspace(first, last, _POINTS)
-    values = np.stack([np.interp(place, *run.T) for run in points], -1)
-    low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500, bounds=BOUNDS[name])
-    return place, values.mean(-1), low[0], high[0]
+    return place, np.stack([np.interp(place, *run.T) for run in points], -1)
 
 
 def _known_norms(comparison: Comparison, task: str) -> dict[str, dict[int, Estimate]]:

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from damian.common.tables import markdown_table
 from damian.compare.comparison import (
     COMPARED,
@@ -12,9 +14,10 @@ from damian.compare.comparison import (
     Comparison,
     Line,
 )
+from damian.compare.figures import Curves, curve
 
 
-def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
+def markdown(comparison: Comparison, curves: Curves, notes: Sequence[str]) -> str:
     """Return the whole comparison as Markdown, with ``notes`` as lines at the top."""
     all_lines, parts = comparison.lines, ["\n".join(f"- {note}" for note in notes)]
     for task in comparison.tasks():
@@ -22,7 +25,7 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
             lines = [line for line in all_lines if line.task == task and line.delay in (NOT_LATE, delay)]
             parts += [f"## {task}, delay {delay}", _length(comparison, task), _table(lines)]
             if delay != NOT_LATE:
-                parts += _pairs(comparison, task, delay)
+                parts += _steps(comparison, curves, task, delay)
     overall = [(arm, seeds, str(norm)) for arm, (seeds, norm) in comparison.overall().items()]
     if overall:
         table = markdown_table(("method", "n", "interquartile mean of J_norm"), overall)
@@ -54,13 +57,22 @@ def _table(lines: Sequence[Line]) -> str:
     return markdown_table(heads, rows, left=len(left))
 
 
-def _pairs(comparison: Comparison, task: str, delay: str) -> list[str]:
-    """Table of the probabilities that a run of one arm beats a run of another."""
-    pairs = comparison.pairs(task, delay)
-    arms = list(dict.fromkeys(one for one, _ in pairs))
-    rows = [[one, *(str(pairs.get((one, other), "")) for other in arms)] for one in arms]
-    title = "Probability that a run of the row's method beats one of the column's [95 % score interval]:"
-    return [title, markdown_table(("method", *arms), rows)] if arms else []
+def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> list[str]:
+    """Table of the steps after which the training of each arm returns what the best naive one ends with."""
+    sources = {arm: (task, delay if of.delayed else NOT_LATE, arm) for arm, of in comparison.arms.items()}
+    found = {arm: curve(curves[run], "perceived_return") for arm, run in sources.items() if run in curves}
+    ends = {arm: found[arm][1][-1].mean() for arm in found if comparison.arms[arm].naive}
+    if not ends:
+        return []
+    best = max(ends, key=lambda arm: ends[arm])
+    rows = []
+    for arm, (steps, values) in found.items():
+        # The mean of the seeds first, then each of them.
+        reached = [min(steps[run >= ends[best]], default=np.inf) for run in (values.mean(-1), *values.T)]
+        numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
+        rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
+    title = f"Steps until the perceived return in training is what *{best}* ends with ({ends[best]:.1f}):"
+    return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]
 
 
 def _compute(comparison: Comparison) -> str:

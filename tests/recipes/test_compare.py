@@ -39,7 +39,7 @@ def listed(*words: str) -> str:
     return f"overrides={list(words)}"
 
 
-TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", listed(*SMALL)]
+TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,naive]", listed(*SMALL)]
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     (tmp_path / "my files").mkdir()
     folder = compare("--config-dir", "my files", *TWO)
     printed = capsys.readouterr().out
-    runs = [f"none/undelayed/seed_{n}" for n in (8, 9)] + [f"paper/unaware/seed_{n}" for n in (8, 9)]
+    runs = [f"none/undelayed/seed_{n}" for n in (8, 9)] + [f"paper/naive/seed_{n}" for n in (8, 9)]
     found = sorted(path.parent.relative_to(folder / "usecase2") for path in folder.rglob("result.csv"))
     assert [str(path) for path in found] == runs
     assert "| random |" in (folder / "usecase2" / runs[0] / "log.txt").read_text()
@@ -86,14 +86,14 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert shlex.split(typed) == ["--config-dir", "my files", *TWO]
     rows = table(folder / "results.csv")
     assert len(rows) == 4 * 6
-    unaware = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", TRAINED, "paper")]
-    assert [r["seed"] for r in unaware] == ["8", "9"]
+    naive = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("naive", TRAINED, "paper")]
+    assert [r["seed"] for r in naive] == ["8", "9"]
     stored = [table(folder / "usecase2" / name / "result.csv")[2]["return"] for name in runs[2:]]
-    assert [float(r["return"]) for r in unaware] == [float(number) for number in stored]
+    assert [float(r["return"]) for r in naive] == [float(number) for number in stored]
 
     before = stamps(folder)
     (folder / "usecase2" / runs[3] / "result.csv").unlink()  # as after Ctrl-C during the evaluation
-    compare(*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3])
+    compare(*TWO[:2], "arms=[undelayed,naive,deployed]", TWO[3])
     after = stamps(folder)
     rewritten = {path for path in before if before[path] != after[path]}
     assert rewritten
@@ -105,7 +105,7 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     capsys.readouterr()
     compare(*TWO[:1], "seeds=3", *TWO[2:], "report_only=true")
     text = (folder / "table.md").read_text()
-    assert "missing: usecase2/none/undelayed/seed_10, usecase2/paper/unaware/seed_10" in text
+    assert "missing: usecase2/none/undelayed/seed_10, usecase2/paper/naive/seed_10" in text
     compare(*TWO[:1], *TWO[2:], "report_only=true")
     assert not re.search("missing|seed_10| to 10", (folder / "table.md").read_text())
     assert stamps(folder) == after
@@ -124,7 +124,7 @@ tasks: {tracking: [scenario=tracking]}
 delays: {paper: [delay=paper]}
 arms:
   undelayed: {delayed: false}
-  unaware: {naive: true}
+  naive: {naive: true}
   finetuned: {starts_from: undelayed}
   student: {teacher: undelayed, overrides: [learner=distillation:DistillationConfig]}
 """
@@ -143,7 +143,7 @@ def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(comp
     assert read_record(place / "paper" / "finetuned" / "seed_3")[POLICY] == policy
     rows = measured(folder)
     regimes = {row["arm"]: row["regime"] for row in rows}
-    assert regimes == {"undelayed": "R3", "unaware": "R0", "finetuned": "R2", "student": "R2"}
+    assert regimes == {"undelayed": "R3", "naive": "R0", "finetuned": "R2", "student": "R2"}
 
     shutil.rmtree(place)
     compare(*words, "keep=true")
@@ -165,7 +165,7 @@ def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(comp
 
 @pytest.mark.slow
 def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
-    words = ["experiment=usecase2", "seeds=1", "arms=[undelayed,unaware]", listed(*SMALL, "frames=64")]
+    words = ["experiment=usecase2", "seeds=1", "arms=[undelayed,naive]", listed(*SMALL, "frames=64")]
     folder, kept = compare(*words), tmp_path / "kept"
     kept.mkdir()
     for name in ("results.csv", "curves.csv"):
@@ -209,7 +209,7 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
 
 @pytest.mark.slow
 def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_named(compare, capsys):
-    words = [*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3]]
+    words = [*TWO[:2], "arms=[undelayed,naive,deployed]", TWO[3]]
     folder = compare(*words)
     expected = measured(folder)
     compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")

@@ -79,7 +79,7 @@ def test_a_sweep_ends_with_a_table_of_means_over_seeds(sweep, capsys):
 def test_results_of_a_run_and_of_a_comparison_are_rows_too(sweep):
     run = next(path.parent for path in sweep.rglob("result.csv"))
     assert [row["policy"] for row in damian.results(run)][:2] == ["untrained", "untrained, deterministic"]
-    folder = Path(__file__).parents[2] / "docs" / "results" / "delaybench3"
+    folder = Path(__file__).parents[2] / "docs" / "results" / "delaybench"
     rows = damian.results(folder)
     assert {row["arm"] for row in rows} >= {"undelayed", "own"}
     with pytest.raises(InputError, match="no run has finished there"):
