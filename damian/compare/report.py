@@ -67,7 +67,6 @@ def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> lis
     best = max(ends, key=lambda arm: ends[arm])
     rows = []
     for arm, (steps, values) in found.items():
-        # The mean of the seeds first, then each of them.
         reached = [min(steps[run >= ends[best]], default=np.inf) for run in (values.mean(-1), *values.T)]
         numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
         rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
