@@ -192,11 +192,6 @@ class Comparison:
             found.setdefault((row["task"], row["delay"], row["arm"], row["policy"]), []).append(row)
         return found
 
-    def mean(self, task: str, delay: str, arm: str) -> Estimate:
-        """Mean score of an arm over its seeds."""
-        scores = list(self.values(task, delay, arm, self.policy, self.score).values())
-        return mean_over_seeds(scores, self.score) if scores else UNKNOWN
-
     def scores(self, task: str, delay: str) -> dict[str, dict[int, float]]:
         """Scores by arm and seed, higher ones better; first come undelayed and random, without delay."""
         sign = -1 if self.score in LESS_IS_BETTER else 1

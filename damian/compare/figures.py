@@ -1,7 +1,4 @@
-"""Figures of a comparison: learning curves, J_norm of each arm, and scores over delays.
-
-A method has the same colour in all figures, whichever others are drawn.
-"""
+"""Figures of a comparison: learning curves, and J_norm of each arm."""
 
 import math
 import zlib

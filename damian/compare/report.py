@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from damian.common.tables import markdown_table
 from damian.compare.comparison import (
@@ -59,18 +60,23 @@ def _table(lines: Sequence[Line]) -> str:
 
 def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> list[str]:
     """Table of the steps after which the training of each arm returns what the best naive one ends with."""
-    sources = {arm: (task, delay if of.delayed else NOT_LATE, arm) for arm, of in comparison.arms.items()}
-    found = {arm: curve(curves[run], "perceived_return") for arm, run in sources.items() if run in curves}
+    found = {}
+    for arm, of_arm in comparison.arms.items():
+        run = (task, delay if of_arm.delayed else NOT_LATE, arm)
+        if run in curves:
+            steps, values = curve(curves[run], "perceived_return")
+            tenth = len(steps) // 10
+            found[arm] = steps[tenth - 1 :], sliding_window_view(values, tenth, axis=0).mean(-1)
     ends = {arm: found[arm][1][-1].mean() for arm in found if comparison.arms[arm].naive}
     if not ends:
         return []
-    best = max(ends, key=lambda arm: ends[arm])
+    best, level = max(ends.items(), key=lambda end: end[1])
     rows = []
     for arm, (steps, values) in found.items():
-        reached = [min(steps[run >= ends[best]], default=np.inf) for run in (values.mean(-1), *values.T)]
+        reached = [min(steps[run >= level], default=np.inf) for run in (values.mean(-1), *values.T)]
         numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
         rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
-    title = f"Steps until the perceived return in training is what *{best}* ends with ({ends[best]:.1f}):"
+    title = f"Steps until the perceived return, in a tenth of all, is what *{best}* ends with, {level:.1f}:"
     return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]
 
 
