@@ -93,7 +93,8 @@ pictures: $(VENV)/base
 	cp build/flight/episode_0.gif docs/images/flight.gif
 	$(PY) docs/figures.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
-	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench > build/delaybench.md
+	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench "delays=['4']" \
+	  "arms=[undelayed,own_naive,history,memory,own,own_history,own_memory,untrained,deployed_own]" > build/delaybench.md
 
 # The documentation site, in build/site.
 docs: $(VENV)/docs
