@@ -24,6 +24,7 @@ from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import YAMLError
@@ -273,12 +274,9 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
             first.append("hydra.job.config.override_dirname.exclude_keys=[]")  # else runs share a folder
         sys.argv[1:] = ["-m", *first, *given.overrides]  # Hydra wants options first
 
-        sweeps: set[Path] = set()
-
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
             output, own = Path(HydraConfig.get().runtime.output_dir), list(HydraConfig.get().overrides.task)
-            sweeps.add(Path(HydraConfig.get().sweep.dir))
             try:
                 with one_line_errors():
                     _start(work, program, own, given.config_dir, output)
@@ -287,8 +285,13 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
                     output.rmdir()
 
         job()
-        for folder in sweeps:
-            import_module(".results", __package__).show_sweep(shown(folder))  # it imports torch
+
+
+class SweepReport(Callback):
+    """Reports on a sweep when all of its runs have ended, whichever processes or machines they were in."""
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        import_module(".results", __package__).show_sweep(shown(Path(config.hydra.sweep.dir)))  # needs torch
 
 
 def _start(

@@ -119,8 +119,8 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     """Write the tables and the figures."""
     comparison = Comparison(results.rows, config.chosen("arms"), config.score, POLICIES[config.policy])
     write_csv(folder / TABLE, [line.cells() for line in comparison.lines])
-    notes = _notes(config, results, missing)
-    write_atomically(folder / MARKDOWN, markdown(comparison, results.curves, notes))
+    text = markdown(comparison, results.curves, _notes(config, results, missing))
+    write_atomically(folder / MARKDOWN, text)
     plot_curves(comparison, results.curves, folder / CURVES)
     plot_norms(comparison, folder / FIGURE)
 

@@ -46,7 +46,6 @@ def _length(comparison: Comparison, task: str) -> str:
 
 
 def _table(lines: Sequence[Line]) -> str:
-    left, heads = ["method", "regime", "policy"], [column.head for column in MEASURED]
     rows = []
     for line in lines:
         name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
@@ -54,8 +53,8 @@ def _table(lines: Sequence[Line]) -> str:
         compared = [str(line.compared[column.name]) for column in COMPARED]
         n_compared = str(len(line.compared.seeds) or "-")
         rows.append([name, line.regime, line.policy, str(len(line.seeds)), *measured, n_compared, *compared])
-    heads = [*left, "n", *heads, "n compared", *(column.head for column in COMPARED)]
-    return markdown_table(heads, rows, left=len(left))
+    heads = [*(column.head for column in MEASURED), "n compared", *(column.head for column in COMPARED)]
+    return markdown_table(["method", "regime", "policy", "n", *heads], rows, left=3)
 
 
 def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> list[str]:

@@ -76,6 +76,18 @@ def test_a_sweep_ends_with_a_table_of_means_over_seeds(sweep, capsys):
     assert {path.name: path.read_bytes() for path in sweep.glob("*.csv")} == before
 
 
+@pytest.mark.slow
+def test_a_sweep_in_several_processes_ends_with_its_table_too(tmp_path):
+    words = (
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        "delay.obs=1,2",
+        f"hydra.sweep.dir={tmp_path}",
+    )
+    main(["train", "-m", *SWEEP, *words])
+    assert (tmp_path / "table.md").read_text().startswith("| delay.obs |")
+
+
 def test_results_of_a_run_and_of_a_comparison_are_rows_too(sweep):
     run = next(path.parent for path in sweep.rglob("result.csv"))
     assert [row["policy"] for row in damian.results(run)][:2] == ["untrained", "untrained, deterministic"]
