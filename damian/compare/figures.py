@@ -39,12 +39,12 @@ PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
 ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
 """Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
 _METHODS = (
-    f"undelayed {TRAINED},deployed_own rewards {SCRIPT},own_naive finetuned {RANDOM},history imitation,"
-    "naive,memory,learnt critic server,own backupdate,own_history both,deployed own_memory,"
-    "belief,untrained privileged"
+    f"undelayed {TRAINED},deployed_own rewards {SCRIPT},own_naive own_naive_tuned finetuned {RANDOM},"
+    "history history_tuned imitation,naive,memory memory_tuned,learnt critic server,own own_tuned backupdate,"
+    "own_history both,deployed own_memory,belief,untrained privileged"
 ).split(",")
 """The arms of our experiments, and the policies of a run, that have each of these colours."""
-_LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os^D"
+_LINES, _DOTTED, _MARKERS = ("-", "-.", "--"), (":", (0, (1, 4))), "os^D"
 """Of arms that train, of those that train nothing, and of points; later ones where two have one colour."""
 _POINTS = 200
 """Number of points of a learning curve."""
