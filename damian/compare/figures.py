@@ -68,7 +68,7 @@ def plot_curves(comparison: Comparison, curves: Curves, path: Path) -> None:
     if all(len(row) == 1 for row in grid):
         panels = [panel for (panel,) in grid]
         grid = [panels[i : i + _CURVES_IN_A_ROW] for i in range(0, len(panels), _CURVES_IN_A_ROW)]
-    width, ends = max(map(len, grid)), [run[-1].get("frames", 0) for runs in curves.values() for run in runs]
+    width, ends = max(map(len, grid)), [run[-1]["frames"] for runs in curves.values() for run in runs] or [0]
     progress = "frames" if min(ends) > 0.95 * max(ends) else "episodes"  # batches end a little later
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.2 * width + 1.2, 2.6 * len(grid)), layout="constrained")

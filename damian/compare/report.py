@@ -58,7 +58,7 @@ def _table(lines: Sequence[Line]) -> str:
 
 
 def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> list[str]:
-    """Table of the steps after which the training of each arm returns what the best naive one ends with."""
+    """Table of the environment steps in which arms reach the final training return of the best naive arm."""
     found = {}
     for arm, of_arm in comparison.arms.items():
         run = (task, delay if of_arm.delayed else NOT_LATE, arm)
@@ -75,7 +75,7 @@ def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> lis
         reached = [min(steps[run >= level], default=np.inf) for run in (values.mean(-1), *values.T)]
         numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
         rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
-    title = f"Steps until the perceived return, in a tenth of all, is what *{best}* ends with, {level:.1f}:"
+    title = f"Steps to the final training return (perceived, mean over a tenth) of *{best}*, {level:.1f}:"
     return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]
 
 

@@ -15,7 +15,7 @@ from damian.compare.comparison import (
     Arm,
     Comparison,
 )
-from damian.compare.figures import look
+from damian.compare.figures import look, plot_curves
 from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
 
@@ -135,9 +135,9 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
-def test_steps_are_counted_until_the_training_returns_what_the_best_naive_arm_ends_with():
+def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
     # Straight learning curves over 100 steps: the mean of the naive one ends with 4, of the aware one with 8.
-    # A mean over the last tenth of the steps is what the curve was a twentieth, 5 steps, before.
+    # The mean over the last tenth of the steps lags a straight curve by a twentieth of them, 5 steps.
     ends = {
         ("t", "late", "blind"): [3.0, 5.0],
         ("t", "late", "aware"): [3.0, 13.0],
@@ -148,11 +148,16 @@ def test_steps_are_counted_until_the_training_returns_what_the_best_naive_arm_en
         for run, seeds in ends.items()
     }
     lines = markdown(Comparison(rows_of("t", "late", SCORES), ARMS), curves, []).splitlines()
-    table = lines[next(i for i, line in enumerate(lines) if line.endswith("what *blind* ends with, 3.8:")) :]
+    table = lines[next(i for i, line in enumerate(lines) if line.endswith("of *blind*, 3.8:")) :]
     rows = {arm: numbers for arm, *numbers in (line.strip("| ").split(" | ") for line in table[4:7])}
     assert rows["best"] == ["15", "15", "15"]
     assert rows["aware"] == ["53", "34", "never"]
     assert rows["blind"] == ["100", "81", "never"]
+
+
+def test_arms_that_train_nothing_are_drawn_without_curves(tmp_path):
+    plot_curves(Comparison(rows_of("t", "late", SCORES), ARMS), {}, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").exists()
 
 
 def test_a_recovery_is_from_the_naive_arm_of_the_same_track():
