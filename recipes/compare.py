@@ -1,6 +1,6 @@
 """Train and evaluate several arms with several seeds over tasks and delays, and compare their results.
 
-damian compare experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
+damian compare experiment=usecases "tasks=[usecase2]" seeds=2 "overrides=['frames=1000','eval_episodes=8']"
 damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench
 """
 

@@ -38,7 +38,7 @@ INSTEAD = {
     "seed=0,1,2": "seed=0",
     "port=8000": "port=0",
     "span=[600,900]": "span=[10,20]",
-    "experiment=delays": "experiment=usecase2",
+    "experiment=delays": "experiment=usecases",
     "hydra/launcher=submitit_slurm": "hydra/launcher=submitit_local",
     "hydra.launcher.partition=cpu": "hydra.launcher.timeout_min=60",
 }

@@ -1,12 +1,11 @@
 """Figures of a comparison: learning curves, and J_norm of each arm."""
 
-import math
 import zlib
-from collections.abc import Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -25,6 +24,7 @@ from damian.compare.comparison import (
 from damian.compare.statistics import Floats, bootstrap
 from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
 
+Panel = TypeVar("Panel")
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """Rows of ``metrics.csv`` of each seed, by task, delay and arm."""
 
@@ -48,7 +48,6 @@ _LINES, _DOTTED, _MARKERS = ("-", "-.", "--"), (":", (0, (1, 4))), "os^D"
 """Of arms that train, of those that train nothing, and of points; later ones where two have one colour."""
 _POINTS = 200
 """Number of points of a learning curve."""
-_CURVES_IN_A_ROW, _NORMS_IN_A_ROW = 2, 4
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
@@ -62,67 +61,41 @@ def plot_curves(comparison: Comparison, curves: Curves, path: Path) -> None:
     undelayed script; dotted: arms that train nothing.
     """
     grid = [row for row in _panels(comparison, curves) if row]
-    if not grid:
-        path.unlink(missing_ok=True)  # an older one would show other runs
-        return
     if all(len(row) == 1 for row in grid):
-        panels = [panel for (panel,) in grid]
-        grid = [panels[i : i + _CURVES_IN_A_ROW] for i in range(0, len(panels), _CURVES_IN_A_ROW)]
-    width, ends = max(map(len, grid)), [run[-1]["frames"] for runs in curves.values() for run in runs] or [0]
+        grid = _rows([panel for (panel,) in grid], 2)
+    ends = [run[-1]["frames"] for runs in curves.values() for run in runs] or [0]
     progress = "frames" if min(ends) > 0.95 * max(ends) else "episodes"  # batches end a little later
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(3.2 * width + 1.2, 2.6 * len(grid)), layout="constrained")
-        axes = figure.subplots(len(grid), width, squeeze=False)
-        for row, contents in zip(axes, grid, strict=True):
-            for axis, (task, delay, name) in zip(row, contents, strict=False):
-                _curve_panel(axis, comparison, curves, (task, delay, name), progress)
-                title, label = f"{task}, delay {delay}", f"{LABELS[name]}, perceived"
-                axis.set(xlabel=PROGRESS[progress], ylabel=label, title=title)
-                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-            for axis in row[len(contents) :]:
-                axis.set_axis_off()
-        _legend(figure)
-        figure.savefig(path, dpi=150)
+    _save(path, grid, partial(_curve_panel, comparison, curves, progress), (3.2, 2.6))
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
     """Draw J_norm of each arm under each delay, with 95 % intervals, in a panel for each task with any."""
     norms = {task: found for task in comparison.tasks() if (found := _known_norms(comparison, task))}
-    if not norms:
-        path.unlink(missing_ok=True)  # an older one would show other runs
-        return
-    width = min(len(norms), _NORMS_IN_A_ROW)
-    height = math.ceil(len(norms) / width)
+    grid = _rows([*norms], 4)
     arms = [name for name, arm in comparison.arms.items() if arm.delayed]
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(3.0 * width + 1.2, 3.0 * height), layout="constrained")
-        axes = figure.subplots(height, width, squeeze=False, sharey=True)
-        for axis, task in zip_longest(axes.flat, norms):
-            if task is None:
-                axis.set_axis_off()
-                continue
-            for arm in [arm for arm in arms if arm in norms[task]]:
-                place = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
-                known = [(x + place, norm) for x, norm in norms[task][arm].items()]
-                _error_bars(axis, known, label=arm, **look(comparison, arm) | {"linestyle": ""})
-            delays = comparison.delays(task)
-            axis.set_xticks(range(len(delays)), delays)
-            title = task.replace(HELD_OUT_MARK, ", held-out ")
-            axis.set(title=title, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
-            for level in (0, 1):
-                axis.axhline(level, **_LEVEL)
-        for axis in axes[:, 0]:
+
+    def panel(axis: Axes, task: str) -> None:
+        for arm in [arm for arm in arms if arm in norms[task]]:
+            place = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
+            known = [(x + place, norm) for x, norm in norms[task][arm].items()]
+            _error_bars(axis, known, label=arm, **look(comparison, arm) | {"linestyle": ""})
+        delays = comparison.delays(task)
+        axis.set_xticks(range(len(delays)), delays)
+        title = task.replace(HELD_OUT_MARK, ", held-out ")
+        axis.set(title=title, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
+        for level in (0, 1):
+            axis.axhline(level, **_LEVEL)
+        if task in [row[0] for row in grid]:
             axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
-        _legend(figure)
-        figure.savefig(path, dpi=150)
+
+    _save(path, grid, panel, (3.0, 3.0), sharey=True)
 
 
 def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Path) -> None:
     """Draw means with 95 % intervals in a row for each group of runs, and a colour for each policy."""
     groups = list(dict.fromkeys(name for found in means.values() for name in found))
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 0.4 * len(groups) + 1.4), layout="constrained")
-        axis = figure.subplots()
+
+    def panel(axis: Axes, _: None) -> None:
         for place, (policy, found) in enumerate(means.items()):
             shift = 0.5 * ((place + 0.5) / len(means) - 0.5)
             rows = [groups.index(name) + shift for name in found]
@@ -132,8 +105,8 @@ def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Pa
         axis.set_yticks(range(len(groups)), groups)
         axis.invert_yaxis()
         axis.set_xlabel(label)
-        _legend(figure)
-        figure.savefig(path, dpi=150)
+
+    _save(path, [[None]], panel, (5.2, 0.4 * len(groups) + 1.4))
 
 
 def look(comparison: Comparison, arm: str) -> dict[str, Any]:
@@ -155,12 +128,35 @@ def colour_of(method: str) -> str:
     return ARM_COLOURS[known[0] if known else zlib.crc32(method.encode()) % len(ARM_COLOURS)]
 
 
-def _legend(figure: Figure) -> None:
-    """Name what any of the panels shows, to the right of them."""
-    drawn: dict[str, Any] = {}
-    for axis in figure.axes:
-        drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    figure.legend([*drawn.values()], [*drawn], loc="outside right upper", frameon=False)
+def _rows(panels: list[Panel], width: int) -> list[list[Panel]]:
+    """Panels in rows of at most ``width``."""
+    return [panels[i : i + width] for i in range(0, len(panels), width)]
+
+
+def _save(
+    path: Path,
+    grid: Sequence[Sequence[Panel]],
+    draw: Callable[[Axes, Panel], None],
+    size: tuple[float, float],
+    sharey: bool = False,
+) -> None:
+    """Draw rows of panels of this size [inches], with one legend to the right of them."""
+    if not grid:
+        path.unlink(missing_ok=True)  # an older one would show other runs
+        return
+    width = max(map(len, grid))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(size[0] * width + 1.2, size[1] * len(grid)), layout="constrained")
+        axes = figure.subplots(len(grid), width, squeeze=False, sharey=sharey)
+        drawn: dict[str, Any] = {}
+        for row, panels in zip(axes, grid, strict=True):
+            for axis, panel in zip(row, panels, strict=False):
+                draw(axis, panel)
+                drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+            for axis in row[len(panels) :]:
+                axis.set_axis_off()
+        figure.legend([*drawn.values()], [*drawn], loc="outside right upper", frameon=False)
+        figure.savefig(path, dpi=150)
 
 
 def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str, str]]]:
@@ -176,10 +172,14 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
 
 
 def _curve_panel(
-    axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str], progress: str
+    comparison: Comparison, curves: Curves, progress: str, axis: Axes, content: tuple[str, str, str]
 ) -> None:
     """Draw all arms in a panel of ``_panels``."""
     task, delay, measure = content
+    axis.set(
+        xlabel=PROGRESS[progress], ylabel=f"{LABELS[measure]}, perceived", title=f"{task}, delay {delay}"
+    )
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     for name, arm in comparison.arms.items():
         run = (task, delay if arm.delayed else NOT_LATE, name)
         style: dict[str, Any] = look(comparison, name) | {"marker": "", "label": name}

@@ -53,7 +53,7 @@ def test_settings_help_and_wrong_words_need_no_torch(code):
         (["train", "agents=0"], "agents: 0 is not between 1 and 1000"),
         (["train", "clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
         (["train", "region=geojson"], "region.path: it is missing: region.kind=geojson needs it"),
-        (["compare", "experiment=usecase2", "agents=3"], "agents: it is a setting of the runs"),
+        (["compare", "experiment=usecases", "agents=3"], "agents: it is a setting of the runs"),
     ],
     ids=lambda part: part[-1] if isinstance(part, list) else "",
 )

@@ -39,7 +39,8 @@ def listed(*words: str) -> str:
     return f"overrides={list(words)}"
 
 
-TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,naive]", listed(*SMALL)]
+ONE = ["experiment=usecases", "tasks=[usecase2]"]
+TWO = [*ONE, "seeds=2", "arms=[undelayed,naive]", listed(*SMALL)]
 
 
 @pytest.fixture
@@ -50,7 +51,7 @@ def compare(tmp_path, monkeypatch):
     def run_recipe(*overrides: str) -> Path:
         monkeypatch.setattr(sys, "argv", ["damian compare", *overrides])
         main()
-        return tmp_path / "runs" / "usecase2"
+        return tmp_path / "runs" / "usecases"
 
     return run_recipe
 
@@ -93,7 +94,7 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
 
     before = stamps(folder)
     (folder / "usecase2" / runs[3] / "result.csv").unlink()  # as after Ctrl-C during the evaluation
-    compare(*TWO[:2], "arms=[undelayed,naive,deployed]", TWO[3])
+    compare(*TWO[:3], "arms=[undelayed,naive,deployed]", TWO[4])
     after = stamps(folder)
     rewritten = {path for path in before if before[path] != after[path]}
     assert rewritten
@@ -103,10 +104,10 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert resumed == runs[3:]
 
     capsys.readouterr()
-    compare(*TWO[:1], "seeds=3", *TWO[2:], "report_only=true")
+    compare(*TWO[:2], "seeds=3", *TWO[3:], "report_only=true")
     text = (folder / "table.md").read_text()
     assert "missing: usecase2/none/undelayed/seed_10, usecase2/paper/naive/seed_10" in text
-    compare(*TWO[:1], *TWO[2:], "report_only=true")
+    compare(*TWO[:2], *TWO[3:], "report_only=true")
     assert not re.search("missing|seed_10| to 10", (folder / "table.md").read_text())
     assert stamps(folder) == after
 
@@ -165,7 +166,7 @@ def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(comp
 
 @pytest.mark.slow
 def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
-    words = ["experiment=usecase2", "seeds=1", "arms=[undelayed,naive]", listed(*SMALL, "frames=64")]
+    words = [*ONE, "seeds=1", "arms=[undelayed,naive]", listed(*SMALL, "frames=64")]
     folder, kept = compare(*words), tmp_path / "kept"
     kept.mkdir()
     for name in ("results.csv", "curves.csv"):
@@ -177,17 +178,17 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
         assert (kept / name).read_bytes() == (folder / name).read_bytes()
     texts = [(place / "table.md").read_text() for place in (folder, kept)]
     assert len({re.sub("`damian compare .*`", "", text) for text in texts}) == 1
-    compare(*words[:2], "arms=[undelayed]", *stored)
+    compare(*words[:3], "arms=[undelayed]", *stored)
     assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "script"}
     late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
     check_refused(lambda: compare(*words, *late), problem, capsys)
     (kept / "results.csv").write_text("seed\nx\n")
-    check_refused(lambda: compare(*words[:1], *stored), "it does not hold the results", capsys)
+    check_refused(lambda: compare(*words[:2], *stored), "it does not hold the results", capsys)
 
 
 @pytest.mark.slow
 def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compare, capsys):
-    words = [TWO[0], "seeds=1", "arms=[undelayed,deployed]", TWO[3]]
+    words = [*ONE, "seeds=1", "arms=[undelayed,deployed]", TWO[4]]
     folder = compare(*words) / "usecase2"
     source, flown = (folder / name / "seed_8" for name in ("none/undelayed", "paper/deployed"))
     compare(*words)
@@ -209,16 +210,16 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
 
 @pytest.mark.slow
 def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_named(compare, capsys):
-    words = [*TWO[:2], "arms=[undelayed,naive,deployed]", TWO[3]]
+    words = [*TWO[:3], "arms=[undelayed,naive,deployed]", TWO[4]]
     folder = compare(*words)
     expected = measured(folder)
-    compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")
+    compare(*words, "processes=2", "hydra.run.dir=runs/usecases/other")
     assert measured(folder / "other") == expected
     broken = folder / "other" / "usecase2" / "none" / "undelayed" / "seed_8"
     (broken / "result.csv").unlink()
     (broken / "checkpoint.pt").write_text("nonsense")
     with pytest.raises(SystemExit) as stopped:
-        compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")
+        compare(*words, "processes=2", "hydra.run.dir=runs/usecases/other")
     assert stopped.value.code == 1
     assert "failed: usecase2/none/undelayed/seed_8; see " in capsys.readouterr().err
     assert "missing: usecase2/none/undelayed/seed_8" in (folder / "other" / "table.md").read_text()
@@ -230,13 +231,13 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
     [
         ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
         (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
-        (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
+        (["tasks=[spotting]"], "tasks: spotting is not one of usecase1, usecase2"),
     ],
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
     compare, capsys, tmp_path, overrides, message
 ):
-    check_refused(lambda: compare("experiment=usecase2", "seeds=2", *overrides), message, capsys)
+    check_refused(lambda: compare(*TWO[:3], *overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
 
 
