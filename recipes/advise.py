@@ -190,9 +190,4 @@ def most_connections() -> int:
 
 
 def run() -> None:
-    """Run the program with the words of the command line."""
     cli.run(advise, "advise")
-
-
-if __name__ == "__main__":
-    run()

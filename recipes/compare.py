@@ -203,9 +203,4 @@ def _not_kept(runs: list[Run], kept: Results) -> list[Run]:
 
 
 def run() -> None:
-    """Run the program with the words of the command line."""
     cli.run(compare, "compare", again=True)
-
-
-if __name__ == "__main__":
-    run()

@@ -34,7 +34,8 @@ likely one is taken. A policy without memory often needs chance to search."""
 
 def fly(config: TrainConfig, folder: Path) -> None:
     """Evaluate the policy of ``config.checkpoint`` and fill the run folder."""
-    env, actor = stored(config)
+    env = make_eval_env(config)
+    actor = stored_actor(config, env)
     save_config(config, folder)
     report(config, folder, env, actor)
 
@@ -43,12 +44,6 @@ def fly_untrained(config: TrainConfig, folder: Path) -> None:
     """Evaluate the networks before their first update, and fill the run folder."""
     save_config(config, folder)
     report(config, folder, make_eval_env(config))
-
-
-def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
-    """The evaluation environment, and the actor of ``config.checkpoint``."""
-    env = make_eval_env(config)
-    return env, stored_actor(config, env)
 
 
 def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
@@ -147,9 +142,4 @@ def own_code(learner: str) -> AbstractContextManager[None]:
 
 
 def run() -> None:
-    """Run the program with the words of the command line."""
     cli.run(fly)
-
-
-if __name__ == "__main__":
-    run()

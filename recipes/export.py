@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict
+from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor
 
@@ -51,7 +51,7 @@ class ExportedPolicy(nn.Module):
         self.layers, self.in_keys = nn.ModuleList(layers), [*actor.in_keys]
         self.recurrent = keys.HIDDEN in self.in_keys
         self.discrete = keys.LOGITS in actor.out_keys
-        self.inputs = [_name(key) for key in self.in_keys]
+        self.inputs = [str(keys.last_part(key)) for key in self.in_keys]
         parameters = ["probability"] if self.discrete else ["loc", "scale"]
         self.outputs = ["action", *parameters, *["hidden"] * self.recurrent]
 
@@ -72,10 +72,6 @@ class ExportedPolicy(nn.Module):
         return (logits.argmax(-1), logits.softmax(-1), *hidden)
 
 
-def _name(key: NestedKey) -> str:
-    return key if isinstance(key, str) else str(key[-1])
-
-
 def export(run: Path, trust: bool = False) -> Path:
     """Export the policy of a run folder into its subfolder ``export``; returns that folder."""
     safetensors, _ = _needed("safetensors.torch"), _needed("onnxscript")
@@ -94,7 +90,8 @@ def export(run: Path, trust: bool = False) -> Path:
         {name: weight.contiguous() for name, weight in policy.state_dict().items()},
         target / "policy.safetensors",
     )
-    outputs = [_output(name) for name in policy.outputs]
+    # ONNX does not let an output have the name of an input.
+    outputs = [f"next_{name}" if name == "hidden" else name for name in policy.outputs]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nobody needs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
@@ -110,11 +107,6 @@ def export(run: Path, trust: bool = False) -> Path:
     described = describe(run, policy, env, dict(zip(policy.inputs, examples, strict=True)), 1 in sizes)
     write_atomically(target / DESCRIPTION, json.dumps(described, indent=2) + "\n")
     return target
-
-
-def _output(name: str) -> str:
-    """Name of an output in ONNX, which does not let an output have the name of an input."""
-    return f"next_{name}" if name == "hidden" else name
 
 
 def _needed(module: str) -> Any:

@@ -148,9 +148,4 @@ def fly_or_replay(config: FlyConfig, folder: Path) -> None:
 
 
 def run() -> None:
-    """Run the program with the words of the command line."""
     cli.run(fly_or_replay, "fly")
-
-
-if __name__ == "__main__":
-    run()

@@ -152,8 +152,8 @@ def known_settings(program: str) -> dict[str, Setting]:
     """Every setting of a program by its dotted key, sections included; those of every learner."""
     found = _described(SCHEMAS[program], "")
     if "learner" in found:
-        for _, learner in LEARNERS.items():
-            found = {**_described(learner, "learner."), **found}
+        for name in LEARNERS:
+            found = {**_described(LEARNERS.get(name, "learner"), "learner."), **found}
     return found
 
 

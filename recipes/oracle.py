@@ -84,9 +84,4 @@ def true_belief(env: DelayedEnv) -> TensorDictModule:
 
 
 def run() -> None:
-    """Run the program with the words of the command line."""
     cli.run(fly)
-
-
-if __name__ == "__main__":
-    run()

@@ -22,7 +22,7 @@ from damian.runs.run_record import read_record
 
 from .known import key_of
 from .shared.comparison_results import FIGURE, MARKDOWN, ROWS, stored_results, write_csv
-from .shared.many_runs import result_rows
+from .shared.many_runs import read_rows
 from .shared.runs import OVERRIDES
 
 MEASURES = ("return", "success_rate", "steps", "perceived_return", "age")
@@ -65,7 +65,7 @@ def sweep_rows(folder: Path) -> tuple[list[str], list[dict[str, Any]]]:
     return swept, [
         {**{key: _value(given[run].get(key)) for key in swept}, "folder": str(run.relative_to(folder)), **row}
         for run in runs
-        for row in result_rows(run)
+        for row in read_rows(run / RESULTS)
     ]
 
 

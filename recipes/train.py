@@ -226,9 +226,4 @@ def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, int
 
 
 def run() -> None:
-    """Run the program with the words of the command line."""
     cli.run(train)
-
-
-if __name__ == "__main__":
-    run()

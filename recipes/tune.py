@@ -195,9 +195,4 @@ def search_all(config: TuneConfig, folder: Path) -> None:
 
 
 def run() -> None:
-    """Run the program with the words of the command line."""
     cli.run(search_all, "tune", again=True)
-
-
-if __name__ == "__main__":
-    run()

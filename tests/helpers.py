@@ -13,14 +13,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from twin import Uav
 
-from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig, ServerContext
 from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig
+from damian.settings import ClockConfig, ScenarioConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.messages import Messages

@@ -15,7 +15,7 @@ from damian.advice.known import Ground
 from damian.advice.node import Node
 from damian.advice.rows import Report, Rows, reports_of, rows_of_json
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import ScenarioConfig
+from damian.settings import ScenarioConfig
 from damian.settings.programs import FieldRules
 
 START = 1.7e9

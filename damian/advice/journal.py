@@ -94,8 +94,6 @@ class Command(BaseModel):
 
 
 class Commanded(Command):
-    """A line about that."""
-
     received: Time
 
 
@@ -107,8 +105,6 @@ class Change(BaseModel):
 
 
 class Members(Change):
-    """A line about that."""
-
     received: Time
 
 

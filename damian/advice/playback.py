@@ -93,7 +93,7 @@ def episode_of(
         emits=None,
         reward_terms=terms,
         cells=cells_of(fleet.node.worlds) if view.belief else None,
-        belief=_stacked(view.belief) if view.belief else None,
+        belief=np.stack([np.asarray(row) for row in view.belief]) if view.belief else None,
     )
 
 
@@ -233,7 +233,3 @@ def _of_members(
             latest = np.searchsorted(known, np.arange(len(rows)), side="right") - 1
             found[:, uav] = found[known[latest.clip(min=0)], uav]
     return found
-
-
-def _stacked(rows: Sequence[Tensor]) -> NDArray[Any]:
-    return np.stack([np.asarray(row) for row in rows])

@@ -132,7 +132,7 @@ def limited(most: int) -> type[HttpToolsProtocol]:
 
 
 class Service:
-    """The requests; arguments as of ``make_app``."""
+    """The requests, which ``api`` describes; arguments as of ``make_app``."""
 
     def __init__(
         self, session: AdviceSession, token: str, clock: Callable[[], float], version: str = ""
@@ -142,21 +142,17 @@ class Service:
     # What needs no token.
 
     async def page(self, _: Request) -> Response:
-        """The requests as a page."""
         return HTMLResponse(api.page())
 
     async def openapi(self, _: Request) -> Response:
-        """The requests as OpenAPI."""
         return JSONResponse(api.openapi(self.version))
 
     async def health(self, _: Request) -> Response:
-        """Whether the journals can be written."""
         problem, n_fleets = self.session.problem, len(self.session.names)
         said = {"status": "failing" if problem else "ok", "problem": problem, "fleets": n_fleets}
         return JSONResponse({**said, "version": self.version}, 503 if problem else 200)
 
     async def time(self, _: Request) -> Response:
-        """The time of the service."""
         now, clock = self.clock(), self.clock
         ahead, jumps = (clock.ahead, clock.jumps) if isinstance(clock, Clock) else (0.0, 0)
         said = {"time": now, "written": written(now), "system_ahead": round(ahead, 3), "jumps": jumps}
@@ -165,41 +161,34 @@ class Service:
     # Fleets.
 
     async def list(self, request: Request) -> Response:
-        """The names of all fleets."""
         self._check_token(request)
         return JSONResponse({"fleets": self.session.names})
 
     async def put(self, request: Request) -> Response:
-        """Create a fleet, or find it."""
         name, body = self._name(request), parsed_json(await _body(request))
         created = self.session.create(name, body.get("uavs") if isinstance(body, dict) else None)
         return JSONResponse({"fleet": name, "uavs": self.session.fleet(name).uavs}, 201 if created else 200)
 
     async def get(self, request: Request) -> Response:
-        """What is known of a fleet."""
         name = self._name(request)
         return JSONResponse(self.session.fleet(name).status(name).model_dump(exclude_unset=True))
 
     async def delete(self, request: Request) -> Response:
-        """End a fleet."""
         self.session.end(self._name(request), self.clock())
         return Response(status_code=204)
 
     async def command(self, request: Request) -> Response:
-        """Hold, resume or return UAVs."""
         name = self._name(request)
         uavs = self.session.command(name, validated(Command, parsed_json(await _body(request))), self.clock())
         return JSONResponse({"fleet": name, "uavs": uavs})
 
     async def members(self, request: Request) -> Response:
-        """Let UAVs join and leave."""
         name = self._name(request)
         change = validated(Change, parsed_json(await _body(request)))
         uavs = self.session.change_members(name, change, self.clock())
         return JSONResponse({"fleet": name, "uavs": uavs})
 
     async def geofence(self, request: Request) -> Response:
-        """The region in longitude and latitude."""
         region = self.session.fleet(self._name(request)).ground.region
         if region.origin is None:
             raise InputError(f"geofence: {region.name} has no place on Earth")
@@ -209,7 +198,6 @@ class Service:
     # Reports and advice.
 
     async def reports(self, request: Request) -> Response:
-        """Take reports, as JSON or as a CSV table."""
         name, rows = self._name(request), reports_of(await _rows(request))
         unknown = ignored(rows)
         found = self.session.report(name, rows, self.clock())
@@ -217,7 +205,6 @@ class Service:
         return JSONResponse({"accepted": len(found), "found": found, **note})
 
     async def acknowledge(self, request: Request) -> Response:
-        """Take acknowledgements, as JSON or as a CSV table."""
         name, rows = self._name(request), acknowledgements_of(await _rows(request))
         return JSONResponse({"status": self.session.acknowledge(name, rows, self.clock())})
 
@@ -234,7 +221,6 @@ class Service:
         return JSONResponse({"fleet": name, "advice": as_rows(answer)})
 
     async def events(self, request: Request) -> Response:
-        """The advice of all UAVs, or of those named, whenever it changes."""
         name, uavs = self._name(request), request.query_params.getlist("uav") or None
         fleet = self.session.fleet(name)
         fleet.numbers_of(uavs)

@@ -87,15 +87,11 @@ class Greedy:
             time = held.time if age is None else held.time + age.squeeze(-1) * self.dt
             likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
             weight = torch.where(recent, likely, weight * likely)
-        return self.choose(held, weight @ self.footprints(region), region, mask)
+        return self.choose_landing(held, weight @ self.footprints(region), region, mask)[0]
 
     def footprints(self, region: Tensor) -> Tensor:
         """1 for landing points (rows) in the footprints of others (columns), [B or 1, L, L]."""
         return self.near if len(self.near) == 1 else self.near[region]
-
-    def choose(self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None) -> Tensor:
-        """Actions to the landing points of most ``gain`` [B, N, L], for UAVs at the targets of ``held``."""
-        return self.choose_landing(held, gain, region, mask)[0]
 
     def choose_landing(
         self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None
@@ -205,7 +201,7 @@ class Searcher(Greedy):
         probable = chance.amax(-1, keepdim=True) >= PROBABLE
         chance = torch.where(probable | near, chance, 0.0)
         worth = chance >= WORTH * chance.amax(-1, keepdim=True)
-        return self.choose(own, torch.where(worth, chance, 0.0), region, mask)
+        return self.choose_landing(own, torch.where(worth, chance, 0.0), region, mask)[0]
 
     def from_others(self, known: Messages, ground: Tensor) -> Tensor:
         """Distance from the nearest other UAV to each landing point [m], [B, N, L]; infinite for one UAV."""

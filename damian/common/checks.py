@@ -6,7 +6,6 @@ long before a computer refuses a number.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from numbers import Integral
 from typing import Any, TypeGuard
 
 from damian.common.errors import InputError
@@ -55,13 +54,6 @@ def above(key: str, value: float, low: float, unit: str = "") -> None:
     good = is_number(value) and low < value < math.inf
     require(good, key, f"{value} {unit}".strip(), f"is not above {low:g} {unit}".strip())
     in_range(key, value, low + TINY, max(low + TINY, LARGEST.get(unit, HUGE)), unit)
-
-
-def seed(key: str, value: Any, low: int | None = None) -> None:
-    """Require the seed of random draws: a whole number, from ``low`` on if that is given."""
-    good = isinstance(value, Integral) and not isinstance(value, bool)
-    require(good, key, repr(value), "is not a whole number such as 0")
-    require(low is None or int(value) >= low, key, value, f"is not at least {low}")
 
 
 def seconds(key: str, value: str | float, zero: bool = False) -> float:

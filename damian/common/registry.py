@@ -26,11 +26,14 @@ class Registry(Generic[T]):
 
     Args:
         kind: what a component is called in errors, such as ``law``.
-        problem: says what is wrong with an imported object; None if it is a component of this kind.
+        fits: the class of components, or a function that says whether an imported object is one.
+        problem: what is wrong with an object that does not fit, as in ``is no law``.
     """
 
-    def __init__(self, kind: str, problem: Callable[[Any], str | None] = lambda _: None) -> None:
-        self.kind, self._problem = kind, problem
+    def __init__(
+        self, kind: str, fits: type | Callable[[Any], bool] = object, problem: str = "does not fit"
+    ) -> None:
+        self.kind, self._fits, self._problem = kind, fits, problem
         self._components: dict[str, T] = {}
         self._imported: dict[str, T] = {}  # a compiled step looks a component up, but cannot import it
 
@@ -58,8 +61,9 @@ class Registry(Generic[T]):
             known = f"one of {', '.join(self._components)}, nor " if self._components else ""
             raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
         component = _import_path(name, key)
-        if problem := self._problem(component):
-            raise InputError(f"{key}: {name} {problem}")
+        fits = self._fits
+        good = isinstance(component, fits) if isinstance(fits, type) else fits(component)
+        checks.require(good, key, name, self._problem)
         self._imported[name] = component
         return component
 
@@ -77,10 +81,6 @@ class Registry(Generic[T]):
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and name in self._components
-
-    def items(self) -> Iterator[tuple[str, T]]:
-        """Registered names and components."""
-        yield from self._components.items()
 
 
 @functools.cache

@@ -80,12 +80,11 @@ def _seconds(key: str, delay: str) -> float:
 _NO_DELAY = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
 
 
-def _is_no_law(found: Any) -> str | None:
-    good = isinstance(found, type) and issubclass(found, Law) and is_dataclass(found)
-    return None if good else "is no dataclass derived from damian.Law"
-
-
-LAWS = Registry[type[Law]]("law", _is_no_law)
+LAWS = Registry[type[Law]](
+    "law",
+    lambda found: isinstance(found, type) and issubclass(found, Law) and is_dataclass(found),
+    "is no dataclass derived from damian.Law",
+)
 """Laws by name; ``law_of`` also takes the path of a class outside the package, ``package.module:Class``."""
 
 

@@ -23,9 +23,9 @@ from damian.common import checks
 from damian.delays.config import CONTEXT_KEYS, check_laws, delay_law, delay_reads, delay_sampler, link_reads
 from damian.delays.laws import law_of, sampler_of
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.scenario import ScenarioConfig, make_simulation
-from damian.envs.uav_env import ALL_EXTRAS, UavEnv
+from damian.envs.uav_env import ALL_EXTRAS, UavEnv, make_simulation
 from damian.server.server import Server
+from damian.settings import ScenarioConfig
 from damian.transforms import (
     ActionDelay,
     ActionHistory,

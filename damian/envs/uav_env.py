@@ -14,9 +14,9 @@ from torchrl.envs import EnvBase
 from damian import keys
 from damian.common import checks, counter_rng, devices
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
-from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
+from damian.settings import ScenarioConfig
 from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State
@@ -211,11 +211,13 @@ class UavEnv(EnvBase):
             state = state._replace(coverage=features["coverage"])
         packed = self.simulation.layout.pack(state)
         outputs = self._state_outputs(state, features)
-        result = self.server.reward_and_status(features, state.sent, state.steps, state.source_over)
-        outputs[keys.REWARD] = result.reward.unsqueeze(-1)
+        reward, terms, status = self.server.reward_and_status(
+            features, state.sent, state.steps, state.source_over
+        )
+        outputs[keys.REWARD] = reward.unsqueeze(-1)
         if "reward_terms" in self.extras:
-            outputs |= {(*keys.REWARD_TERMS, name): term for name, term in result.terms.items()}
-        return packed, outputs | result.status.entries()
+            outputs |= {(*keys.REWARD_TERMS, name): term for name, term in terms.items()}
+        return packed, outputs | status.entries()
 
     def _state_outputs(self, state: State, features: Features | None = None) -> Outputs:
         """The outputs that depend on a state and, if given, on the features of its messages."""
@@ -327,3 +329,8 @@ def _levels(entries: dict[NestedKey, Any]) -> dict[tuple[str, ...], dict[str, An
         *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
         levels.setdefault(tuple(path), {})[name] = value
     return levels
+
+
+def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:
+    """Build the physics of a scenario; ``seed`` is that of regions, start positions and walks."""
+    return Simulation(scenario, scenario.clock.dt, scenario.observation.window, seed)

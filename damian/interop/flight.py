@@ -15,8 +15,8 @@ from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
+from damian.settings import ScenarioConfig
 from damian.show.film import LiveFilm
 
 RENDER_MODES = ("rgb_array",)

@@ -36,11 +36,9 @@ class SystemClock:
         self.period = min(max(changed, self.shortest), self.longest)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint."""
         return {"period": self.period}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state of a checkpoint."""
         self.period = int(state["period"])
 
 
@@ -58,10 +56,8 @@ class LinearSchedule:
         self.value.fill_(self.first + (self.last - self.first) * min(self.learnt / self.frames, 1.0))
 
     def state_dict(self) -> dict[str, Any]:
-        """The state for a checkpoint."""
         return {"learnt": self.learnt}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state of a checkpoint."""
         self.learnt = 0
         self.advance(int(state["learnt"]))

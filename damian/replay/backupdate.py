@@ -13,7 +13,7 @@ from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.keys import next_key
-from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
+from damian.replay.hindsight import ended_before, latest_arrived
 from damian.replay.time_storage import TimeStorage
 from damian.transforms.base import Correction, Entries, StatefulTransform, leaf_transforms, sibling_key
 
@@ -200,14 +200,12 @@ class BackupdateStorage(TimeStorage):
             paid = cast(Callable[..., Tensor], late.paid)(steps, steps[self._count].squeeze(-1))
             return {}, {self._backupdated: paid & (delay > 0)}
         held, age = steps[self._held], steps[self._age].long()
-        log = MessageLog(steps[self._sent], delay.squeeze(-1), held, age.squeeze(-1))
         if self._hindsight is not None:
             # At the first step, the storage may know a newer message than the receiver held; its sender may
             # have sent it before that step, so that it is in no row of these steps.
             held = torch.cat([steps[self._hindsight][:1], held[1:]])
             age = torch.cat([steps[self._hindsight_age][:1], age[1:]])
-            log = log._replace(held=held, age=age.squeeze(-1))
-        latest, age = latest_arrived(log)
+        latest, age = latest_arrived(steps[self._sent], delay.squeeze(-1), held, age.squeeze(-1))
         replaced = latest != steps[self._held]
         added: Entries = {self._backupdated: replaced.any(-1, keepdim=True)}
         if self._hindsight is not None:

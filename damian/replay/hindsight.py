@@ -4,42 +4,33 @@ Pure functions of T consecutive steps. A message that is generated at step g wit
 available from step g + d on, even if its episode has ended meanwhile.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from damian.common.tensors import expand_mask
 
 
-class MessageLog(NamedTuple):
-    """Messages sent and held at T consecutive steps."""
+def latest_arrived(sent: Tensor, delay: Tensor, held: Tensor, age: Tensor) -> tuple[Tensor, Tensor]:
+    """For each of T steps, the newest message sent in its episode that has arrived by the last step.
 
-    sent: Tensor
-    """The message sent after each step, [T, *, M]; arbitrary numbers if none was sent."""
-    delay: Tensor
-    """Delay of the message sent [steps], [T, *]; -1 if it never arrives, or if none was sent."""
-    held: Tensor
-    """The message that the server held after each step, [T, *, M]."""
-    age: Tensor
-    """Age of the message held [steps], [T, *]."""
+    It returns the messages, [T, *, M], and the age of each at its step [steps], [T, *]. To miss none, the
+    steps must begin earlier than the first one of interest, by the longest delay.
 
-
-def latest_arrived(log: MessageLog, now: int | None = None) -> tuple[Tensor, Tensor]:
-    """For each step, the newest message sent in its episode that has arrived by step ``now`` (the last).
-
-    It returns the messages, [T, *, M], and the age of each at its step [steps], [T, *]. To miss none, the log
-    must begin earlier than the first step of interest, by the longest delay.
+    Args:
+        sent: the message sent after each step, [T, *, M]; arbitrary numbers if none was sent.
+        delay: of the message sent [steps], [T, *]; -1 if it never arrives, or if none was sent.
+        held: the message that the server held after each step, [T, *, M].
+        age: of the message held [steps], [T, *].
     """
-    steps = _steps(log.delay)
-    arrived = arrived_by_now(log.delay, (len(steps) - 1 if now is None else now) - steps)
+    steps = _steps(delay)
+    arrived = arrived_by_now(delay, len(steps) - 1 - steps)
     none = torch.iinfo(steps.dtype).min  # older than any held message, even one older than these steps
     newest = torch.where(arrived, steps, none).cummax(0).values
     # With ``order=arrival`` the server may have held a newer message at an earlier step.
-    newest_held, held_at = (steps - log.age).cummax(0)
+    newest_held, held_at = (steps - age).cummax(0)
     # A message of an earlier episode is never newer than the held one.
     came_late = newest > newest_held
-    latest = torch.where(came_late.unsqueeze(-1), _at(log.sent, newest.clamp(min=0)), _at(log.held, held_at))
+    latest = torch.where(came_late.unsqueeze(-1), _at(sent, newest.clamp(min=0)), _at(held, held_at))
     return latest, steps - torch.maximum(newest, newest_held)
 
 

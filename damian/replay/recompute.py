@@ -41,7 +41,7 @@ def server_recompute(
         if "actor" in corrected:
             sent, own = steps[next_key(keys.MESSAGE)], server.observation.own
             entries[keys.OBSERVATION] = (
-                server.observe_with_timely_messages(
+                server.observe_with_own_messages(
                     messages, sent, elapsed, belief=steps.get(next_key(keys.OWN_BELIEF), None)
                 )
                 if own

@@ -31,12 +31,11 @@ class Logger(Protocol):
         ...
 
 
-def _not_a_logger(found: Any) -> str | None:
-    good = callable(found) and (not isinstance(found, type) or hasattr(found, "log_scalar"))
-    return None if good else "is no function (folder) -> logger, nor a class with a method log_scalar"
-
-
-LOGGERS = Registry[Callable[..., Logger]]("logger", _not_a_logger)
+LOGGERS = Registry[Callable[..., Logger]](
+    "logger",
+    lambda found: callable(found) and (not isinstance(found, type) or hasattr(found, "log_scalar")),
+    "is no function (folder) -> logger, nor a class with a method log_scalar",
+)
 """Loggers of the user's own as ``package.module:Name``: functions or classes that get the run folder."""
 
 

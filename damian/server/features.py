@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -176,11 +176,7 @@ def feature(
     return lambda compute: Feature(compute, scope, width, low, high)
 
 
-def _not_a_feature(found: Any) -> str | None:
-    return None if isinstance(found, Feature) else "is no feature: decorate the function with damian.feature"
-
-
-FEATURES = Registry[Feature]("feature", _not_a_feature)
+FEATURES = Registry[Feature]("feature", Feature, "is no feature: decorate the function with damian.feature")
 """Features by name; those outside the package as ``package.module:name``."""
 
 

@@ -54,11 +54,9 @@ def reward_term(
     return lambda compute: RewardTerm(compute, tuple(reads), scope)
 
 
-def _not_a_term(found: Any) -> str | None:
-    return None if isinstance(found, RewardTerm) else "is no reward term: decorate it with damian.reward_term"
-
-
-REWARD_TERMS = Registry[RewardTerm]("reward term", _not_a_term)
+REWARD_TERMS = Registry[RewardTerm](
+    "reward term", RewardTerm, "is no reward term: decorate it with damian.reward_term"
+)
 """Reward terms from outside the package, by name or as ``package.module:name``."""
 
 

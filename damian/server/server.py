@@ -5,7 +5,6 @@ replay storage with those that have arrived by the time of learning.
 """
 
 import itertools
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -30,14 +29,6 @@ from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.simulation import Simulation
 
 Features = dict[str, Tensor]
-
-
-class RewardAndStatus(NamedTuple):
-    """The UAVs' rewards and the status of the task; fields as in ``ServerOutputs``."""
-
-    reward: Tensor
-    terms: dict[str, Tensor]
-    status: Status
 
 
 class ServerOutputs(NamedTuple):
@@ -172,28 +163,17 @@ class Server:
         """Observations of the actors [*, N, F] and of the critic [*, N, G]."""
         return stack(features, self.observation.actor), stack(features, self.observation.critic)
 
-    def observe_with_timely_messages(
-        self,
-        received: Tensor,
-        sent: Tensor,
-        steps: Tensor,
-        on_time: Tensor | None = None,
-        fields: Sequence[str] = Messages._fields,
-        belief: Tensor | None = None,
+    def observe_with_own_messages(
+        self, received: Tensor, sent: Tensor, steps: Tensor, belief: Tensor | None = None
     ) -> Tensor:
-        """Observations of actors that receive some messages without delay, [*, N, F].
+        """Observations of actors that know their own messages at once, [*, N, F].
 
         ``received`` and ``sent`` are packed messages [*, N, M] as the server holds them, and as the UAVs sent
-        them last. Element (i, j) of ``on_time`` [N, N] tells whether UAV i receives the ``fields`` of UAV j
-        without delay; if not given, each receives its own. ``belief``: that of each UAV, [*, N, K].
+        them last. ``belief``: that of each UAV, [*, N, K].
         """
-        n_agents = received.shape[-2]
-        if on_time is None:
-            on_time = torch.eye(n_agents, dtype=torch.bool, device=received.device)
-        timely = torch.where(on_time.unsqueeze(-1), sent.unsqueeze(-3), received.unsqueeze(-3))
-        known = self.messages(received.unsqueeze(-3).expand_as(timely))  # [*, N receivers, N senders]
-        timely = self.messages(timely)._asdict()
-        return self.observe_each(known._replace(**{name: timely[name] for name in fields}), steps, belief)
+        own = torch.eye(received.shape[-2], dtype=torch.bool, device=received.device).unsqueeze(-1)
+        known = torch.where(own, sent.unsqueeze(-3), received.unsqueeze(-3))  # [*, N receivers, N senders]
+        return self.observe_each(self.messages(known), steps, belief)
 
     def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
         """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K]."""
@@ -203,13 +183,16 @@ class Server:
 
     def reward_and_status(
         self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor
-    ) -> RewardAndStatus:
-        """Rewards (paper, eq. 5-8) and the end of the episode (section 4.1); features are of the messages."""
+    ) -> tuple[Tensor, Features, Status]:
+        """Rewards (paper, eq. 5-8), their terms, and the end of the episode (section 4.1).
+
+        Shapes as in ``ServerOutputs``; features are of the messages.
+        """
         counters = Counters(steps, messages.motions)
         ended = status(messages, steps, source_over, self.dt, self.episode)
         terms = reward(features, counters, self.reward)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
-        return RewardAndStatus(sum(terms.values(), start=final), terms, ended)
+        return sum(terms.values(), start=final), terms, ended
 
     def _context(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages."""

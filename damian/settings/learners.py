@@ -16,16 +16,15 @@ if TYPE_CHECKING:
     from torchrl.modules import ProbabilisticActor
 
 
-def _not_a_learner(found: Any) -> str | None:
-    good = isinstance(found, type) and issubclass(found, LearnerConfig)
-    if good and "__dataclass_fields__" not in vars(found):
-        return "is no dataclass: write @dataclass above the class"
-    if good and (found.learner or found.make is not LearnerConfig.make):
-        return None
-    return "is no dataclass derived from damian.LearnerConfig with a method make"
+def _is_learner(found: Any) -> bool:
+    derived = isinstance(found, type) and issubclass(found, LearnerConfig)
+    declared = derived and "__dataclass_fields__" in vars(found)
+    return declared and bool(found.learner or found.make is not LearnerConfig.make)
 
 
-LEARNERS = Registry[type["LearnerConfig"]]("learner", _not_a_learner)
+LEARNERS = Registry[type["LearnerConfig"]](
+    "learner", _is_learner, "is no @dataclass derived from damian.LearnerConfig with a method make"
+)
 """Settings of learners, by name; the user's own as ``package.module:Name``."""
 
 

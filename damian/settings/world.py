@@ -1,14 +1,11 @@
 """Settings of the simulated world: UAVs, region, motion, signal source, batteries and actions."""
 
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from damian.common import checks
 from damian.settings.fields import Settings, check_place, constant, setting
 
-RESOLUTION = 0.01
-"""Places are told apart to this distance [m]."""
 RANDOM, GEOJSON, POLYNOMIAL = ("random",), ("geojson",), ("polynomial",)
 DYNAMIC, CHARGING = ("dynamic",), ("charging",)
 
@@ -57,10 +54,6 @@ class RegionConfig(Settings):
         super().__post_init__()
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.initial_conditions", self.initial_conditions, self.pool)
-        apart = self.lattice_step * math.sin(math.radians(self.lattice_angle))
-        self.refuse(
-            apart < RESOLUTION, "lattice_step", f"lays rows {apart:g} m apart: less than {RESOLUTION} m"
-        )
         for name in {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}.get(self.kind, []):
             self.refuse(not getattr(self, name), name, f"is missing: region.kind={self.kind} needs it")
         problem = "means nothing without a region of your own (region.kind=package.module:function)"

@@ -81,7 +81,7 @@ class ServerNode(StatefulTransform):
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
         outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, entries.get(keys.BELIEF))
         if self.own_key:
-            own = self.server.observe_with_timely_messages(
+            own = self.server.observe_with_own_messages(
                 received, entries[self.own_key], steps, belief=entries.get(keys.OWN_BELIEF)
             )
             outputs = outputs._replace(observation=own)

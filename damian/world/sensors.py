@@ -49,11 +49,7 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
     return lambda compute: Sensor(compute, width, compute.__name__)
 
 
-def _not_a_sensor(found: Any) -> str | None:
-    return None if isinstance(found, Sensor) else "is no sensor: decorate the function with damian.sensor"
-
-
-SENSORS = Registry[Sensor]("sensor", _not_a_sensor)
+SENSORS = Registry[Sensor]("sensor", Sensor, "is no sensor: decorate the function with damian.sensor")
 """Sensors, as ``package.module:name``."""
 
 

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -22,18 +22,7 @@ from damian.world.regions.region import Region
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
-from damian.world.vehicles import make_model
-
-
-class InitialConditions(NamedTuple):
-    """Q initial conditions, the same number for each region."""
-
-    region: Tensor
-    """Index of the region, [Q]."""
-    start: Tensor
-    """Landing point of each UAV within its region, [Q, N]."""
-    walk: Walk
-    """Walk of the source over at most K stops, [Q, K]."""
+from damian.world.vehicles import MOTION_MODELS
 
 
 class Simulation:
@@ -46,14 +35,13 @@ class Simulation:
         self.radius = footprint_radius(config.source)
         self.airspace = build_airspace(regions_of(config.region, rng), config.region, config.agents)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
-        drawn = _draw_initial_conditions(config, self.airspace, rng)
-        self.walk = drawn.walk
-        self.vehicles = make_model(config, self.airspace, dt)
+        region, start, self.walk = _draw_initial_conditions(config, self.airspace, rng)
+        self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         shortest = self._shortest_flights()
         self._require_moves(shortest)
         self.shortest_flight = shortest if config.battery.enabled else None
-        self.initial = self._initial_state(drawn, trail, seed)
+        self.initial = self._initial_state(region, start, trail, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
 
@@ -114,7 +102,7 @@ class Simulation:
         valid = distance <= reach
         if not self.candidates.can_hold:
             valid = valid | ~valid.any(-1, keepdim=True)
-        return self.vehicles.mask_busy(valid, reach >= 0, self.candidates.hold)
+        return valid if self.vehicles.instant else torch.where(reach >= 0, valid, self.candidates.hold)
 
     # The stages of one step, in order.
 
@@ -227,10 +215,10 @@ class Simulation:
             emits = draw < config.emission_probability
         return place, emits & ~over, over
 
-    def _initial_state(self, drawn: InitialConditions, trail: int, seed: int) -> State:
+    def _initial_state(self, region: Tensor, start: Tensor, trail: int, seed: int) -> State:
         """The state at time 0 of every initial condition, [Q, ...]; resets copy rows of it."""
-        n = len(drawn.region)
-        goal = drawn.start + drawn.region.unsqueeze(-1) * self.airspace.max_points
+        n = len(region)
+        goal = start + region.unsqueeze(-1) * self.airspace.max_points
         number = torch.arange(n)
         zeros = torch.zeros(goal.shape)
         place = gather_rows(self.points, goal)
@@ -238,7 +226,7 @@ class Simulation:
             seed=counter_rng.world_seeds(seed, n),
             episode=torch.zeros_like(number),
             initial_condition=number,
-            region=drawn.region,
+            region=region,
             steps=torch.zeros_like(number),
             origin=goal,
             goal=goal,
@@ -250,7 +238,7 @@ class Simulation:
             track=zeros,
             battery=zeros + 100,
             motions=torch.zeros_like(goal),
-            source=drawn.walk.stop[:, 0],
+            source=self.walk.stop[:, 0],
             source_over=torch.zeros_like(number, dtype=torch.bool),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
@@ -263,8 +251,12 @@ class Simulation:
 
 def _draw_initial_conditions(
     config: WorldConfig, airspace: Airspace, rng: np.random.Generator
-) -> InitialConditions:
-    """Draw the start points of the UAVs and the walks of the source, on the CPU."""
+) -> tuple[Tensor, Tensor, Walk]:
+    """Draw Q initial conditions, the same number for each region, on the CPU.
+
+    Returns the index of the region, [Q], the landing point of each UAV within it, [Q, N], and the walk of the
+    source over at most K stops, [Q, K].
+    """
     per_region = config.region.initial_conditions // len(airspace.regions)
     walks, starts = [], []
     for index, region in enumerate(airspace.regions):
@@ -274,7 +266,7 @@ def _draw_initial_conditions(
     padded = [_pad(walk, stops) for walk in walks]
     region = torch.arange(len(airspace.regions)).repeat_interleave(per_region)
     walk = tree_map(lambda *parts: torch.cat(parts), *padded)
-    return InitialConditions(region, torch.cat(starts), walk)
+    return region, torch.cat(starts), walk
 
 
 def _pad(walk: Walk, stops: int) -> Walk:

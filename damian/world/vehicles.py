@@ -1,7 +1,7 @@
 """Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
 
 from abc import ABC, abstractmethod
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -15,7 +15,6 @@ from damian.world.battery import charge_gain, cruise_range, flight_drain, used_s
 from damian.world.messages import Messages
 from damian.world.motion import flight_levels, fly, minimum_time
 from damian.world.regions.places import local_places
-from damian.world.regions.polygon import MAX_COORDINATE_M
 from damian.world.state import State
 
 FLIGHT_LEVEL_M = 30.48
@@ -63,10 +62,6 @@ class MotionModel(ABC):
         """Whether each UAV stands on its landing point, [B, N] bool."""
 
     @abstractmethod
-    def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
-        """Legal actions [B, N, A]: ``valid`` for UAVs that are ready [B, N, 1], ``hold`` [A] for others."""
-
-    @abstractmethod
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
         """Start flights of the UAVs that have just chosen to fly (``departs``) to ``goal``, [B, N].
 
@@ -97,7 +92,7 @@ class MotionModel(ABC):
     def battery_reach(self, state: State) -> Tensor:
         """Longest cruise that each battery allows [m], [B, N]; 0: it allows only holding."""
         if not self.battery.enabled:
-            return torch.full_like(state.battery, MAX_COORDINATE_M)
+            return torch.full_like(state.battery, checks.METRES)
         return cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
 
     def length(self, origin: Tensor, goal: Tensor) -> Tensor:
@@ -116,18 +111,12 @@ class MotionModel(ABC):
         return (level - drain + gain).clamp(0, 100)
 
 
-def _not_a_model(found: Any) -> str | None:
-    good = isinstance(found, type) and issubclass(found, MotionModel)
-    return None if good else "is no class derived from damian.world.vehicles.MotionModel"
-
-
-MOTION_MODELS = Registry[type[MotionModel]]("motion model", _not_a_model)
+MOTION_MODELS = Registry[type[MotionModel]](
+    "motion model",
+    lambda found: isinstance(found, type) and issubclass(found, MotionModel),
+    "is no class derived from damian.world.vehicles.MotionModel",
+)
 """Motion models by ``motion.kind``, or as ``package.module:Class``."""
-
-
-def make_model(config: WorldConfig, airspace: Airspace, dt: float) -> MotionModel:
-    """Build the motion model of the settings; the arguments are those of ``MotionModel``."""
-    return MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, airspace, dt)
 
 
 @MOTION_MODELS.register("instant")
@@ -141,9 +130,6 @@ class InstantMotion(MotionModel):
 
     def on_ground(self, state: State) -> Tensor:
         return torch.ones_like(state.message_sent)
-
-    def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
-        return valid
 
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
         return state._replace(origin=state.goal, goal=goal)
@@ -176,9 +162,6 @@ class PolynomialFlight(MotionModel):
 
     def on_ground(self, state: State) -> Tensor:
         return state.elapsed >= self.steps(state)
-
-    def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
-        return torch.where(ready, valid, hold)
 
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
         state = state._replace(origin=torch.where(ready, state.goal, state.origin), goal=goal)
@@ -224,12 +207,9 @@ class PolynomialFlight(MotionModel):
 
     def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
         """Least number of steps after which the latest flight, and a time [s] behind it, are over, [B, N]."""
-        seconds = self.duration(state).double() * (1 - _FLIGHT_ERROR) + sensing_time
+        flight = 2 * state.vertical + state.cruise
+        seconds = flight.double() * (1 - _FLIGHT_ERROR) + sensing_time
         return (seconds * ((1 - _ROUNDING) / self.dt)).ceil().long()
-
-    def duration(self, state: State) -> Tensor:
-        """Duration of the latest flight [s], [B, N]; 0 if the UAV held."""
-        return 2 * state.vertical + state.cruise
 
 
 def check_levels(levels: list[float], airspace: Airspace) -> None:

@@ -3,7 +3,6 @@
 The files are enough for all tables and figures, without the folders of the runs.
 """
 
-import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,16 +17,15 @@ from damian.common.tables import csv_table
 from damian.compare.comparison import OF_ARM, Arm, Row, regime
 from damian.compare.figures import LABELS
 from damian.runs.metrics_log import read_metrics
+from damian.runs.run_folder import RESULTS
 from damian.runs.run_record import read_record
 
 from ..cli import reason
-from .many_runs import Run
+from .many_runs import Run, read_rows
 
 ROWS, CURVES = "results.csv", "curves.csv"
 MARKDOWN, FIGURE = "table.md", "figure.png"
 """What follows from the rows, also of a sweep."""
-WORDS = ("task", "delay", "arm", "regime", "policy")
-"""Columns that are not numbers."""
 POINTS = 50
 """Largest number of points of a stored learning curve, evenly spaced over its updates."""
 
@@ -88,7 +86,7 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
             "frames": metrics[-1]["frames"] if metrics else 0,
             "seconds": read_record(run.folder).get("wall_time_s", math.nan),
         }
-        for row in run.results():
+        for row in read_rows(run.folder / RESULTS):
             learns = shares and row["policy"] in OF_ARM[:2]
             learnt = {"backupdated": fmean(shares) if learns else math.nan}
             without = {} if succeeds else {name: math.nan for name in row if name.endswith("success_rate")}
@@ -107,10 +105,8 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     write_atomically(path, csv_table([names, *([row[name] for name in names] for row in rows)]))
 
 
-def _read(path: Path) -> list[Row]:
+def _read(path: Path) -> Sequence[Row]:
     try:
-        with path.open(newline="") as file:
-            kinds = dict.fromkeys(WORDS, str) | {"seed": int}
-            return [{k: kinds.get(k, float)(x) for k, x in row.items()} for row in csv.DictReader(file)]
+        return read_rows(path)
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: it does not hold the results of a comparison ({reason(error)})") from error

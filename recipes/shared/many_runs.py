@@ -38,6 +38,8 @@ from damian.settings.fields import leaves
 from ..cli import Work
 from .runs import POLICY, perform, stored_config
 
+WORDS = ("task", "delay", "arm", "regime", "policy")
+"""Columns of results that are not numbers."""
 LOG = "log.txt"
 
 
@@ -77,21 +79,15 @@ class Run:
 
     def score(self, policy: str, measure: str) -> float:
         """A measure of one policy in the results of a finished run, or of its first one."""
-        rows = {row["policy"]: row for row in self.results()}
+        rows = {row["policy"]: row for row in read_rows(self.folder / RESULTS)}
         return rows.get(policy, next(iter(rows.values())))[measure]
 
-    def results(self) -> list[dict[str, Any]]:
-        """The results of a finished run, a row for each policy."""
-        return result_rows(self.folder)
 
-
-def result_rows(folder: Path) -> list[dict[str, Any]]:
-    """The results in the folder of a finished run, a row for each policy."""
-    with (folder / RESULTS).open(newline="") as lines:
-        return [
-            {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
-            for row in csv.DictReader(lines)
-        ]
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of results in a CSV file."""
+    kinds = dict.fromkeys(WORDS, str) | {"seed": int}
+    with path.open(newline="") as file:
+        return [{k: kinds.get(k, float)(x) for k, x in row.items()} for row in csv.DictReader(file)]
 
 
 def check_stored(run: Run) -> None:

@@ -8,7 +8,7 @@ from damian.learners.schedule import SystemClock
 from damian.runs.loggers import check_loggers
 from damian.server.features import check_features
 from damian.server.rewards import own_terms
-from damian.settings import DelayConfig, LearningSetup, PredictiveMappoConfig, TrainConfig
+from damian.settings import LearningSetup, PredictiveMappoConfig, TrainConfig
 from damian.world.sensors import sensors_of
 
 
@@ -18,15 +18,10 @@ def late(config: TrainConfig) -> list[str]:
     return [*["delay.obs"] * has_message_delay(config), *found]
 
 
-def longest_delay(config: TrainConfig) -> int:
-    """Longest delay of a message [steps]."""
-    return delay_sampler(config.delay, "obs", config.clock.dt).longest
-
-
 def longest_wait(config: TrainConfig) -> int:
     """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
-    late_reward = delay_sampler(config.delay, "rew", config.clock.dt).longest
-    return max(longest_delay(config), late_reward) if backupdates(config) else longest_delay(config)
+    message, reward = (delay_sampler(config.delay, kind, config.clock.dt).longest for kind in ("obs", "rew"))
+    return max(message, reward) if backupdates(config) else message
 
 
 def action_delay(config: TrainConfig) -> int | None:
@@ -77,23 +72,10 @@ def check_learning(config: TrainConfig) -> None:
     problem = "does not go with model.rnn: hidden states change at every step, not only at decisions"
     checks.require(not (config.model.recurrent and config.clock.skip), "clock.skip", True, problem)
     _check_backupdate(config)
-    _check_delay(config)
-
-
-def _check_delay(config: TrainConfig) -> None:
-    """Check that no setting of the delays is without any effect."""
-    delay, name = config.delay, config.learner.name
-    at_once, problem = longest_delay(config) == 0, "means nothing without delayed messages (delay.obs)"
-    checks.require(not (at_once and delay.hold == "max"), "delay.hold", "max", problem)
-    # Links other than the server's have a delay of their own, to which the order applies too.
-    useless = at_once and config.links.kind == "server" and delay.order == "arrival"
-    checks.require(not useless, "delay.order", "arrival", problem)
-    useless = delay.reward_window == 1 and delay.reward_discount != DelayConfig.reward_discount
-    problem = "means nothing with delay.reward_window=1, which sums no rewards; leave it out"
-    checks.require(not useless, "delay.reward_discount", delay.reward_discount, problem)
-    unread = delay.messages and ":" not in name and not isinstance(config.learner, PredictiveMappoConfig)
+    messages, name = config.delay.messages, config.learner.name
+    unread = messages and ":" not in name and not isinstance(config.learner, PredictiveMappoConfig)
     problem = f"is not read by learner={name}; choose learner=predictive_mappo, or leave it out"
-    checks.require(not unread, "delay.messages", delay.messages, problem)
+    checks.require(not unread, "delay.messages", messages, problem)
 
 
 def _check_backupdate(config: TrainConfig) -> None:

@@ -16,10 +16,10 @@ from damian.baselines.random import random_policy
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import ScenarioConfig
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
+from damian.settings import ScenarioConfig
 from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig

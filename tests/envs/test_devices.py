@@ -16,8 +16,8 @@ from damian.common import devices
 from damian.common.tensors import tree_map
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import Outputs
+from damian.settings import ScenarioConfig
 from damian.transforms.base import Entries, Memory, StatefulTransform
 from damian.world.state import PackedState
 

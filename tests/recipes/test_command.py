@@ -81,14 +81,14 @@ def test_what_only_a_program_can_tell_is_one_line_too_and_leaves_no_folder(
 
 def test_a_refused_run_removes_only_the_folders_that_it_has_made(capsys, tmp_path):
     (tmp_path / "mine").mkdir()
-    words = ("delay.hold=max", f"hydra.run.dir={tmp_path}/mine/new/run")
-    assert "delay.hold: max means nothing" in refusal(capsys, "train", *words)
+    words = ("settle=true", f"hydra.run.dir={tmp_path}/mine/new/run")
+    assert "settle: True means nothing" in refusal(capsys, "train", *words)
     assert list((tmp_path / "mine").iterdir()) == []
 
 
 def test_a_refused_job_of_a_sweep_leaves_no_folder(capsys, tmp_path):
-    words = ("-m", "delay.hold=max", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
-    assert "delay.hold: max means nothing" in refusal(capsys, "train", *words)
+    words = ("-m", "settle=true", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
+    assert "settle: True means nothing" in refusal(capsys, "train", *words)
     assert [path.name for path in tmp_path.iterdir()] == ["multirun.yaml"]
 
 

@@ -9,9 +9,9 @@ import torch
 
 from damian import keys
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import ScenarioConfig
 from damian.recipes import oracle
 from damian.server.features import ObservationConfig
+from damian.settings import ScenarioConfig
 from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 

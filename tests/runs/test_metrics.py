@@ -20,7 +20,6 @@ from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import ScenarioConfig
 from damian.runs.metrics import EpisodeLog, Evaluation, evaluation
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import save_results
@@ -29,6 +28,7 @@ from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig
+from damian.settings import ScenarioConfig
 from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig
 
@@ -87,11 +87,11 @@ def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[
         row["perceived_return"] += next_step["agents", "reward"].mean().item()
         row["success"] |= next_step["success"].item()
         truth, steps = Messages.unpack(next_step["agents", "message"][None]), torch.tensor([t])
-        undelayed = server.reward_and_status(
+        undelayed, _, _ = server.reward_and_status(
             server.features(truth, steps), truth, steps, torch.zeros(1, dtype=torch.bool)
         )
         if not truly_over:
-            row["return"] += undelayed.reward.mean().item()
+            row["return"] += undelayed.mean().item()
         if truth.spotted.sum() >= needed and not truly_over:
             row["true_success"] = truly_over = True
             row["steps"] = t

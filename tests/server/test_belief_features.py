@@ -8,10 +8,11 @@ from belief_twin import chance_at
 from helpers import everything, square, walking
 
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import ScenarioConfig, make_simulation
+from damian.envs.uav_env import make_simulation
 from damian.server.belief import predict
 from damian.server.features import RINGS, SECTORS, ObservationConfig, feature
 from damian.server.server import Server
+from damian.settings import ScenarioConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
 

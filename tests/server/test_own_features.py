@@ -6,7 +6,7 @@ from helpers import SQUARE, everything
 from torch import Tensor
 
 from damian.common.tensors import tree_map
-from damian.envs.scenario import make_simulation
+from damian.envs.uav_env import make_simulation
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages

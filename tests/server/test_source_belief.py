@@ -10,7 +10,7 @@ from belief_twin import belief, chance_at, detection_table
 from helpers import everything, square, walking
 from torch import Tensor
 
-from damian.envs.scenario import make_simulation
+from damian.envs.uav_env import make_simulation
 from damian.server.belief import (
     SourceGrid,
     _advance,

@@ -72,5 +72,5 @@ def test_a_limit_since_the_latest_detection_is_reached_after_exactly_that_many_s
     assert messages.spotted.all()
     over = torch.zeros_like(steps, dtype=torch.bool)
     features = env.server.features(messages, steps)
-    ended = env.server.reward_and_status(features, messages, steps, over).status
+    ended = env.server.reward_and_status(features, messages, steps, over)[2]
     assert ended.truncated.tolist() == (torch.arange(-1, limit + 2) >= limit).tolist()

@@ -18,9 +18,9 @@ from helpers import (
     usecase,
 )
 
-from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.termination import EpisodeConfig
+from damian.settings import ScenarioConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.regions.config import RegionConfig

@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Callable
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 
@@ -19,11 +18,9 @@ RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]
 """From the settings and a random generator to the regions; each episode flies over one of them."""
 
 
-def _not_a_source(found: Any) -> str | None:
-    return None if inspect.isfunction(found) else "is no function (config, rng) -> list[Region]"
-
-
-REGION_SOURCES = Registry[RegionSource]("region source", _not_a_source)
+REGION_SOURCES = Registry[RegionSource](
+    "region source", inspect.isfunction, "is no function (config, rng) -> list[Region]"
+)
 """Region sources by ``region.kind``, or as ``package.module:function``."""
 
 

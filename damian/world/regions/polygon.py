@@ -18,8 +18,6 @@ from damian.common.errors import InputError
 
 Floats = NDArray[np.float64]
 
-MAX_COORDINATE_M = checks.METRES
-"""No local coordinate is larger [m]."""
 RESOLUTION = 0.01
 """Distances of landing points that differ by less are not told apart [m]."""
 MAX_CANDIDATES = 5_000_000
