@@ -23,7 +23,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
 from damian.settings import TrainConfig
-from damian.settings.programs import FILMS, FieldRules, FlyConfig
+from damian.settings.programs import FILMS, AdviseConfig, FieldRules, FlyConfig
 from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
 from damian.show.film import save_film
@@ -56,8 +56,6 @@ def fly(config: FlyConfig) -> list[Episode]:
 def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
     """The settings by which the fleet of the journal was advised, unless others are given now."""
     from damian.advice.journal import read_head  # noqa: PLC0415 (needs pydantic, which only advice does)
-
-    from .advise import AdviseConfig  # noqa: PLC0415
 
     told = read_head(Path(str(config.journal))).about.overrides
     of_advice = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
@@ -95,7 +93,7 @@ def episode_of_journal(config: FlyConfig) -> Episode:
 
 
 def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:
-    """The episodes to keep, by the names of their files; ``which`` is one of ``KEPT``."""
+    """The episodes to keep, by the names of their files; ``which`` is ``all`` or ``extremes``."""
     if which == "all":
         return {f"episode_{number}": episode for number, episode in enumerate(episodes)}
     order = np.argsort([episode.perceived_return for episode in episodes], kind="stable")
