@@ -135,7 +135,7 @@ def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(comp
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "others.yaml").write_text(LEARNING_FROM_OTHERS)
     shutil.copy(ROOT / "examples" / "extending" / "distillation.py", tmp_path)
-    small = listed(*(word for word in SMALL if "learner" not in word))
+    small = listed(*(word for word in SMALL if "learner" not in word), "episode.max_steps=8")
     words = ["--config-dir", "conf", "experiment=others", "seeds=1", "experiment.first_seed=3", small]
     compare(*words)
     folder = tmp_path / "runs" / "others"
