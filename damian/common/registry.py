@@ -19,10 +19,10 @@ Component = TypeVar("Component")
 class Registry(Generic[T]):
     """Components of one kind.
 
-    With ``LAWS = Registry[type[Law]]("law")``, ``@LAWS.register("uniform")`` adds a class and
-    ``LAWS.get("uniform", key)`` returns it. ``LAWS.get("my_lab.delays:Satellite", key)`` imports a class that
-    is not registered, also from the current folder, so that your own file needs no installation. An installed
-    package that declares its module as an entry point ``damian.plugins`` registers names in the same way.
+    ``@LAWS.register("uniform")`` adds a class to the registry ``LAWS``, and ``LAWS.get("uniform", key)``
+    returns it. ``LAWS.get("my_lab.delays:Satellite", key)`` imports a class that is not registered, also from
+    the current folder, so that your own file needs no installation. An installed package that declares its
+    module as an entry point ``damian.plugins`` registers names in the same way.
 
     Args:
         kind: what a component is called in errors, such as ``law``.
@@ -30,9 +30,7 @@ class Registry(Generic[T]):
         problem: what is wrong with an object that does not fit, as in ``is no law``.
     """
 
-    def __init__(
-        self, kind: str, fits: type | Callable[[Any], bool] = object, problem: str = "does not fit"
-    ) -> None:
+    def __init__(self, kind: str, fits: type | Callable[[Any], bool], problem: str) -> None:
         self.kind, self._fits, self._problem = kind, fits, problem
         self._components: dict[str, T] = {}
         self._imported: dict[str, T] = {}  # a compiled step looks a component up, but cannot import it

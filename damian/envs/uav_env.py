@@ -332,5 +332,5 @@ def _levels(entries: dict[NestedKey, Any]) -> dict[tuple[str, ...], dict[str, An
 
 
 def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:
-    """Build the physics of a scenario; ``seed`` is that of regions, start positions and walks."""
+    """Build the simulation of a scenario; regions, start positions and source walks are drawn by ``seed``."""
     return Simulation(scenario, scenario.clock.dt, scenario.observation.window, seed)

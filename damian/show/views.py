@@ -183,7 +183,7 @@ def height_of_rows(n_agents: int) -> float:
 
 
 def _draw_shares(axis: Axes, episode: Episode, colours: list[str]) -> None:
-    """Draw time spans as cells: their opacity is the share of late messages, a bar that of lost ones."""
+    """Draw the share of late messages (opacity of a cell) and of lost ones (a bar) in each time span."""
     spans, end = np.arange(episode.n_steps + 1) * _BINS // (episode.n_steps + 1), float(episode.time[-1])
     places, picture = (np.arange(_BINS) + 0.5) * end / _BINS, np.zeros((len(colours), _BINS, 4))
     for uav, colour in enumerate(colours):
