@@ -1,10 +1,10 @@
 """Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed late.
 
-    python examples/studies/control.py --jobs 2                   (Pendulum-v1; half an hour, two free cores)
-    python examples/studies/control.py --arms history bpql        (these arms only)
+    python examples/studies/control.py --jobs 2                  (Pendulum-v1; half an hour, two free cores)
+    python examples/studies/control.py --arms history bpql       (these arms only)
     python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 --hidden 256 \\
-        --lr 3e-4 --episodes 10 --out runs/cheetah                (pip install "gymnasium[mujoco]"; 50 minutes)
-    ... --shortest 1 --out runs/cheetah_random                    (delays are drawn from 1 to 9 steps)
+        --lr 3e-4 --episodes 10 --out runs/cheetah               (pip install "gymnasium[mujoco]"; 50 minutes)
+    ... --shortest 1 --out runs/cheetah_random                   (delays are drawn from 1 to 9 steps)
 
 Four arms are trained for each seed: undelayed; naive, whose observations are late; history, which also
 observes the agent's latest actions, and the age of the observation if that varies; and bpql, whose actor is
