@@ -44,17 +44,18 @@ POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
     """Every run with its checked settings: seed after seed, and last what flies others' policies."""
     tasks, delays = config.chosen("tasks"), {NOT_LATE: [], **config.chosen("delays")}
-    places = {task: (task, overrides) for task, overrides in tasks.items()}
+    places: dict[str, tuple[str, list[str]]] = {task: (task, []) for task in tasks}
     for name, held_out in config.experiment.held_out.items():
         for task in tasks if held_out.tasks is None else [t for t in tasks if t in held_out.tasks]:
-            places[f"{task}{HELD_OUT_MARK}{name}"] = (task, [*tasks[task], *held_out.overrides])
+            places[f"{task}{HELD_OUT_MARK}{name}"] = (task, held_out.overrides)
     runs = [
         run
-        for place, (task, task_overrides) in places.items()
+        for place, (task, changes) in places.items()
         for delay, delay_overrides in delays.items()
         for name, arm in config.chosen("arms").items()
         if arm.delayed == (delay != NOT_LATE) and (arm.tasks is None or task in arm.tasks)
-        for run in _seeds(config, folder / place / delay / name, task, [*task_overrides, *delay_overrides])
+        for overrides in [[*tasks[task], *delay_overrides, *changes]]
+        for run in _seeds(config, folder / place / delay / name, task, overrides)
     ]
     by_folder = {run.folder: run.config for run in runs}
     for run in runs:

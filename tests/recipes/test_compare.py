@@ -21,7 +21,7 @@ from damian.recipes.shared.runs import POLICY
 from damian.runs.checkpoint import digest
 from damian.runs.run_lock import locked
 from damian.runs.run_record import read_record
-from damian.settings.programs import CompareConfig, Experiment
+from damian.settings.programs import CompareConfig, Experiment, HeldOut
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -295,3 +295,15 @@ def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
         f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
     ]
     assert [run.name for run in runs] == [*trained, "b/late/flown/seed_3", "b/late/flown/seed_4"]
+
+
+def test_a_held_out_delay_replaces_the_one_of_the_training():
+    arms = {"best": Arm(delayed=False), "naive": Arm(naive=True)}
+    delays = {"constant": ["delay.obs=2"], "paper": ["delay=paper"]}
+    held_out = {"six": HeldOut(["delay.obs=6"])}
+    experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms, held_out)
+    with initialize_config_dir(str(CONF), version_base=None):
+        runs = plan(CompareConfig(experiment, seeds=1), Path("runs"))
+    delay = {(run.task, run.delay): run.config.delay.obs for run in runs if run.arm == "naive"}
+    assert delay["a", "constant"] == 2
+    assert delay["a@six", "constant"] == delay["a@six", "paper"] == 6
