@@ -1,8 +1,8 @@
 """PPO of TorchRL on a Gymnasium environment whose observations and actions are late: one file, to be copied.
 
-python examples/ppo_gymnasium.py                   two minutes: CartPole, observations 1 to 3 steps late
-python examples/ppo_gymnasium.py --no-history      the same without past actions in the observation
-python examples/ppo_gymnasium.py --delay 0         the same without delay
+python examples/ppo_gymnasium.py                 two minutes: CartPole, 1 to 3 steps late; returns 325 to 396
+python examples/ppo_gymnasium.py --no-history    without past actions in the observation: 224 to 261
+python examples/ppo_gymnasium.py --delay 0       without delay: 352 to 444 (last ten batches, seeds 0 to 2)
 """
 
 import argparse
