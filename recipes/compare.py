@@ -110,8 +110,9 @@ _composed = cache(cli.settings)  # several arms differ only in whose policy they
 
 def includes(config: CompareConfig, row: Row) -> bool:
     """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
-    task, delays = row["task"].partition(HELD_OUT_MARK)[0], [NOT_LATE, *config.chosen("delays")]
-    chosen = task in config.chosen("tasks") and row["arm"] in config.chosen("arms")
+    (task, _, held_out), delays = row["task"].partition(HELD_OUT_MARK), [NOT_LATE, *config.chosen("delays")]
+    chosen = task in config.chosen("tasks") and held_out in ("", *config.experiment.held_out)
+    chosen = chosen and row["arm"] in config.chosen("arms")
     seeds = range(config.experiment.first_seed, sys.maxsize) if config.seeds is None else config.every_seed
     return chosen and row["delay"] in delays and row["seed"] in seeds
 

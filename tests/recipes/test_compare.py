@@ -13,7 +13,7 @@ from helpers import check_refused
 from hydra import initialize_config_dir
 
 from damian.compare.comparison import TRAINED, Arm
-from damian.recipes.compare import plan
+from damian.recipes.compare import includes, plan
 from damian.recipes.compare import run as main
 from damian.recipes.known import CONF
 from damian.recipes.shared.comparison_results import write_csv
@@ -302,8 +302,12 @@ def test_a_held_out_delay_replaces_the_one_of_the_training():
     delays = {"constant": ["delay.obs=2"], "paper": ["delay=paper"]}
     held_out = {"six": HeldOut(["delay.obs=6"])}
     experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms, held_out)
+    config = CompareConfig(experiment, seeds=1)
     with initialize_config_dir(str(CONF), version_base=None):
-        runs = plan(CompareConfig(experiment, seeds=1), Path("runs"))
+        runs = plan(config, Path("runs"))
     delay = {(run.task, run.delay): run.config.delay.obs for run in runs if run.arm == "naive"}
     assert delay["a", "constant"] == 2
     assert delay["a@six", "constant"] == delay["a@six", "paper"] == 6
+    stored = {"task": "a@six", "delay": "paper", "arm": "naive", "seed": 0}
+    assert includes(config, stored)
+    assert not includes(config, {**stored, "task": "a@seven"})  # of an experiment that had another one
