@@ -65,6 +65,7 @@ class Greedy:
         scenario, simulation = worlds.scenario, worlds.simulation
         source = scenario.source
         self.unpack, self.region_of = worlds.server.messages, worlds.server.region_of
+        self.counted = worlds.server.counted
         self.grid = worlds.server.grid
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
@@ -112,7 +113,8 @@ class Greedy:
         """1 for landing points [B, L, 2] nearest to the UAV and outside its latest footprints, [B, N, L]."""
         distance = distances(held.target, ground)
         own = distance <= distance.amin(1, keepdim=True)
-        from_trail = distances(gather_rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
+        landed = gather_rows(self.points.flatten(0, 1), self.counted(held))
+        from_trail = distances(landed, ground.unsqueeze(1))
         return (own & (from_trail > self.radius).all(-2)).float()
 
     def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
@@ -252,7 +254,7 @@ class Coverer(Greedy):
     ) -> tuple[Tensor, Tensor]:
         """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others."""
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        latest = alone.trail[:, 0, :-1] % self.points.shape[1]  # the next landing replaces the oldest one
+        latest = self.counted(alone)[:, 0, :-1] % self.points.shape[1]  # the next landing replaces the oldest one
         covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
         return self.choose_landing(alone, (1 - covered) @ near, self.region_of(known), mask)
 

@@ -205,7 +205,7 @@ class UavEnv(EnvBase):
         if self.messages_only:
             return self.simulation.layout.pack(state), self._state_outputs(state)
         remembers = self.server.remembers_coverage
-        known = KnownCoverage(before.sent.trail, before.coverage) if remembers else None
+        known = KnownCoverage(self.server.counted(before.sent), before.coverage) if remembers else None
         features = self.server.features(state.sent, state.steps, coverage=known)
         if remembers:
             state = state._replace(coverage=features["coverage"])
@@ -333,4 +333,4 @@ def _levels(entries: dict[NestedKey, Any]) -> dict[tuple[str, ...], dict[str, An
 
 def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:
     """Build the simulation of a scenario; regions, start positions and source walks are drawn by ``seed``."""
-    return Simulation(scenario, scenario.clock.dt, scenario.observation.window, seed)
+    return Simulation(scenario, scenario.clock.dt, scenario.observation.stops, seed)

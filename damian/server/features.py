@@ -49,6 +49,12 @@ class ServerContext(NamedTuple):
     """Landing points by flat id, [R*L, 2] metres."""
     age_scale: float
     """Ages are divided by this [s]."""
+    window: int = 1
+    """Number of latest landing points that coverage counts."""
+    slots: int = 0
+    """Number of steps of the feature ``timeline``."""
+    dt: float = 1.0
+    """Length of a step [s]."""
     newest: bool = False
     """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
     readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
@@ -104,6 +110,11 @@ class FeatureCache:
         return values.squeeze(-1) if width == 1 else values
 
     @property
+    def trail(self) -> Tensor:
+        """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
+        return self.messages.trail[..., : self.context.window]
+
+    @property
     def region(self) -> Tensor:
         """Index of the region, [*]."""
         return self.messages.region(self.context.n_points)
@@ -140,7 +151,7 @@ class Feature(NamedTuple):
     compute: Callable[[FeatureCache], Tensor]
     """From messages [*, N] to values [*, N] or, if it has several for each UAV, [*, N, width]."""
     scope: str
-    """``local``, ``global`` or ``belief``, as in ``feature``, or ``actor``: never for the critic."""
+    """``local``, ``global`` or ``belief``, as in ``feature``; ``timeline``, or ``actor``: not the critic's."""
     width: int | None = 1
     """Number of values for each UAV; None if it depends on the settings."""
     low: float = 0.0
@@ -172,7 +183,7 @@ def feature(
         ... def track(cache):  # in lab.py, used as observation.local_features=[spotted,lab:track]
         ...     return cache.messages.track / (2 * math.pi)
     """
-    checks.one_of("scope of a feature", scope, ("local", "global", "belief", "actor"))
+    checks.one_of("scope of a feature", scope, ("local", "global", "belief", "timeline", "actor"))
     return lambda compute: Feature(compute, scope, width, low, high)
 
 
@@ -322,7 +333,7 @@ def _agent_distances(v: FeatureCache) -> Tensor:
 def _coverage(v: FeatureCache) -> Tensor:
     """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
     assert v.context.footprints is not None
-    trail, points, known = v.messages.trail, v.context.points, v.context.coverage
+    trail, points, known = v.trail, v.context.points, v.context.coverage
     if v.own_only:
         return own_covered_share(v.context.footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
     if known is not None and devices.data_dependent(trail.device):

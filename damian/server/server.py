@@ -84,6 +84,9 @@ class Server:
             "footprints": footprints,
             "points": airspace.points.flatten(0, 1),
             "age_scale": observation.age_scale,
+            "window": observation.window,
+            "slots": observation.timeline,
+            "dt": simulation.dt,
             "newest": observation.estimate == "newest",
             "readings": {name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
             "radius": simulation.radius,
@@ -115,6 +118,10 @@ class Server:
         """Messages from their packed rows [*, N, M], with the readings of all sensors."""
         return Messages.unpack(rows, self._n_readings)
 
+    def counted(self, messages: Messages) -> Tensor:
+        """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
+        return messages.trail[..., : self.observation.window]
+
     def action_columns(self, features: Features) -> slice | None:
         """The columns of the actors' observations that hold ``belief_gain``; None if there are none."""
         names = self.observation.actor
@@ -139,7 +146,7 @@ class Server:
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         features = self.features(messages, steps, coverage=coverage, belief=belief)
         result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
-        known = KnownCoverage(messages.trail, features["coverage"]) if self.remembers_coverage else None
+        known = KnownCoverage(self.counted(messages), features["coverage"]) if self.remembers_coverage else None
         return ServerOutputs(*self.observations(features), *result, known)
 
     def features(

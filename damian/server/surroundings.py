@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from damian.common.tensors import distances, gather_rows
-from damian.server.features import FEATURES, FeatureCache, feature, of_others
+from damian.server.features import FEATURES, FeatureCache, feature
 from damian.world.airspace import Airspace
 
 RINGS = (0.6, 1.25, 2.5)
@@ -79,13 +79,55 @@ def _others(v: FeatureCache) -> Tensor:
     Of each: the way to its place and to its target, east and north, over half the largest vertex distance of
     the region, and 1.
     """
-    messages, own = v.messages, v.wanted(v.messages.target).unsqueeze(-2)
-    ways = torch.cat([messages.position.unsqueeze(-3) - own, messages.target.unsqueeze(-3) - own], -1)
-    ways = F.pad(ways / (v.context.scale / 2)[..., None, None, None], (0, 1), value=1.0)  # [*, N, N, 5]
-    ways = of_others(v, ways)
-    nearest = ways[..., 2:4].square().sum(-1).argsort(dim=-1, stable=True)[..., :OTHERS]
-    ways = ways.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, 5))
-    return F.pad(ways.clamp(-1, 1), (0, 0, 0, OTHERS - nearest.shape[-1])).flatten(-2)
+    messages = v.messages
+    places = torch.stack([messages.position, messages.target], -2)
+    ways = _ways_to_nearest(v, places, torch.ones_like(places[..., :1]))
+    return _four(torch.cat([ways[..., 0, :2], ways[..., 1, :]], -1))
+
+
+@FEATURES.register("timeline")
+@feature("timeline", width=None, low=-1.0)
+def _timeline(v: FeatureCache) -> Tensor:
+    """What is known of the four nearest other UAVs by when it was true, [*, N, 4 (3 ``slots`` + 3)].
+
+    Of each, slot k tells where it landed, or held, k steps ago: the way to that place, east and north, over
+    half the largest vertex distance of the region, and 1. It is zeros if no message that has arrived tells of
+    that step. Behind the slots stands the same of the destination of a UAV in flight. Ways begin where the
+    observer is bound for.
+    """
+    messages, context = v.messages, v.context
+    since = (context.now[..., None, None] - messages.landed) / context.dt
+    since = torch.where(messages.landed < 0, -1, since.round().long())  # [*, N, S]
+    slot = torch.arange(context.slots, device=since.device)
+    fills = (since.unsqueeze(-2) == slot.unsqueeze(-1)).float()  # [*, N, slots, S], at most one stop each
+    places = fills @ gather_rows(context.points, messages.trail)
+    places = torch.cat([places, messages.target.unsqueeze(-2)], -2)
+    known = torch.cat([fills.sum(-1), messages.in_flight.float().unsqueeze(-1)], -1)
+    return _four(_ways_to_nearest(v, places, known.unsqueeze(-1)).flatten(-2))
+
+
+def _ways_to_nearest(v: FeatureCache, places: Tensor, known: Tensor) -> Tensor:
+    """Ways to places [*, N, P, 2] of the nearest other UAVs, the nearest first, and 1, [*, N, 4, P, 3].
+
+    Zeros where a place is not ``known`` [*, N, P, 1]. Nearest are those whose targets are the nearest.
+    """
+    half, own = v.context.scale / 2, v.wanted(v.messages.target).unsqueeze(-2)
+    itself = torch.eye(places.shape[-3], dtype=torch.bool, device=places.device)
+    itself = itself.unsqueeze(-2) if v.own_only else itself
+    ways = (v.messages.target.unsqueeze(-3) - own) / half[..., None, None, None]
+    distance = ways.square().sum(-1).masked_fill(itself, torch.inf)  # [*, N, N]
+    nearest = distance.argsort(dim=-1, stable=True)[..., : min(OTHERS, len(itself) - 1)]
+    table = torch.cat([places, known], -1).flatten(-2).unsqueeze(-3)
+    index = nearest.unsqueeze(-1).expand(*nearest.shape, table.shape[-1])
+    found = table.expand(*distance.shape, -1).gather(-2, index).unflatten(-1, (-1, 3))
+    places, known = found.split([2, 1], -1)
+    ways = ((places - own.unsqueeze(-2)) / half[..., None, None, None, None]).clamp(-1, 1)
+    return torch.cat([ways * known, known], -1)
+
+
+def _four(described: Tensor) -> Tensor:
+    """Descriptions of at most four UAVs [*, N, 4, F], with zeros for those that do not exist, [*, N, 4 F]."""
+    return F.pad(described, (0, 0, 0, OTHERS - described.shape[-2])).flatten(-2)
 
 
 @FEATURES.register("coverage_map")
@@ -96,7 +138,7 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     It is the distance of a place from the nearest of all UAVs' latest landing points, over the diameter of a
     footprint; older landing points of ``observation.window`` count as further away.
     """
-    context, trail = v.context, v.messages.trail
+    context, trail = v.context, v.trail
     assert context.places_inside is not None
     standing = v.wanted(trail[..., 0])
     offsets = ring_places(context.radius, standing.device)

@@ -84,6 +84,12 @@ class ObservationConfig(Settings):
         None, "Edge of a cell of the belief; 0.8 footprint radii or more if not given [m].", above=0
     )
     window: int = setting(2, "Latest landing points of a UAV that its coverage counts.", low=1, high=16)
+    timeline: int = setting(
+        0,
+        "Latest steps of which actor and critic observe where other UAVs stood then, as far as known; 0: none.",
+        low=0,
+        high=100,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,7 +101,7 @@ class ObservationConfig(Settings):
     @property
     def actor(self) -> list[str]:
         """Features of the actor's observation, in order."""
-        features = [*self.local_features, *self.belief] if self.ctde else self.critic
+        features = [*self.local_features, *self.belief, *self.timed] if self.ctde else self.critic
         return [*features, "age"] if self.age else features
 
     @property
@@ -104,7 +110,17 @@ class ObservationConfig(Settings):
 
         It has no age: after back-updating, that would tell how far a step is from the end of its batch.
         """
-        return [*self.global_features, *self.local_features, *self.belief]
+        return [*self.global_features, *self.local_features, *self.belief, *self.timed]
+
+    @property
+    def timed(self) -> list[str]:
+        """The feature of other UAVs by time, if it is observed."""
+        return ["timeline"] * (self.timeline > 0)
+
+    @property
+    def stops(self) -> int:
+        """Number of latest stops of a UAV that its messages carry."""
+        return max(self.window, self.timeline)
 
 
 @dataclass

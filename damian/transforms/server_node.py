@@ -66,7 +66,7 @@ class ServerNode(StatefulTransform):
         memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
         if not self.server.remembers_coverage:
             return memory
-        trail = self.server.messages(rows).trail
+        trail = self.server.counted(self.server.messages(rows))
         return memory | {"trail": trail, "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:

@@ -45,16 +45,18 @@ class Messages(NamedTuple):
     detected_position: Annotated[Tensor, Column(2)]
     """Position of the UAV at its latest detection, east, north [m]."""
     trail: Annotated[Tensor, Column(None, torch.long)]
-    """Flat ids of the UAV's last landing points, newest first, [*, N, window]."""
+    """Flat ids of the landing points of the UAV's latest stops, newest first, [*, N, S]; holding is a stop."""
+    landed: Annotated[Tensor, Column(None)]
+    """Time at which each of these stops began [s], [*, N, S]; -1 before the episode."""
     readings: Annotated[Tensor, Column(None)]
     """Readings of the user's sensors, beside each other in the order of the settings, [*, N, K]."""
 
     @classmethod
     def blank(cls, trail: Tensor, n_readings: int = 0) -> "Messages":
-        """Messages of zeros, without a detection, with the landing points ``trail`` [*, N, window]."""
-        width = _FIXED + trail.shape[-1] + n_readings
+        """Messages of zeros, without a detection, of UAVs whose stops ``trail`` [*, N, S] came before."""
+        width = _FIXED + 2 * trail.shape[-1] + n_readings
         blank = cls.unpack(torch.zeros(*trail.shape[:-1], width), n_readings)
-        return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
+        return blank._replace(detected_time=blank.detected_time - 1, trail=trail, landed=blank.landed - 1)
 
     def pack(self) -> Tensor:
         """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through exactly."""
@@ -68,8 +70,8 @@ class Messages(NamedTuple):
 
         ``Server.messages``, which knows how many there are, is the way to unpack messages of an environment.
         """
-        window = rows.shape[-1] - _FIXED - n_readings
-        parts = rows.split([*(column.width for column in _COLUMNS[:-2]), window, n_readings], -1)
+        stops = (rows.shape[-1] - _FIXED - n_readings) // 2
+        parts = rows.split([*(column.width for column in _COLUMNS[:-3]), stops, stops, n_readings], -1)
         return cls._make(_read(part, column) for part, column in zip(parts, _COLUMNS, strict=True))
 
     @property
@@ -90,7 +92,7 @@ _COLUMNS: list[Column] = [
     hint.__metadata__[0] for hint in get_type_hints(Messages, include_extras=True).values()
 ]
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
-"""Number of columns of all fields but the last two, the trail and the readings."""
+"""Number of columns of all fields but the last three, those of the stops and the readings."""
 
 
 def _read(part: Tensor, column: Column) -> Tensor:

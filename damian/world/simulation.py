@@ -28,7 +28,7 @@ from damian.world.vehicles import MOTION_MODELS
 class Simulation:
     """The worlds' constants, regions and walks, drawn on the CPU, and functions of their state."""
 
-    def __init__(self, config: WorldConfig, dt: float, trail: int, seed: int) -> None:
+    def __init__(self, config: WorldConfig, dt: float, stops: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.config, self.dt = config, dt
         self.sensors = sensors_of(config.sensors)
@@ -41,7 +41,7 @@ class Simulation:
         shortest = self._shortest_flights()
         self._require_moves(shortest)
         self.shortest_flight = shortest if config.battery.enabled else None
-        self.initial = self._initial_state(region, start, trail, seed)
+        self.initial = self._initial_state(region, start, stops, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
 
@@ -134,6 +134,7 @@ class Simulation:
         squared_distance = (position - place.unsqueeze(-2)).square().sum(-1)
         spotted = on_ground & emits.unsqueeze(-1) & (squared_distance <= self.radius**2)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
+        trail, landed = self._stops(state, times, on_ground, action_valid)
         messages = Messages(
             time=times,
             position=position,
@@ -145,18 +146,25 @@ class Simulation:
             motions=state.motions,
             detected_time=torch.where(spotted, times, state.sent.detected_time),
             detected_position=torch.where(spotted.unsqueeze(-1), position, state.sent.detected_position),
-            trail=self._trail(state, on_ground, action_valid),
+            trail=trail,
+            landed=landed,
             readings=self._readings(state),
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
 
-    def _trail(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor:
-        """The latest landing points of each UAV, newest first."""
-        before = state.sent.trail
-        longer = torch.cat([state.goal.unsqueeze(-1), before[..., :-1]], -1)
+    def _stops(
+        self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Landing points and times [s] of each UAV's latest stops, newest first, [B, N, S] each."""
+        before = state.sent.trail, state.sent.landed
         added = self.vehicles.new_stop(state, on_ground, action_valid)
-        return longer if added is None else torch.where(added.unsqueeze(-1), longer, before)
+        newest = zip((state.goal, now), before, strict=True)
+        trail, landed = (torch.cat([new.unsqueeze(-1), old[..., :-1]], -1) for new, old in newest)
+        if added is None:
+            return trail, landed
+        added = added.unsqueeze(-1)
+        return torch.where(added, trail, before[0]), torch.where(added, landed, before[1])
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:
         """Whether each UAV's observed battery level is 0, or allows nothing but holding, [B, N]."""
@@ -215,7 +223,7 @@ class Simulation:
             emits = draw < config.emission_probability
         return place, emits & ~over, over
 
-    def _initial_state(self, region: Tensor, start: Tensor, trail: int, seed: int) -> State:
+    def _initial_state(self, region: Tensor, start: Tensor, stops: int, seed: int) -> State:
         """The state at time 0 of every initial condition, [Q, ...]; resets copy rows of it."""
         n = len(region)
         goal = start + region.unsqueeze(-1) * self.airspace.max_points
@@ -243,7 +251,7 @@ class Simulation:
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
             sent=Messages.blank(
-                goal.unsqueeze(-1).repeat(1, 1, trail), sum(sensor.width for sensor in self.sensors.values())
+                goal.unsqueeze(-1).repeat(1, 1, stops), sum(sensor.width for sensor in self.sensors.values())
             ),
         )
         return self._sense(state)

@@ -36,7 +36,7 @@ def heard(v: FeatureCache) -> Tensor:
     distance of the region; whether it spots the source; and the age of the message, over ten seconds.
     """
     messages, own = v.messages, v.wanted(v.messages.target)
-    landed = gather_rows(v.context.points, messages.trail)  # [*, N, window, 2]
+    landed = gather_rows(v.context.points, v.trail)  # [*, N, window, 2]
     places = torch.cat([messages.target.unsqueeze(-2), landed], -2)
     ways = places.unsqueeze(-4) - own[..., :, None, None, :]
     ways = (ways / (v.context.scale / 2)[..., None, None, None, None]).flatten(-2)  # [*, N, N, 2 + 2 window]
