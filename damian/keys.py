@@ -39,8 +39,8 @@ RECEIVED = (AGENTS, "received")
 """The message of each UAV that the server holds, packed (``Messages.pack``), [B, N, M]."""
 LINKED = (AGENTS, "linked")
 """Messages that each UAV holds of each other with ``links=matrix``, [B, N, N, M] (receiver, sender)."""
-HISTORY = (AGENTS, "history")
-"""Messages of the latest steps that each UAV knows, with ages (``MessageHistory``), [B, N, L, C]."""
+TIMELINE = (AGENTS, "timeline")
+"""Messages of the latest steps that each UAV knows (``ObservationTimeline``), [B, N, N, K, C]."""
 AGE = (AGENTS, "age")
 """Age of information: steps since the message that the server holds was generated, [B, N, 1]."""
 DELAY = (AGENTS, "delay")

@@ -19,8 +19,8 @@ from damian import (
     ActionHistory,
     BackupdateStorage,
     LearningSetup,
-    MessageHistory,
     ObservationDelay,
+    ObservationTimeline,
     Uniform,
     keys,
     set_seed,
@@ -57,7 +57,7 @@ def late_navigation(n_worlds: int) -> TransformedEnv:
     late: list[Transform] = [
         RenameTransform([keys.OBSERVATION], [keys.MESSAGE]),
         ObservationDelay(Uniform(3, LATEST), keys.MESSAGE, keys.RECEIVED, age_key="age", delay_key="delay"),
-        MessageHistory(12, keys.MESSAGE, delay_key="delay"),
+        ObservationTimeline(12, keys.MESSAGE, delay_key="delay"),
         Receiver(),
         ActionHistory(LATEST, keys.ACTION, append_to=keys.OBSERVATION),
         StepCounter(100),

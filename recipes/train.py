@@ -6,6 +6,7 @@ damian train resume=runs/first frames=600000
 
 import shlex
 import time
+from collections.abc import Collection
 from contextlib import closing
 from pathlib import Path
 from typing import cast
@@ -28,7 +29,7 @@ from damian.replay.recompute import CORRECTED, server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt, end_interrupted
 from damian.runs.loggers import make_loggers
-from damian.runs.metrics import Evaluation, evaluate
+from damian.runs.metrics import Evaluation, HindsightReturns, evaluate
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
 from damian.runs.training_state import RandomState, TrainingState, load_networks
@@ -37,9 +38,15 @@ from damian.settings.fields import leaves
 
 from . import cli
 from .evaluate import make_eval_env, own_code, report
-from .shared.collectors import learning_env, make_collector, ticks
+from .shared.collectors import learning_env, make_collector, read_by, ticks
 from .shared.runs import names_own_code, run_folder, save_config, stored_config
-from .shared.settings import backupdates, check_learning, learning_setup, longest_wait
+from .shared.settings import (
+    backupdates,
+    check_learning,
+    learning_setup,
+    longest_delay,
+    measures_hindsight,
+)
 
 
 def train(config: TrainConfig, folder: Path) -> None:
@@ -49,7 +56,8 @@ def train(config: TrainConfig, folder: Path) -> None:
     buffer = replay_buffer(config, env)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compiles)
-    state = TrainingState(folder, learner.components(), collector, clock, buffer)
+    hindsight = hindsight_returns(config, env)
+    state = TrainingState(folder, learner.components(), collector, clock, buffer, hindsight)
     begin(config, state)
     if config.compiles:
         print("compiling: the first update takes up to a minute longer")
@@ -123,22 +131,37 @@ def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     least = setup.least_buffer
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
-    recompute = server_recompute(env.server, config.corrected) if has_message_delay(config) else None
-    corrected = config.corrected if recompute else ["reward"]
+    storage = corrected_storage(config, env, config.corrected, size, setup.worlds)
+    return ReplayBuffer(storage=storage)
+
+
+def corrected_storage(
+    config: TrainConfig, env: DelayedEnv, corrected: Collection[str], size: int, worlds: int
+) -> BackupdateStorage:
+    """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct steps."""
+    late_messages = has_message_delay(config)
+    corrected = corrected if late_messages else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
     # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
     # The storage then has to keep the newest one.
-    hindsight = "hindsight" in config.learner.reads or (bool(recompute) and config.delay.order == "arrival")
-    size += sum(correction.lookback for correction in corrections) * setup.worlds
-    storage = BackupdateStorage(
-        size,
-        recompute,
-        longest_wait(config),
+    hindsight = "hindsight" in config.learner.reads or (late_messages and config.delay.order == "arrival")
+    return BackupdateStorage(
+        size + sum(correction.lookback for correction in corrections) * worlds,
+        server_recompute(env.server, corrected) if late_messages else None,
+        longest_delay(config),
         corrections=corrections,
         hindsight_key=keys.HINDSIGHT if hindsight else None,
         device=config.device,
     )
-    return ReplayBuffer(storage=storage)
+
+
+def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:
+    """The returns of the learning curve; None if they are those perceived, or if steps are skipped."""
+    if not measures_hindsight(config):
+        return None
+    worlds = min(config.worlds, HindsightReturns.WORLDS)
+    size = (learning_setup(config).longest_period + 2 * longest_delay(config)) * worlds
+    return HindsightReturns(corrected_storage(config, env, ["reward"], size, worlds), worlds)
 
 
 def begin(config: TrainConfig, state: TrainingState) -> None:
@@ -172,7 +195,7 @@ def update(
     try:
         torch.set_num_threads(config.threads)
         with own_code(config.learner.name):
-            losses = {name: float(number) for name, number in learner.learn(batch).items()}
+            losses = {name: float(number) for name, number in learner.learn(read_by(config, batch)).items()}
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan
         check_convergence(config, state, {})
         raise
@@ -216,8 +239,8 @@ def enough(config: TrainConfig, state: TrainingState) -> bool:
 def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> bool:
     """Write a checkpoint after an update if one is due; returns whether the training ends here."""
     finished, asked = enough(config, state), interrupt.asked is not None
-    due = finished or state.progress.updates % config.checkpoint_every == 0
-    if due or asked:
+    due = state.progress.updates % config.checkpoint_every == 0
+    if due or finished or asked:
         log.sync()
         if due:
             state.save_best()

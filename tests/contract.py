@@ -18,8 +18,8 @@ from damian.transforms import (
     ActionHistory,
     Channel,
     CumulativeReward,
-    MessageHistory,
     ObservationDelay,
+    ObservationTimeline,
     RewardDelay,
     SampleAndHold,
     set_seed,
@@ -114,10 +114,11 @@ CASES = {
     "CumulativeReward, one world": Case(cartpole, lambda: CumulativeReward(3)),
     "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
     "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),
-    "MessageHistory, one world": Case(cartpole, lambda: MessageHistory(3)),
-    "MessageHistory, worlds": Case(Drift, lambda: MessageHistory(2)),
-    "MessageHistory, agents": Case(
-        uavs, lambda: MessageHistory(3, ("agents", "message"), sent_key="message_sent", group=True, own=True)
+    "ObservationTimeline, one world": Case(cartpole, lambda: ObservationTimeline(3)),
+    "ObservationTimeline, worlds": Case(Drift, lambda: ObservationTimeline(2)),
+    "ObservationTimeline, agents": Case(
+        uavs,
+        lambda: ObservationTimeline(3, ("agents", "message"), sent_key="message_sent", group=True, own=True),
     ),
     "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
     "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"}, fresh_key="fresh")),

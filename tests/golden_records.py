@@ -142,6 +142,7 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         detected_time=zeros + detected[:, None],
         detected_position=zeros[..., None] + estimate[:, None],
         trail=torch.zeros(*zeros.shape, 2, dtype=torch.long),
+        landed=torch.zeros(*zeros.shape, 2),
         readings=torch.zeros(*zeros.shape, 0),
     )
     server = ServerContext(

@@ -254,6 +254,7 @@ def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, Server
         detected_time=column(lambda uav: -1.0 if uav.heard_at is None else uav.heard_at),
         detected_position=column(lambda uav: uav.heard_from),
         trail=torch.zeros(*place.shape[:-1], 2, dtype=torch.long),
+        landed=torch.zeros(*place.shape[:-1], 2),
         readings=torch.zeros(*place.shape[:-1], 0),
     )
     server = ServerContext(

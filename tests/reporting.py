@@ -77,6 +77,7 @@ class Reporter:
             "motions": int(messages.motions[uav]),
             "previous": [list(self.ground.place(int(p))) for p in messages.trail[uav, 1:]],
             "sequence": self.n_sent[uav],
+            "landed": [self.time_of(round(t / self.dt)) for t in messages.landed[uav].tolist() if t >= 0],
         }
         seen = float(messages.detected_time[uav])
         if seen >= 0:

@@ -131,7 +131,7 @@ class Fleet:
     def _new_log(self) -> UavLog:
         n_readings = sum(each.width for each in self.node.simulation.sensors.values())
         kept = 2 * max(self.node.law_longest, REMEMBERED_STEPS)
-        return UavLog(self.ground, self.node.server.observation.window, n_readings, kept)
+        return UavLog(self.ground, self.node.server.observation.stops, n_readings, kept, self.node.dt)
 
     def _free_level(self, used: Sequence[float]) -> float:
         """The lowest of the flight levels [m] that the fewest UAVs use."""

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -110,8 +111,8 @@ class FilledReport:
     """Landing point of that detection."""
     motions: int = 0
     """Decisions since its latest detection before."""
-    trail: tuple[int, ...] = ()
-    """Its latest landing points, newest first."""
+    stops: tuple[tuple[int, int], ...] = ()
+    """Its latest landing points, newest first, each with the step of the landing, or -1 if it is unknown."""
     readings: tuple[float, ...] = ()
     """Readings of sensors of your own."""
 
@@ -130,8 +131,9 @@ def stored_report(said: str, received: float, *others: Any) -> FilledReport:
 class UavLog:
     """The reports of one UAV."""
 
-    def __init__(self, ground: Ground, window: int, n_readings: int, kept_steps: int) -> None:
-        self.ground, self.window, self.n_readings, self.kept_steps = ground, window, n_readings, kept_steps
+    def __init__(self, ground: Ground, n_stops: int, n_readings: int, kept_steps: int, dt: float) -> None:
+        self.ground, self.n_stops, self.n_readings, self.kept_steps = ground, n_stops, n_readings, kept_steps
+        self.dt = dt
         self.reports: list[FilledReport] = []
         self.known_from = -math.inf
         """Time since which all reports are kept [s]."""
@@ -223,12 +225,22 @@ class UavLog:
         filled.motions += before is not None
         if report.motions is not None:
             filled.motions = report.motions
-        trail = list(before.trail) if before else []
+        filled.stops = self._stops(filled, before)
+
+    def _stops(self, filled: FilledReport, before: FilledReport | None) -> tuple[tuple[int, int], ...]:
+        """The latest stops of a UAV, as far as a report and the one before it tell."""
+        report, stops = filled.report, list(before.stops) if before else []
+        if not stops or stops[0][0] != filled.point:
+            stops = [(filled.point, filled.step), *stops]
         if report.previous is not None:
-            trail = [filled.point, *map(near, report.previous)]
-        elif trail[:1] != [filled.point]:
-            trail = [filled.point, *trail]
-        filled.trail = tuple([*trail, *[trail[-1]] * self.window][: self.window])
+            points = [filled.point, *map(self.ground.landing_point, report.previous)]
+            known = zip_longest(points, stops[: len(points)], fillvalue=(-1, -1))
+            stops = [(point, step if point == stop else -1) for point, (stop, step) in known]
+        if report.landed is not None:
+            ago = (round((report.time - time) / self.dt) for time in report.landed[: len(stops)])
+            steps = (filled.step - n_steps for n_steps in ago)
+            stops = [(point, step) for (point, _), step in zip_longest(stops, steps, fillvalue=-1)]
+        return tuple([*stops, *[(stops[-1][0], -1)] * self.n_stops][: self.n_stops])
 
 
 def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float) -> Messages:
@@ -237,6 +249,7 @@ def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor,
     detected = torch.tensor([-1 if each.detected is None else each.detected for each in reports])
     battery = torch.tensor([each.battery for each in reports])
     at = points[[each.detected_at or 0 for each in reports]]
+    stops = torch.tensor([each.stops for each in reports])  # [n, S, 2]
     is_empty = server.battery.enabled and observed(battery, server.battery) <= 0
     return Messages(
         time=steps * dt,
@@ -249,6 +262,7 @@ def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor,
         motions=torch.tensor([each.motions for each in reports]),
         detected_time=torch.where(detected >= 0, detected * dt, -1.0),
         detected_position=torch.where((detected >= 0).unsqueeze(-1), at, 0.0),
-        trail=torch.tensor([each.trail for each in reports]),
+        trail=stops[..., 0],
+        landed=torch.where(stops[..., 1] >= 0, stops[..., 1] * dt, -1.0),
         readings=torch.tensor([each.readings for each in reports]).view(len(reports), -1),
     )

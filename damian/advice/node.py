@@ -21,7 +21,7 @@ from damian.envs.pipeline import observation_transforms, remembering_transforms,
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Features
 from damian.settings import ScenarioConfig
-from damian.transforms import MessageHistory, StatefulTransform
+from damian.transforms import ObservationTimeline, StatefulTransform
 from damian.transforms.base import act, begin, observe
 from damian.transforms.server_node import Belief, ServerNode
 from damian.world.state import State
@@ -84,7 +84,7 @@ class ReportedEnv(UavEnv):
             keys.MESSAGE_SENT: on_time,
             keys.RECEIVED: held.clone(),
             keys.AGE: reported.age.view(1, -1, 1).float(),
-            keys.DELAY: torch.where(on_time, 0, -1).unsqueeze(-1),
+            keys.DELAY: torch.where(on_time | first, 0, -1).unsqueeze(-1),
         }
 
 
@@ -136,7 +136,7 @@ class Node:
         """Memories and outputs after actions [1, N, ...] that the ``chosen`` UAVs took in the step before."""
         memories = _copies(memories)
         for i, transform in enumerate(self.transforms):
-            if isinstance(transform, Belief | MessageHistory):
+            if isinstance(transform, Belief | ObservationTimeline):
                 for late in reported.late:
                     memories[i] = transform.note_late(memories[i], *late)
         memories, _ = act(self.transforms, memories, {keys.ACTION: action, keys.READY: chosen})

@@ -139,6 +139,8 @@ class Report(Row):
     target_y: Coordinate | None = None
     previous: Annotated[tuple[Pair, ...], Field(max_length=16), _text_split_at(";")] | None = None
     """Landing points where it was before, newest first: [[53.1, -4.5]], or 53.1 -4.5; 53.2 -4.5."""
+    landed: Annotated[tuple[Time, ...], Field(max_length=17), _text_split_at(";")] | None = None
+    """Times at which it landed, or held, where it is and at the places of ``previous`` [s]."""
     motions: Count | None = None
     """Decisions (holding included) since it last detected the source before."""
     readings: Annotated[tuple[Number, ...], Field(max_length=1000), _text_split_at(";")] | None = None

@@ -254,7 +254,9 @@ class Coverer(Greedy):
     ) -> tuple[Tensor, Tensor]:
         """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others."""
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        latest = self.counted(alone)[:, 0, :-1] % self.points.shape[1]  # the next landing replaces the oldest one
+        latest = (
+            self.counted(alone)[:, 0, :-1] % self.points.shape[1]
+        )  # the next landing replaces the oldest one
         covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
         return self.choose_landing(alone, (1 - covered) @ near, self.region_of(known), mask)
 

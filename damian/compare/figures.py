@@ -29,11 +29,11 @@ Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """Rows of ``metrics.csv`` of each seed, by task, delay and arm."""
 
 LABELS = {
-    "perceived_return": "return",
-    "perceived_success_rate": "success rate",
-    "perceived_steps": "steps per episode",
+    "hindsight_return": "return in hindsight",
+    "perceived_success_rate": "success rate, perceived",
+    "perceived_steps": "steps per episode, perceived",
 }
-"""Axis labels of the measures in training, all as the server perceived them."""
+"""Axis labels of the measures in training: in hindsight, from late data, or as the server perceived them."""
 PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
 """Axis labels of how far a training has come."""
 ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
@@ -164,10 +164,10 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
     tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
     delays = {task: comparison.delays(task) or [NOT_LATE] for task in tasks}
     if len(tasks) > 1:
-        return [[(task, delay, "perceived_return") for delay in delays[task]] for task in tasks]
+        return [[(task, delay, "hindsight_return") for delay in delays[task]] for task in tasks]
     rows = [row for runs in curves.values() for run in runs for row in run]
     succeeds = any(not np.isnan(row["perceived_success_rate"]) for row in rows)
-    measures = [*LABELS] if succeeds else ["perceived_return"]  # else episodes end at their limit
+    measures = [*LABELS] if succeeds else ["hindsight_return"]  # else episodes end at their limit
     return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]
 
 
@@ -176,22 +176,21 @@ def _curve_panel(
 ) -> None:
     """Draw all arms in a panel of ``_panels``."""
     task, delay, measure = content
-    axis.set(
-        xlabel=PROGRESS[progress], ylabel=f"{LABELS[measure]}, perceived", title=f"{task}, delay {delay}"
-    )
+    flown = "return" if measure == "hindsight_return" else measure  # of an evaluation, which knows the truth
+    axis.set(xlabel=PROGRESS[progress], ylabel=LABELS[measure], title=f"{task}, delay {delay}")
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     for name, arm in comparison.arms.items():
         run = (task, delay if arm.delayed else NOT_LATE, name)
         style: dict[str, Any] = look(comparison, name) | {"marker": "", "label": name}
         if run in curves:
             place, values = curve(curves[run], measure, progress)
-            low, high = bootstrap(lambda v: v.mean(-1), values[None], draws=500, bounds=BOUNDS[measure])
+            low, high = bootstrap(lambda v: v.mean(-1), values[None], draws=500, bounds=BOUNDS[flown])
             axis.plot(place, values.mean(-1), linewidth=1.2, **style)
             axis.fill_between(place, low[0], high[0], color=style["color"], alpha=0.2, linewidth=0)
-        elif values := comparison.values(*run, comparison.policy, measure):
+        elif values := comparison.values(*run, comparison.policy, flown):
             axis.axhline(fmean(values.values()), **style)
     for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, f"{SCRIPT}, undelayed", "-.")):
-        if values := comparison.values(task, NOT_LATE, comparison.undelayed, policy, measure):
+        if values := comparison.values(task, NOT_LATE, comparison.undelayed, policy, flown):
             level: dict[str, Any] = _LEVEL | {"linestyle": line}
             axis.axhline(fmean(values.values()), label=label, **level)
 

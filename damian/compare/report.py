@@ -63,7 +63,7 @@ def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> lis
     for arm, of_arm in comparison.arms.items():
         run = (task, delay if of_arm.delayed else NOT_LATE, arm)
         if run in curves:
-            steps, values = curve(curves[run], "perceived_return")
+            steps, values = curve(curves[run], "hindsight_return")
             tenth = len(steps) // 10
             found[arm] = steps[tenth - 1 :], sliding_window_view(values, tenth, axis=0).mean(-1)
     ends = {arm: found[arm][1][-1].mean() for arm in found if comparison.arms[arm].naive}
@@ -75,7 +75,7 @@ def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> lis
         reached = [min(steps[run >= level], default=np.inf) for run in (values.mean(-1), *values.T)]
         numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
         rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
-    title = f"Steps to the final training return (perceived, mean over a tenth) of *{best}*, {level:.1f}:"
+    title = f"Steps to the final training return (in hindsight, mean over a tenth) of *{best}*, {level:.1f}:"
     return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]
 
 

@@ -183,10 +183,15 @@ class BroadcastLine:
         for i, content in enumerate(contents):
             memory[f"contents_{i}"].flatten(0, 1).index_copy_(0, rows, content)
 
-    def step(self, memory: Memory, sent: Tensor, context: MessageContext | None = None) -> Memory:
-        """Send what was written last over the links ``sent`` [L] bool, and deliver what arrives now."""
+    def step(
+        self, memory: Memory, sent: Tensor, context: MessageContext | None = None
+    ) -> tuple[Memory, Tensor]:
+        """Send what was written last over the links ``sent`` [L] bool, and deliver what arrives now.
+
+        Also returns the delays of what was sent [steps], [L], as in a ``Delivery``.
+        """
         memory, delivery = self.line.step(memory, [], sent, context)
-        return self._hold(memory, delivery.fresh)
+        return self._hold(memory, delivery.fresh), delivery.delay
 
     def deliver_now(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [L] is true, deliver the messages of the latest step at once, sent or not."""

@@ -3,7 +3,8 @@
 What a step passes, in this order (a transform is there only if the scenario asks for it)::
 
     policy -> action -> ActionDelay -> UavEnv: physics makes messages
-    UavEnv -> message -> ObservationDelay -> Belief, MessageHistory -> ServerNode: observations, rewards, ends
+    UavEnv -> message -> ObservationDelay -> Belief, ObservationTimeline
+                      -> ServerNode: observations, rewards, ends
                       -> Channel -> OnboardNode: observations from what other UAVs have sent directly
     reward -> RewardDelay -> CumulativeReward
     observation -> SampleAndHold (server) -> ObservationDelay (broadcast) -> SampleAndHold (agents)
@@ -31,8 +32,8 @@ from damian.transforms import (
     ActionHistory,
     Channel,
     CumulativeReward,
-    MessageHistory,
     ObservationDelay,
+    ObservationTimeline,
     RewardDelay,
     SampleAndHold,
 )
@@ -130,7 +131,7 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
     transforms += remembering_transforms(scenario, server, longest, delayed)
     dropped = []
     if not output_messages:  # the server node drops what only it and the transforms before it read
-        written = [key for each in transforms for key in each.out_keys if key != keys.HISTORY]
+        written = [key for each in transforms for key in each.out_keys if key != keys.TIMELINE]
         sent = [] if scenario.links.kind == "matrix" else _SENT
         dropped = [*sent, *written, *[keys.DELAY] * (delayed and remembers)]
     held = keys.RECEIVED if delayed else keys.MESSAGE
@@ -165,10 +166,10 @@ def remembering_transforms(
     if server.grid is not None:
         transforms.append(Belief(server, longest, delayed=delayed, own=own))
     if scenario.delay.messages:
-        history = MessageHistory(
+        history = ObservationTimeline(
             scenario.delay.messages,
             keys.MESSAGE,
-            keys.HISTORY,
+            keys.TIMELINE,
             delay_key=keys.DELAY if delayed else None,
             sent_key=keys.MESSAGE_SENT,
             encode=partial(scaled_messages, server),
@@ -235,7 +236,7 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     """Clocks of server and UAVs (paper, section 3.6), the broadcast, and the action history (section 3.3)."""
     clock, links, n_actions = scenario.clock, scenario.links, scenario.delay.history
     transforms: list[Transform] = []
-    broadcast = [keys.OBSERVATION, *[keys.HISTORY] * bool(scenario.delay.messages)]
+    broadcast = [keys.OBSERVATION, *[keys.TIMELINE] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
         transforms.append(SampleAndHold(clock.steps("server"), [*broadcast, keys.GLOBAL_OBSERVATION]))
     updown, law = links.kind == "updown", links.delay

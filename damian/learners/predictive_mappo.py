@@ -52,7 +52,7 @@ class PredictiveMappo(Mappo):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """As ``Mappo.learn``; also the mean ``prediction_error``, 1 if no better than the targets' mean."""
         # What is known after a step is what is known before the next one: it need not be stored twice.
-        numbers = super().learn(batch.exclude(next_key(keys.HISTORY)))
+        numbers = super().learn(batch.exclude(next_key(keys.TIMELINE)))
         last = self.last_steps()
         errors = [self.learn_prediction(last) for _ in range(self.config.prediction_steps)]
         return {**numbers, "prediction_error": torch.stack(errors).mean().item()}
@@ -91,7 +91,7 @@ class PredictiveMappo(Mappo):
         since = torch.randint(n_rows, (n_samples,), device=device)
         world = torch.randint(self.setup.worlds, (n_samples,), device=device)
         first = n_rows - 1 - since
-        read = (keys.OBSERVATION, keys.HISTORY, keys.ACTION, keys.READY)
+        read = (keys.OBSERVATION, keys.TIMELINE, keys.ACTION, keys.READY)
         *before, ready = (cast(Tensor, steps[key])[rows[first], world] for key in read)
         end = last[first, world]
         index = (
@@ -109,7 +109,7 @@ class PredictiveMappo(Mappo):
 # The actor.
 
 FLAGS = 3
-"""Columns of ``MessageHistory`` behind those of the message: whether it has arrived, its age, is it own."""
+"""Columns that follow those of a message: whether it has arrived, its age, and whether it is one's own."""
 CODE_SIZE = 8
 """Size of the learnt code of a discrete action."""
 PREFERENCE_UNIT = 30.0
@@ -124,7 +124,7 @@ class MessageEncoder(nn.Module):
     """Encodes F features, a set of messages of C columns, and a code [K] of what is asked, by attention.
 
     Each message is given as it is and relative to the newest known message of the first sender, which with
-    ``MessageHistory`` is the receiver itself. Messages that are not known have no influence.
+    ``ObservationTimeline`` is the receiver itself. Messages that are not known have no influence.
     """
 
     def __init__(
@@ -138,9 +138,10 @@ class MessageEncoder(nn.Module):
         device: torch.device | None = None,
     ) -> None:
         super().__init__()
-        self.n_message, self.heads, self.width = n_columns - FLAGS, heads, width
+        self.n_message, self.heads, self.width = n_columns - 1, heads, width
         n_known = n_features + self.n_message
-        self.embed = nn.Sequential(nn.Linear(n_columns + self.n_message, width, device=device), nn.ReLU())
+        n_embedded = 2 * self.n_message + FLAGS
+        self.embed = nn.Sequential(nn.Linear(n_embedded, width, device=device), nn.ReLU())
         self.queries = nn.Sequential(
             nn.Linear(n_known + n_code, 2 * width, device=device),
             nn.ReLU(),
@@ -149,11 +150,15 @@ class MessageEncoder(nn.Module):
         self.layers = hidden_layers(config, heads * width + n_known + n_code, config.hidden, device)
 
     def forward(self, observation: Tensor, history: Tensor, codes: Tensor) -> Tensor:
-        """Encode observations [*, F] and histories [*, L, C], for Q codes each [*, Q, K], into [*, Q, H]."""
+        """Encode observations [*, F] and timelines [*, S, K, C], for Q codes each [*, Q, E], into [*, Q, H].
+
+        A timeline has K slots for each of S senders; of one sender it may be [*, K, C].
+        """
         if observation.dim() > 2:  # a compiler replaces attention in four dimensions by a slower kernel
             batch = observation.shape[:-1]
             rows = (part.flatten(0, len(batch) - 1) for part in (observation, history, codes))
             return self(*rows).unflatten(0, batch)
+        history = with_age(history if history.dim() > observation.dim() + 1 else history.unsqueeze(-3))
         message, known = history[..., : self.n_message], history[..., self.n_message]
         newest = known.argmax(-1, keepdim=True).unsqueeze(-1)  # the first of the known ones
         reference = message.gather(-2, newest.expand(*newest.shape[:-1], self.n_message))
@@ -168,6 +173,15 @@ class MessageEncoder(nn.Module):
         found = (shares @ embedded).unflatten(-2, (-1, self.heads)).flatten(-2)
         first, *others = self.layers
         return _apply(others, _linear_of_parts(first, found, context, codes))
+
+
+def with_age(timeline: Tensor) -> Tensor:
+    """Rows of a timeline [*, S, K, C], followed by age and whether of the first sender, [*, S K, C + 2]."""
+    senders, slots = timeline.shape[-3:-1]
+    age = torch.arange(slots, device=timeline.device) / slots
+    first = (torch.arange(senders, device=timeline.device) == 0).float().unsqueeze(-1)
+    flags = torch.stack(torch.broadcast_tensors(age, first), -1).to(timeline.dtype)
+    return torch.cat([timeline, flags.expand(*timeline.shape[:-1], 2)], -1).flatten(-3, -2)
 
 
 def _linear_of_parts(layer: nn.Module, *parts: Tensor) -> Tensor:
@@ -230,7 +244,7 @@ class BeliefHead(TensorDictModuleBase):
         self.codes = nn.Parameter(0.5 * torch.randn((n_actions or 0) + 1, n_code, device=device))
         self.predictor = nn.Linear(n_encoding, n_targets, device=device)
         self.norm = TargetScale(n_targets, device)
-        self.in_keys = [keys.OBSERVATION, keys.HISTORY]  # type: ignore[assignment]
+        self.in_keys = [keys.OBSERVATION, keys.TIMELINE]  # type: ignore[assignment]
         written = [keys.ENCODING, *[keys.PREDICTION] * (n_actions is not None)]
         self.out_keys = written  # type: ignore[assignment]
 
@@ -238,7 +252,7 @@ class BeliefHead(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if recurrent_mode():
             return tensordict
-        observation, history = tensordict[keys.OBSERVATION], tensordict[keys.HISTORY]
+        observation, history = tensordict[keys.OBSERVATION], tensordict[keys.TIMELINE]
         codes = self.codes.expand(*observation.shape[:-1], -1, -1)
         encodings = self.encoder(observation, history, codes)
         tensordict.set(keys.ENCODING, encodings[..., 0, :])
@@ -281,9 +295,9 @@ class NormalPolicy(nn.Module):
 def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int) -> ProbabilisticActor:
     """Make the policy from observations and histories to ``("agents", "action")``."""
     known, device = env.observation_spec.keys(True, True), env.device
-    should = "reads no messages: set delay.messages, or add damian.MessageHistory to the environment"
-    checks.require(keys.HISTORY in known, "learner", "predictive_mappo", should)
-    observation, history = env.observation_spec[keys.OBSERVATION], env.observation_spec[keys.HISTORY]
+    should = "reads no messages: set delay.messages, or add damian.ObservationTimeline to the environment"
+    checks.require(keys.TIMELINE in known, "learner", "predictive_mappo", should)
+    observation, history = env.observation_spec[keys.OBSERVATION], env.observation_spec[keys.TIMELINE]
     n_targets, n_encoding = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1], config.hidden[-1]
 
     def network(n_out: int, *out_keys: NestedKey) -> TensorDictSequential:

@@ -11,6 +11,7 @@ from damian.keys import next_key
 from damian.replay.backupdate import Recompute
 from damian.replay.hindsight import arrived_by_now
 from damian.server.belief import likelihood, predict, repeated, report_rows, weigh
+from damian.server.rewards import features_read
 from damian.server.server import Server
 
 CORRECTED = {"reward": keys.REWARD, "critic": keys.GLOBAL_OBSERVATION, "actor": keys.OBSERVATION}
@@ -25,30 +26,27 @@ def server_recompute(
 
     ``corrected``: names in ``CORRECTED``; the ends of episodes always are.
     """
+    observes = not {"critic", "actor"}.isdisjoint(corrected)
+    names = None if observes else features_read(server.reward)
+    believes = server.grid is not None and (observes or server.rewards_belief)
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
         elapsed = steps[next_key(keys.STEP_COUNT)].squeeze(-1)
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
-        belief = beliefs_in_hindsight(server, steps) if server.grid is not None else None
-        outputs = server(server.messages(messages), elapsed, source_over, belief=belief)
-        entries: dict[NestedKey, Tensor] = {
-            keys.GLOBAL_OBSERVATION: outputs.global_observation,
-            keys.REWARD: outputs.reward.unsqueeze(-1),
-            **outputs.status.entries(),
-        }
+        belief = beliefs_in_hindsight(server, steps) if believes else None
+        held = server.messages(messages)
+        features = server.features(held, elapsed, names, belief=belief)
+        reward, terms, status = server.reward_and_status(features, held, elapsed, source_over)
+        entries: dict[NestedKey, Tensor] = {keys.REWARD: reward.unsqueeze(-1), **status.entries()}
         if belief is not None:
             entries[keys.BELIEF] = belief
-        if "actor" in corrected:
-            sent, own = steps[next_key(keys.MESSAGE)], server.observation.own
-            entries[keys.OBSERVATION] = (
-                server.observe_with_own_messages(
-                    messages, sent, elapsed, belief=steps.get(next_key(keys.OWN_BELIEF), None)
-                )
-                if own
-                else outputs.observation
-            )
+        if observes:
+            entries[keys.OBSERVATION], entries[keys.GLOBAL_OBSERVATION] = server.observations(features)
+        if "actor" in corrected and server.observation.own:
+            sent, own_belief = steps[next_key(keys.MESSAGE)], steps.get(next_key(keys.OWN_BELIEF), None)
+            entries[keys.OBSERVATION] = server.observe_with_own_messages(messages, sent, elapsed, own_belief)
         if reward_terms:
-            entries |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
+            entries |= {(*keys.REWARD_TERMS, name): term for name, term in terms.items()}
         kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
         return {next_key(key): value for key, value in entries.items() if key not in kept}
 

@@ -13,9 +13,9 @@ from damian import keys
 from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
 from damian.learners.recurrent import add_recurrent_state
+from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import beliefs_in_hindsight
-from damian.server.features import FEATURES
-from damian.server.rewards import features_read
+from damian.runs.checkpoint import to_tensordict
 from damian.server.server import Server
 
 
@@ -103,7 +103,7 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
 
 def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Tensor | None:
     """The belief from undelayed messages in first episodes, [B, T, K]; None if no reward term reads it."""
-    if not any(FEATURES.get(name, "feature").scope == "belief" for name in features_read(server.reward)):
+    if not server.rewards_belief:
         return None
     steps = rollout.select(keys.MESSAGE, keys.BELIEF, next_key(keys.MESSAGE), next_key(keys.BELIEF))
     sent = cast(Tensor, rollout[next_key(keys.MESSAGE_SENT)])
@@ -139,36 +139,123 @@ class EpisodeLog:
     """Means over the latest episodes of the training, as many of each world, at least ``EPISODES`` in all.
 
     Every world counts the same, and nothing is known before one has ended in each: the first episodes to end
-    are the shortest, and their means would be too good.
+    are the shortest, and their means would be too good. ``hindsight`` gives the rewards as they are known
+    once they have settled; None if none is late, so that they are those perceived.
     """
 
     NAMES = ("perceived_return", "perceived_success_rate", "perceived_steps")
     EPISODES = 100
 
-    def __init__(self, worlds: int) -> None:
-        self.finished = 0
-        self._latest = torch.full((worlds, math.ceil(self.EPISODES / worlds), len(self.NAMES)), torch.nan)
+    def __init__(self, worlds: int, hindsight: "HindsightReturns | None" = None) -> None:
+        self.finished, self.hindsight = 0, hindsight
+        self._perceived = _LatestEpisodes(worlds, len(self.NAMES))
+        self._settled = _LatestEpisodes(hindsight.worlds, 1) if hindsight else self._perceived
 
     def add(self, batch: TensorDictBase) -> None:
         """Add the episodes that end in a batch [B, T], with the entries of ``EpisodeTotals``."""
-        steps, kept = cast(TensorDictBase, batch["next"]), self._latest.shape[1]
+        steps = cast(TensorDictBase, batch["next"])
         done = steps[keys.DONE].to("cpu")
-        totals = [steps[key].flatten(2).float().mean(2) for key in _TOTALS]
-        ended = torch.stack(totals, -1).to("cpu").masked_fill(~done, torch.nan)  # [B, T, 3]
-        known = torch.cat([self._latest, ended], 1)
-        when = torch.arange(known.shape[1]).where(~known[..., 0].isnan(), -1)
-        latest = when.topk(kept, 1).indices.unsqueeze(-1).expand(-1, -1, len(self.NAMES))
-        self._latest, self.finished = known.gather(1, latest), self.finished + int(done.sum())
+        totals = torch.stack([steps[key].flatten(2).float().mean(2) for key in _TOTALS], -1)
+        self._perceived.add(totals.to("cpu").masked_fill(~done, torch.nan))
+        if self.hindsight:
+            self._settled.add(self.hindsight.add(batch).to("cpu").unsqueeze(-1))
+        self.finished += int(done.sum())
 
     def state_dict(self) -> dict[str, Any]:
-        return {"finished": self.finished, "latest": self._latest}
+        state = {"finished": self.finished, "perceived": self._perceived.known}
+        if self.hindsight:
+            state |= {"settled": self._settled.known, "hindsight": self.hindsight.state_dict()}
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.finished, self._latest = int(state["finished"]), state["latest"]
+        self.finished, self._perceived.known = int(state["finished"]), state["perceived"]
+        if self.hindsight:
+            self._settled.known = state["settled"]
+            self.hindsight.load_state_dict(state["hindsight"])
 
     def means(self) -> dict[str, float]:
-        """Mean return, success rate and steps as perceived; nan before an episode has ended in each world."""
-        return dict(zip(self.NAMES, self._latest.nanmean(1).mean(0).tolist(), strict=True))
+        """Mean returns, success rate and steps; nan before an episode has ended in each world."""
+        settled, perceived = self._settled.means()[0], self._perceived.means()
+        return {"hindsight_return": settled, **dict(zip(self.NAMES, perceived, strict=True))}
+
+
+class _LatestEpisodes:
+    """Numbers of the latest episodes, as many of each world, at least ``EpisodeLog.EPISODES`` in all."""
+
+    def __init__(self, worlds: int, numbers: int) -> None:
+        kept = math.ceil(EpisodeLog.EPISODES / worlds)
+        self.known = torch.full((worlds, kept, numbers), torch.nan)
+
+    def add(self, ended: Tensor) -> None:
+        """Add the numbers of the episodes that end in some steps, nan where none does, [B, T, K]."""
+        known = torch.cat([self.known, ended], 1)
+        when = torch.arange(known.shape[1]).where(~known[..., 0].isnan(), -1)
+        latest = when.topk(self.known.shape[1], 1).indices.unsqueeze(-1).expand(-1, -1, known.shape[2])
+        self.known = known.gather(1, latest)
+
+    def means(self) -> list[float]:
+        return self.known.nanmean(1).mean(0).tolist()
+
+
+class HindsightReturns:
+    """Returns of the training's episodes from late data only, as they are known once they have settled.
+
+    The reward of a step has settled when its messages and it itself can no longer be in transit; until then
+    it waits in a storage of its own, whatever the learner does. Only a few worlds are followed, because that
+    costs time.
+
+    Args:
+        storage: an empty storage that corrects the rewards of ``worlds`` worlds.
+        worlds: number of worlds to follow, the first ones.
+    """
+
+    WORLDS = 32
+    """Most worlds to follow."""
+
+    def __init__(self, storage: BackupdateStorage, worlds: int) -> None:
+        self.storage, self.worlds = storage, worlds
+        self._written = 0
+        """Number of steps written so far."""
+        self._waiting = 0
+        """Number of stored steps that have not been counted yet."""
+        self._running = torch.zeros(worlds, dtype=torch.float64)
+        """Return so far of the current episode of each world."""
+
+    def add(self, batch: TensorDictBase) -> Tensor:
+        """Returns of the episodes whose last steps settle by the end of a batch [B, T], else nan, [W, T']."""
+        steps = batch[: self.worlds].transpose(0, 1)
+        self._store(steps)
+        self._waiting += len(steps)
+        n_settled = max(self._waiting - self.storage.longest, 0)
+        settled = self.storage.steps[self.storage.latest(self._waiting)[:n_settled]]
+        self._waiting -= n_settled
+        if not n_settled:
+            return torch.full((self.worlds, 0), torch.nan)
+        valid, over = (settled[key].squeeze(-1).cpu() for key in (keys.VALID, keys.RESET_AFTER))
+        reward = settled[next_key(keys.REWARD)].squeeze(-1).double().mean(-1).cpu()
+        total = torch.cat([self._running[None], self._running + (reward * valid).cumsum(0)])  # [T' + 1, W]
+        step = torch.arange(n_settled).view(-1, 1)
+        ended = torch.where(over, step + 1, 0).cummax(0).values  # the end of the latest episode before
+        before = torch.cat([torch.zeros_like(ended[:1]), ended])
+        begun = torch.where(before > 0, total.gather(0, before), 0.0)
+        self._running = total[-1] - begun[-1]
+        return torch.where(over, total[1:] - begun[:-1], torch.nan).T.float()
+
+    def _store(self, steps: TensorDictBase, corrected: bool = False) -> None:
+        """Write steps [T, W] behind the latest ones, and correct all by what has arrived."""
+        index = torch.arange(self._written, self._written + len(steps))
+        self._written += len(steps)
+        write = super(BackupdateStorage, self.storage).set if corrected else self.storage.set
+        write(index % (self.storage.max_size // self.worlds), steps)
+
+    def state_dict(self) -> dict[str, Any]:
+        rows = self.storage.steps[self.storage.latest()] if self._written else None
+        return {"rows": rows, "waiting": self._waiting, "running": self._running}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._waiting, self._running = int(state["waiting"]), state["running"]
+        if state["rows"] is not None:
+            self._store(to_tensordict(state["rows"]).to(self.storage.device), corrected=True)
 
 
 _TOTALS = (keys.EPISODE_REWARD, keys.SUCCESS, keys.STEP_COUNT)

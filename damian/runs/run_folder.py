@@ -28,18 +28,19 @@ def plot_learning_curve(
     from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, needed once)
     from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
-    panels = {"perceived_return": "return"}
+    # In hindsight, which is close to what truly happened; what is perceived may rank policies wrongly.
+    panels = {"hindsight_return": ("return", "return")}
     if any(row["perceived_success_rate"] > 0 for row in rows):
-        panels["perceived_success_rate"] = "success rate"
+        panels["perceived_success_rate"] = ("success rate", "perceived_success_rate")
     figure = Figure(figsize=(5 * len(panels), 3.4))
     axes = figure.subplots(1, len(panels), squeeze=False)
-    for axis, (name, label) in zip(axes[0], panels.items(), strict=True):
+    for axis, (name, (label, measure)) in zip(axes[0], panels.items(), strict=True):
         points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
-        points.insert(0, (0, evaluations[UNTRAINED].row()[name]))
+        points.insert(0, (0, evaluations[UNTRAINED].row()[measure]))
         axis.plot(*zip(*points, strict=True), color="tab:blue", marker="o", markevery=[0], label="training")
         for policy, style in {SCRIPT: "-.", RANDOM: "--"}.items():
             if policy in evaluations:  # a region may be too large for the script
-                level = evaluations[policy].row()[name]
+                level = evaluations[policy].row()[measure]
                 axis.axhline(level, color="tab:gray", linestyle=style, label=policy)
         axis.set_xlabel("environment steps, all worlds")
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))

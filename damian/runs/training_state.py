@@ -15,7 +15,7 @@ from torchrl.data import ReplayBuffer
 from damian.common.errors import InputError
 from damian.learners.schedule import SystemClock
 from damian.runs.checkpoint import read_checkpoint, restore, to_tensordict, write_checkpoint
-from damian.runs.metrics import EpisodeLog
+from damian.runs.metrics import EpisodeLog, HindsightReturns
 from damian.runs.replay_memory import ReplayMemory
 from damian.runs.run_folder import BEST, CHECKPOINT, REPLAY
 
@@ -48,9 +48,10 @@ class TrainingState:
         collector: Collector,
         clock: SystemClock,
         buffer: ReplayBuffer | None = None,
+        hindsight: HindsightReturns | None = None,
     ) -> None:
         self.folder, self.components = folder, components
-        self.progress, self.episodes = Progress(), EpisodeLog(collector.env.batch_size[0])
+        self.progress, self.episodes = Progress(), EpisodeLog(collector.env.batch_size[0], hindsight)
         self.saved = 0
         """The update after which the checkpoint of the run was written."""
         self._replay = ReplayMemory(buffer, folder / REPLAY)
@@ -73,8 +74,8 @@ class TrainingState:
         self._replay.remove_old()
 
     def save_best(self) -> None:
-        """Store the learner if the mean episode return is the best so far; ``save`` must follow."""
-        mean = self.episodes.means()["perceived_return"]
+        """Store the learner if the mean return in hindsight is the best so far; ``save`` must follow."""
+        mean = self.episodes.means()["hindsight_return"]
         if mean > self.progress.best:
             self.progress.best = mean
             training = _states({"progress": self.progress})

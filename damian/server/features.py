@@ -151,7 +151,7 @@ class Feature(NamedTuple):
     compute: Callable[[FeatureCache], Tensor]
     """From messages [*, N] to values [*, N] or, if it has several for each UAV, [*, N, width]."""
     scope: str
-    """``local``, ``global`` or ``belief``, as in ``feature``; ``timeline``, or ``actor``: not the critic's."""
+    """As in ``feature``; or ``timeline``, or ``actor``, which the critic never observes."""
     width: int | None = 1
     """Number of values for each UAV; None if it depends on the settings."""
     low: float = 0.0

@@ -16,6 +16,7 @@ from damian.server.belief import SourceGrid, build_source_grid, certain_belief
 from damian.server.features import (
     ServerContext,
     check_features,
+    feature_of,
     observe,
     observe_own,
     stack,
@@ -106,6 +107,11 @@ class Server:
         """Cells of the belief; None if no feature reads it."""
         return self._constants["grid"]
 
+    @property
+    def rewards_belief(self) -> bool:
+        """Whether any reward term reads the belief."""
+        return any(feature_of(name).scope == "belief" for name in features_read(self.reward))
+
     def to(self, device: torch.device) -> "Server":
         """Move the tables to a device, in place."""
         self._scale = self._scale.to(device)
@@ -143,10 +149,11 @@ class Server:
         belief: Tensor | None = None,
     ) -> ServerOutputs:
         """Observations, rewards and status; without ``source_over`` the source never ends."""
-        over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         features = self.features(messages, steps, coverage=coverage, belief=belief)
-        result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
-        known = KnownCoverage(self.counted(messages), features["coverage"]) if self.remembers_coverage else None
+        result = self.reward_and_status(features, messages, steps, source_over)
+        known = (
+            KnownCoverage(self.counted(messages), features["coverage"]) if self.remembers_coverage else None
+        )
         return ServerOutputs(*self.observations(features), *result, known)
 
     def features(
@@ -189,14 +196,15 @@ class Server:
         return stack(observe_own(known, context, self.observation.actor), self.observation.actor)
 
     def reward_and_status(
-        self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor
+        self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor | None
     ) -> tuple[Tensor, Features, Status]:
         """Rewards (paper, eq. 5-8), their terms, and the end of the episode (section 4.1).
 
         Shapes as in ``ServerOutputs``; features are of the messages.
         """
+        over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         counters = Counters(steps, messages.motions)
-        ended = status(messages, steps, source_over, self.dt, self.episode)
+        ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
         terms = reward(features, counters, self.reward)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
         return sum(terms.values(), start=final), terms, ended

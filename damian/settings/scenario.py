@@ -37,6 +37,8 @@ class ScenarioConfig(WorldConfig):
         self.refuse(empty, "observation.global_features", problem)
         problem = f"does not go with links={links}: a UAV would get the messages that the server has received"
         self.refuse(self.delay.messages and links != "server", "delay.messages", problem)
+        problem = "does not go with delay.order=arrival: a slot would change with when a message arrived"
+        self.refuse(observation.timeline and self.delay.order == "arrival", "observation.timeline", problem)
         never = episode.discharged_share is not None and not self.battery.enabled
         self.refuse(never, "episode.discharged_share", "needs battery.enabled=true")
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"

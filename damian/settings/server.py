@@ -86,7 +86,7 @@ class ObservationConfig(Settings):
     window: int = setting(2, "Latest landing points of a UAV that its coverage counts.", low=1, high=16)
     timeline: int = setting(
         0,
-        "Latest steps of which actor and critic observe where other UAVs stood then, as far as known; 0: none.",
+        "Latest steps for which actor and critic observe where other UAVs were, as far as known.",
         low=0,
         high=100,
     )

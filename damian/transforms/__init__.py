@@ -6,19 +6,20 @@ Transforms that need a ``UavEnv`` are in ``damian.transforms.server_node``, and 
 from damian.transforms.action import ActionDelay
 from damian.transforms.base import StatefulTransform, check_order, set_seed
 from damian.transforms.channel import Channel
-from damian.transforms.history import ActionHistory, MessageHistory
+from damian.transforms.history import ActionHistory
 from damian.transforms.hold import SampleAndHold
 from damian.transforms.observation import ObservationDelay
 from damian.transforms.reward import CumulativeReward, RewardDelay
 from damian.transforms.stored import delay_trajectories
+from damian.transforms.timeline import ObservationTimeline
 
 __all__ = [
     "ActionDelay",
     "ActionHistory",
     "Channel",
     "CumulativeReward",
-    "MessageHistory",
     "ObservationDelay",
+    "ObservationTimeline",
     "RewardDelay",
     "SampleAndHold",
     "StatefulTransform",

@@ -68,6 +68,8 @@ class Channel(StatefulTransform):
         age_key: key for the age of the held messages [steps], [*B, N, N] float; before one has arrived,
             steps since the reset; or None.
         mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; or None.
+        delay_key: key for the delays of the messages sent in this step [steps], [*B, N, N] long (receiver,
+            sender), -1 if they never arrive; or None. An actor must not observe it.
         seed: as in ``StatefulTransform``.
 
     Examples:
@@ -94,6 +96,7 @@ class Channel(StatefulTransform):
         dt: float = 1.0,
         age_key: NestedKey | None = "received_age",
         mask_key: NestedKey | None = "received_mask",
+        delay_key: NestedKey | None = None,
         seed: int | None = None,
     ) -> None:
         if action_key is not None:
@@ -113,10 +116,10 @@ class Channel(StatefulTransform):
         several = [f"received_{key[-1]}" for key in self.in_keys]
         names = self.out_keys or (several if len(several) > 1 else ["received"])
         self.out_keys = existing(sibling_key(self._beside, key) for key in names)
-        self.age_key, self.mask_key, self.sent_key, self.position_key = (
-            sibling_key(self._beside, key) for key in (age_key, mask_key, sent_key, position_key)
+        self.age_key, self.mask_key, self.delay_key, self.sent_key, self.position_key = (
+            sibling_key(self._beside, key) for key in (age_key, mask_key, delay_key, sent_key, position_key)
         )
-        self.extra_keys = existing([self.age_key, self.mask_key])
+        self.extra_keys = existing([self.age_key, self.mask_key, self.delay_key])
         self.message_size, self.known_at_reset, self.dt = message_size, known_at_reset, dt
         self.comm_range, self.limit = comm_range, limit
         self.hears = None if hears is None else torch.as_tensor(hears, dtype=torch.bool).flatten().tolist()
@@ -161,7 +164,8 @@ class Channel(StatefulTransform):
         hears = receiver % n != sender
         if self.hears is not None:
             hears = hears & torch.tensor(self.hears, device=streams.device).repeat(len(streams) // n**2)
-        return memory | {"hears": hears}
+        memory |= {"hears": hears}
+        return memory | {"delay": torch.zeros_like(streams)} if self.delay_key else memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         self.line.write(memory, self._contents(entries, mask.device))
@@ -170,6 +174,7 @@ class Channel(StatefulTransform):
         after = self._send(begun, entries, sending)
         if self.known_at_reset:
             after = self.line.deliver_now(after, mask)
+            after |= {"delay": torch.zeros_like(after["delay"])} if self.delay_key else {}
         merged = {
             name: new if new is begun[name] else torch.where(expand_mask(mask, new), new, begun[name])
             for name, new in after.items()
@@ -205,7 +210,7 @@ class Channel(StatefulTransform):
 
     def _send(self, memory: Memory, entries: Entries, wanted: Tensor) -> Memory:
         """Send what was written last over the wanted links [M], and deliver what arrives in this step."""
-        n, sender = self.agents[-1], memory["sender"]
+        n = self.agents[-1]
         position = as_rows(entries[self.position_key], self.agents)[:, :2] if self.position_key else None
         sent = wanted & memory["hears"]
         if self.comm_range is not None:
@@ -214,12 +219,17 @@ class Channel(StatefulTransform):
             sent = sent & (distance <= self.comm_range).view(-1)
         by_link = sent.view(-1, n, n)
         sent = (by_link & self._may_send(memory, by_link.any(1)).unsqueeze(1)).view(-1)
-        if not self.sampler.sees_context:
-            return self.line.step(memory, sent)
+        context = self._context(memory, sent, position) if self.sampler.sees_context else None
+        memory, delay = self.line.step(memory, sent, context)
+        return memory | {"delay": delay} if self.delay_key else memory
+
+    def _context(self, memory: Memory, sent: Tensor, position: Tensor | None) -> MessageContext:
+        """The circumstances of what is ``sent`` over the links [M]; positions are [B * N, 2]."""
+        n, sender = self.agents[-1], memory["sender"]
         receiver = torch.arange(len(sender), device=sender.device) // n
         places = {"position": sender, "receiver_position": receiver}
         clock = memory["clock"]
-        context = MessageContext(
+        return MessageContext(
             sender=sender % n,
             receiver=receiver % n,
             n_sending=sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n),
@@ -228,7 +238,6 @@ class Channel(StatefulTransform):
             dt=self.dt,
             entries={} if position is None else {k: position.index_select(0, v) for k, v in places.items()},
         )
-        return self.line.step(memory, sent, context)
 
     def _may_send(self, memory: Memory, wants: Tensor) -> Tensor:
         """Draw who may send if not all may, [B, N] bool, among those who want to, [B, N] bool."""
@@ -261,6 +270,9 @@ class Channel(StatefulTransform):
             entries[self.age_key] = (now - time.clamp(min=1)).to(torch.float32).view(shape)
         if self.mask_key is not None:
             entries[self.mask_key] = (time > 0).view(shape)
+        if self.delay_key is not None:
+            delay = memory["delay"].view(-1, n).masked_fill(is_own, 0)
+            entries[self.delay_key] = torch.where(delay < self.sampler.lost, delay, -1).view(shape)
         return entries
 
     # The chosen message is an action for the policy, but none for the environment.
@@ -287,4 +299,5 @@ class Channel(StatefulTransform):
             add_spec(observation_spec, key, (*pairs, *size), dtype)
         add_spec(observation_spec, self.age_key, pairs)
         add_spec(observation_spec, self.mask_key, pairs, torch.bool)
+        add_spec(observation_spec, self.delay_key, pairs, torch.long)
         return observation_spec

@@ -45,7 +45,7 @@ class Messages(NamedTuple):
     detected_position: Annotated[Tensor, Column(2)]
     """Position of the UAV at its latest detection, east, north [m]."""
     trail: Annotated[Tensor, Column(None, torch.long)]
-    """Flat ids of the landing points of the UAV's latest stops, newest first, [*, N, S]; holding is a stop."""
+    """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a stop."""
     landed: Annotated[Tensor, Column(None)]
     """Time at which each of these stops began [s], [*, N, S]; -1 before the episode."""
     readings: Annotated[Tensor, Column(None)]
@@ -53,10 +53,10 @@ class Messages(NamedTuple):
 
     @classmethod
     def blank(cls, trail: Tensor, n_readings: int = 0) -> "Messages":
-        """Messages of zeros, without a detection, of UAVs whose stops ``trail`` [*, N, S] came before."""
+        """Messages of zeros, without a detection, of UAVs with the landing points ``trail`` [*, N, S]."""
         width = _FIXED + 2 * trail.shape[-1] + n_readings
         blank = cls.unpack(torch.zeros(*trail.shape[:-1], width), n_readings)
-        return blank._replace(detected_time=blank.detected_time - 1, trail=trail, landed=blank.landed - 1)
+        return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
 
     def pack(self) -> Tensor:
         """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through exactly."""

@@ -254,7 +254,10 @@ class Simulation:
                 goal.unsqueeze(-1).repeat(1, 1, stops), sum(sensor.width for sensor in self.sensors.values())
             ),
         )
-        return self._sense(state)
+        state = self._sense(state)
+        landed = torch.full_like(state.sent.landed, -1.0)
+        landed[..., 0] = 0.0  # nothing is known of the time before
+        return state._replace(sent=state.sent._replace(landed=landed))
 
 
 def _draw_initial_conditions(

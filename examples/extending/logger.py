@@ -19,7 +19,7 @@ class Progress:
         self.file, self.every, self.goal, self.seen = folder / "progress.txt", every, goal, 0
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
-        if name != "train/perceived_return":
+        if name != "train/hindsight_return":
             return
         if self.seen % self.every == 0:
             with self.file.open("a") as file:

@@ -66,8 +66,8 @@ class Truth:
 
     def __init__(self, node: Node, flying: Lockstep) -> None:
         self.node, self.flying = node, flying
-        window = node.server.observation.window
-        self.logs = [UavLog(node.ground, window, 0, 1000) for _ in flying.copters]
+        n_stops = node.server.observation.stops
+        self.logs = [UavLog(node.ground, n_stops, 0, 1000, node.dt) for _ in flying.copters]
         self.steps: list[Any] = []
         self.note()
 

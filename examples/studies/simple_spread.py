@@ -16,7 +16,7 @@ from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEn
 
 from damian import keys
 from damian.delays.laws import Law
-from damian.transforms import ActionHistory, MessageHistory, ObservationDelay
+from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline
 
 HORIZON = 25
 """Steps of an episode."""
@@ -36,9 +36,9 @@ KINEMATICS = (keys.AGENTS, "kinematics")
 SEEN = ("seen", "message")
 """Places of the landmarks and of the other agents relative to each agent, [B, N (2 N - 1), 2]: the N + N - 1
 blocks that agent 0 sees, then those that agent 1 sees. Each block is a message, with a delay of its own."""
-HELD, AGES, DELAYS, PAST = (("seen", name) for name in ("received", "age", "delay", "history"))
+HELD, AGES, DELAYS, PAST = (("seen", name) for name in ("received", "age", "delay", "timeline"))
 """Of each block: the message that the agent holds, its age and the delay of the latest one [steps], and the
-messages of the latest steps that have arrived (``MessageHistory``)."""
+messages of the latest steps that have arrived (``ObservationTimeline``)."""
 
 
 class SimpleSpread(EnvBase):
@@ -181,7 +181,7 @@ class Receiver(Transform):
             keys.DELAY: outputs[DELAYS].view(*rows, -1).amax(-1, keepdim=True),
         }
         if PAST in outputs.keys(True):
-            written[keys.HISTORY] = histories(outputs[PAST], rows[-1])
+            written[keys.TIMELINE] = histories(outputs[PAST], rows[-1])
         return written
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
@@ -199,14 +199,14 @@ def observed(kinematics: Tensor, blocks: Tensor) -> Tensor:
 
 
 def histories(past: Tensor, n_agents: int) -> Tensor:
-    """Histories of all blocks, [B, N M, K, C], by agent, [B, N, M K, C + M].
+    """Timelines of all blocks, [B, N M, K, 2 + 1], by agent, [B, N, M, K, 2 + M + 1].
 
-    A row of the result has the place, which of the M blocks it is, and the flags of ``MessageHistory``.
+    A row of the result has the place, which of the M blocks it is, and whether it is known.
     """
     rows = past.unflatten(1, (n_agents, -1))  # [B, N, M, K, C]
     m = rows.shape[2]
     block = torch.eye(m, device=past.device).view(m, 1, m).expand(*rows.shape[:-1], m)
-    return torch.cat([rows[..., :2], block, rows[..., 2:]], -1).flatten(2, 3)
+    return torch.cat([rows[..., :2], block, rows[..., 2:]], -1)
 
 
 def late_spread(
@@ -221,11 +221,11 @@ def late_spread(
         delay: of each block [steps], or its law.
         longest: number of latest actions that an aware actor observes.
         aware: whether actors observe ages, and their own latest actions by how far these move them.
-        messages: number of latest steps whose messages ``("agents", "history")`` has; 0: there is none.
+        messages: number of latest steps whose messages ``("agents", "timeline")`` has; 0: there is none.
     """
     parts: list[Transform] = [ObservationDelay(delay, [SEEN], [HELD], age_key="age", delay_key="delay")]
     if messages:
-        parts.append(MessageHistory(messages, SEEN, delay_key="delay"))
+        parts.append(ObservationTimeline(messages, SEEN, delay_key="delay"))
     parts.append(Receiver(longest, ages=aware))
     if aware:
         codes = torch.tensor(DIRECTIONS) * REACH

@@ -18,12 +18,12 @@ from damian.server.server import Server
 from damian.settings import TrainConfig
 from damian.transforms.reward import EpisodeTotals
 
-from .settings import backupdates
+from .settings import backupdates, measures_hindsight
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment of the training, [B], with what the learner and the logs need."""
-    messages = backupdates(config) or config.clock.trigger is not None
+    messages = measures_hindsight(config) or config.clock.trigger is not None
     privileged = config.critic == "privileged"
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
@@ -61,6 +61,14 @@ def ticks(collector: Collector, clock: SystemClock, server: Server) -> Iterator[
             clock.tick(spotting(batch, server))
         parts = []
         yield batch
+
+
+def read_by(config: TrainConfig, batch: TensorDictBase) -> TensorDictBase:
+    """The entries of a batch [B, T] for the learner, whose replay buffer would keep messages in vain."""
+    if backupdates(config) or "message" in config.learner.reads:
+        return batch
+    sent = (keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.REWARD_DELAY, keys.EARNED_REWARD)
+    return batch.exclude(*sent, *map(keys.next_key, sent))
 
 
 def spotting(batch: TensorDictBase, server: Server) -> torch.Tensor:

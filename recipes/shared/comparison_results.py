@@ -95,8 +95,9 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
 
 
 def stored_results(folder: Path) -> Results:
-    """Read the results that a folder stores."""
-    return Results(*(_read(folder / name) for name in (ROWS, CURVES)))
+    """Read the results that a folder stores, but no curves of a version that drew perceived returns."""
+    rows, points = (_read(folder / name) for name in (ROWS, CURVES))
+    return Results(rows, [point for point in points if "hindsight_return" in point])
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

@@ -18,10 +18,14 @@ def late(config: TrainConfig) -> list[str]:
     return [*["delay.obs"] * has_message_delay(config), *found]
 
 
-def longest_wait(config: TrainConfig) -> int:
+def longest_delay(config: TrainConfig) -> int:
     """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
-    message, reward = (delay_sampler(config.delay, kind, config.clock.dt).longest for kind in ("obs", "rew"))
-    return max(message, reward) if backupdates(config) else message
+    return max(delay_sampler(config.delay, kind, config.clock.dt).longest for kind in ("obs", "rew"))
+
+
+def measures_hindsight(config: TrainConfig) -> bool:
+    """Whether messages or rewards are late, and the messages of every step are known to correct them."""
+    return bool({"delay.obs", "delay.rew"} & {*late(config)}) and not config.clock.skip
 
 
 def action_delay(config: TrainConfig) -> int | None:
@@ -44,7 +48,7 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
         worlds=config.worlds,
         shortest_period=clock.shortest,
         longest_period=clock.longest,
-        longest_delay=longest_wait(config),
+        longest_delay=longest_delay(config),
         backupdate=backupdates(config),
         settle=config.settle,
         recompute_actor="actor" in config.corrected,

@@ -58,6 +58,11 @@ TASKS = {
         "observation": SEEN,
         "actions": ActionConfig(kind="continuous"),
     },
+    "timeline": {
+        "delay": DelayConfig(obs=LATE),
+        "motion": MotionConfig(kind="polynomial", max_speed=20.0, max_acceleration=10.0),
+        "observation": ObservationConfig(["place"], ["others"], timeline=6),
+    },
     "a region of metres": {
         "delay": DelayConfig(obs=LATE),
         "observation": SEEN,
@@ -75,7 +80,7 @@ def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task,
     spotted, moved, n_steps = 0, 0, 90 if task == "flights" else 40
     for shown, fleet, action, ready, step in flights(scenario, greedy_policy, n_steps, fraction=fraction):
         read = fleet.observe(ready)
-        for key in (keys.OBSERVATION, keys.ACTION_MASK, keys.HISTORY):
+        for key in (keys.OBSERVATION, keys.ACTION_MASK, keys.TIMELINE):
             if key in shown.keys(True):
                 assert torch.equal(read[key], shown[key]), (step, key)
         held = shown.get(keys.RECEIVED, shown[keys.MESSAGE])
@@ -138,7 +143,7 @@ def test_after_a_long_silence_it_does_not_matter_when_somebody_asked(task, monke
         told(fleet, "a", START + 3 * SILENT + 5.5, 17, source_spotted=True)
         fleet.advance(START + 3 * SILENT + 9)
     one, other = (fleet.observe([0, 1, 2]) for fleet in fleets)
-    for key in (keys.OBSERVATION, keys.RECEIVED, keys.HISTORY):
+    for key in (keys.OBSERVATION, keys.RECEIVED, keys.TIMELINE):
         assert key not in one.keys(True) or torch.equal(one[key], other[key])
     assert fleets[0].step == fleets[1].step == 3 * SILENT + 9
 
@@ -203,7 +208,7 @@ def test_what_comes_in_late_fills_in_no_earlier_step_whenever_steps_are_taken():
             fleet.advance(START + 6.5)
         told(fleet, "a", START + 3, 205, START + 6.6, battery=10.0)
         fleet.advance(START + 7)
-        seen.append(fleet.observe([0])[keys.HISTORY])
+        seen.append(fleet.observe([0])[keys.TIMELINE])
     assert torch.equal(*seen)
 
 
@@ -234,7 +239,9 @@ def test_fleets_that_share_a_node_do_not_see_each_other(task):
                 told(fleet, uav, START + step - i, 30 * i + step, START + step, source_spotted=step == 5)
             advise(fleet, START + step + 0.5)
             read = fleet.observe([0, 1, 2])
-            seen += [read[key].tolist() for key in (keys.OBSERVATION, keys.HISTORY) if key in read.keys(True)]
+            seen += [
+                read[key].tolist() for key in (keys.OBSERVATION, keys.TIMELINE) if key in read.keys(True)
+            ]
         return [*seen, *map(list, fleet.told)]
 
     scenario = scenario_of(**TASKS[task])

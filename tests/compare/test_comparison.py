@@ -144,7 +144,7 @@ def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
         ("t", "none", "best"): [40.0],
     }
     curves = {
-        run: [[{"frames": x, "perceived_return": end * x / 100} for x in (0, 100)] for end in seeds]
+        run: [[{"frames": x, "hindsight_return": end * x / 100} for x in (0, 100)] for end in seeds]
         for run, seeds in ends.items()
     }
     lines = markdown(Comparison(rows_of("t", "late", SCORES), ARMS), curves, []).splitlines()

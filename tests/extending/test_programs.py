@@ -74,7 +74,7 @@ def test_a_scenario_of_ones_own_is_trained_with_a_learner_and_a_logger_of_ones_o
     assert config.learner.name == "learner:ReinforceConfig"
     assert (config.agents, config.delay.obs.law) == (2, "law:Distance")
     *_, progress = (first / "progress.txt").read_text().splitlines()
-    assert progress == f"128 steps: {float(metrics['perceived_return']) / 2:.0%}"
+    assert progress == f"128 steps: {float(metrics['hindsight_return']) / 2:.0%}"
     # The policy keeps its action history, which a file of the scenario has chosen.
     words = [OWN[0], "checkpoint=run", "trust=true", "agents=3", "delay=paper"]
     evaluated = run(*words, program="evaluate", name="evaluated")

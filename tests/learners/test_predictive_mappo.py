@@ -62,18 +62,23 @@ def collected(learner: PredictiveMappo, env: DelayedEnv) -> TensorDictBase:
 
 
 def example(*batch: int) -> tuple[MessageEncoder, list[Tensor]]:
-    """An encoder, and an observation of 5, a history of 7 messages of 2 + 3, and 3 codes of 4."""
+    """An encoder, and an observation of 5, a timeline of 2 senders and 4 slots of 2 + 1, and 3 codes of 4."""
     torch.manual_seed(1)
-    encoder = MessageEncoder(5, 5, 4, SMALL, heads=2, width=6)
-    inputs = [torch.rand(*batch, *shape) for shape in ((5,), (7, 5), (3, 4))]
+    encoder = MessageEncoder(5, 3, 4, SMALL, heads=2, width=6)
+    inputs = [torch.rand(*batch, *shape) for shape in ((5,), (2, 4, 3), (3, 4))]
     inputs[1][..., 2] = (inputs[1][..., 2] < 0.6).float()
     return encoder, inputs
 
 
-def twin(encoder: MessageEncoder, observation: Tensor, history: Tensor, code: Tensor) -> Tensor:
-    """The encoding of one observation [F], history [L, C] and code [K], by loops over heads and messages."""
-    known = [row for row in history if row[2] > 0]
-    reference = known[0][:2] if known else history[0, :2]
+def twin(encoder: MessageEncoder, observation: Tensor, timeline: Tensor, code: Tensor) -> Tensor:
+    """The encoding of an observation [F], timeline [S, K, C] and code [E], by loops over messages."""
+    rows = [
+        torch.cat([slot, torch.tensor([age / len(slots), float(sender == 0)])])
+        for sender, slots in enumerate(timeline)
+        for age, slot in enumerate(slots)
+    ]
+    known = [row for row in rows if row[2] > 0]
+    reference = known[0][:2] if known else rows[0][:2]
     asked = torch.cat([observation, reference, code])
     query = encoder.queries(asked).view(2, 6)
     rows = [encoder.embed(torch.cat([row, row[:2] - reference])) for row in known]

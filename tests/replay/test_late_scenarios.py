@@ -77,13 +77,23 @@ CASES: dict[str, dict[str, Any]] = {
         "delay": DelayConfig(obs=LATE, rew=LATE, history=2, **SUMMED),
         "clock": ClockConfig(server="2s", agents="4s"),
     },
+    "late messages, timeline": {
+        "delay": DelayConfig(obs=LATE),
+        "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7),
+    },
     "links": {
         "delay": DelayConfig(obs=LATE, rew=LATE),
         "clock": ClockConfig(server="2s"),
         "links": LinkConfig("matrix", delay=1),
     },
 }
-FLYING = {"late messages", "late messages, slow server", "late and summed rewards", "slow agents, history"}
+FLYING = {
+    "timeline",
+    "late messages",
+    "late messages, slow server",
+    "late and summed rewards",
+    "slow agents, history",
+}
 """Cases with real flights; in the others UAVs move at once."""
 
 

@@ -20,7 +20,10 @@ from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
-from damian.runs.metrics import EpisodeLog, Evaluation, evaluation
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.recompute import server_recompute
+from damian.runs.checkpoint import plain
+from damian.runs.metrics import EpisodeLog, Evaluation, HindsightReturns, evaluation
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import save_results
 from damian.runs.run_record import check_version
@@ -29,6 +32,7 @@ from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig
 from damian.settings import ScenarioConfig
+from damian.transforms.reward import EpisodeTotals
 from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig
 
@@ -209,7 +213,9 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
         log.add(part)
     latest = [ended_episodes(world.unsqueeze(0))[-3:] for world in batch]
     assert log.finished == len(ended_episodes(batch)) > 50
-    for name, mean in log.means().items():
+    means = log.means()
+    assert means.pop("hindsight_return") == means["perceived_return"]  # nothing is late
+    for name, mean in means.items():
         assert mean == pytest.approx(fmean([fmean([row[name] for row in world]) for world in latest]))
     assert {row["perceived_success_rate"] for world in latest for row in world} == {0.0, 1.0}
 
@@ -217,6 +223,42 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
     log.add(batch[:, : shortest + 1])
     assert log.finished > 0
     assert all(math.isnan(mean) for mean in log.means().values())
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_nothing_is_lost(loss):
+    late = DelayConfig(obs={"law": "uniform", "low": 1, "high": 4}, loss=loss)
+    env = make_env(square(delay=late, episode=EpisodeConfig(max_steps=7)), 3, extras=["message"])
+    server = env.server
+    env.append_transform(EpisodeTotals())
+    torch.manual_seed(0)
+    data = env.rollout(44, break_when_any_done=False)
+
+    def make() -> HindsightReturns:
+        return HindsightReturns(BackupdateStorage(72, server_recompute(server, ["reward"]), 4), 2)
+
+    measured, found = make(), []
+    for part in data.split([13, 1, 2, 28], 1):
+        state, measured = measured.state_dict(), make()
+        measured.load_state_dict(plain(state))
+        ended = measured.add(part)
+        found.append(ended)
+    found, steps = torch.cat(found, 1), data["next"]
+    assert found.shape == (2, 44 - 4)
+    for world in range(2):
+        total, newest = 0.0, data[keys.MESSAGE][world, 0].clone()
+        for t in range(found.shape[1]):
+            if t and steps[keys.DONE][world, t - 1]:
+                total, newest = 0.0, data[keys.MESSAGE][world, t].clone()
+            arrives = steps[keys.DELAY][world, t, :, 0] >= 0
+            newest[arrives] = steps[keys.MESSAGE][world, t][arrives]
+            messages = server.messages(newest.unsqueeze(0))
+            total += server(messages, steps[keys.STEP_COUNT][world, t]).reward.mean().item()
+            if steps[keys.DONE][world, t]:
+                assert found[world, t].item() == pytest.approx(total, abs=1e-5)
+            else:
+                assert found[world, t].isnan()
+    assert (found.isnan().logical_not().sum(1) == 5).all()
 
 
 # Tables and files.

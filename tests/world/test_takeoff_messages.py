@@ -22,7 +22,7 @@ def flying(**changed) -> ScenarioConfig:
         "motion": FLYING,
         "source": walking(level_db=136.0),
         "reward": RewardConfig(spotted=1.0, spotting_agents=0.5),
-        "observation": ObservationConfig(global_features=["spotting_agents"]),
+        "observation": ObservationConfig(global_features=["spotting_agents"], timeline=4),
         "episode": EpisodeConfig(max_steps=None, success_share=0.5),
     }
     return ScenarioConfig(**(sections | changed))
@@ -40,11 +40,17 @@ class FlyingUav:
     duration: float = 0.0
     elapsed: int = 10**6
     start: tuple = ()
+    stopped: bool = False
     message: dict = field(default_factory=dict)
+    stops: list = field(default_factory=list)
+    """Time and place of each landing, or decision to hold, the newest first."""
+    told: list = field(default_factory=list)
+    """Those that it has told."""
 
     def choose(self, target: tuple, motion: MotionConfig) -> None:
         """Begin to fly to a landing point, or to hold."""
         self.start, self.place, self.elapsed, self.duration = self.place, target, 0, 0.0
+        self.stopped = False
         self.motions += 1
         if self.start != target:
             phases = self.level, math.dist(self.start, target), self.level
@@ -57,6 +63,8 @@ class FlyingUav:
         if not landed and self.elapsed > 1:
             return False
         spotted = landed and math.dist(self.place, source) <= radius
+        if landed and not (self.stops and self.stopped):
+            self.stops, self.stopped = [(now, self.place), *self.stops], True
         if spotted:
             self.heard_at, self.heard_from = now, self.place
         self.message = {
@@ -68,6 +76,7 @@ class FlyingUav:
             "detected_time": self.heard_at,
             "detected_position": self.heard_from,
         }
+        self.told = list(self.stops)
         self.motions = 0 if spotted else self.motions
         return True
 
@@ -109,6 +118,9 @@ def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
                 )
                 for name, value in uav.message.items():
                     assert getattr(sent, name)[b, n].tolist() == pytest.approx(value, abs=1e-4), name
+                told_stops = zip(sent.landed[b, n].tolist(), sent.trail[b, n].tolist(), strict=True)
+                for (time, point), stop in zip(told_stops, uav.told, strict=False):
+                    assert (time, env.simulation.points[point].tolist()) == (stop[0], pytest.approx(stop[1]))
                 begun += uav.message["position"] != uav.message["target"]
             spots = [uav.message["spotted"] for uav in world]
             shared = 0.5 * sum(spots) / len(world)
