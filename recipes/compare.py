@@ -25,7 +25,7 @@ from damian.compare.figures import plot_curves, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.interrupt import end_interrupted, number_of
-from damian.settings.programs import SEEDS, CompareConfig
+from damian.settings.programs import SEEDS, CompareConfig, HeldOut
 
 from . import cli
 from .evaluate import fly, fly_untrained
@@ -44,17 +44,19 @@ POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
     """Every run with its checked settings: seed after seed, and last what flies others' policies."""
     tasks, delays = config.chosen("tasks"), {NOT_LATE: [], **config.chosen("delays")}
-    places: dict[str, tuple[str, list[str]]] = {task: (task, []) for task in tasks}
+    places = {task: (task, HeldOut()) for task in tasks}
     for name, held_out in config.experiment.held_out.items():
         for task in tasks if held_out.tasks is None else [t for t in tasks if t in held_out.tasks]:
-            places[f"{task}{HELD_OUT_MARK}{name}"] = (task, held_out.overrides)
+            places[f"{task}{HELD_OUT_MARK}{name}"] = (task, held_out)
     runs = [
         run
-        for place, (task, changes) in places.items()
+        for place, (task, held_out) in places.items()
         for delay, delay_overrides in delays.items()
         for name, arm in config.chosen("arms").items()
         if arm.delayed == (delay != NOT_LATE) and (arm.tasks is None or task in arm.tasks)
-        for overrides in [[*tasks[task], *delay_overrides, *changes]]
+        if (held_out.arms is None or name in held_out.arms)
+        and (held_out.delays is None or delay in held_out.delays)
+        for overrides in [[*tasks[task], *delay_overrides, *held_out.overrides]]
         for run in _seeds(config, folder / place / delay / name, task, overrides)
     ]
     by_folder = {run.folder: run.config for run in runs}

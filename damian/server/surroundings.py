@@ -85,6 +85,14 @@ def _others(v: FeatureCache) -> Tensor:
     return _four(torch.cat([ways[..., 0, :2], ways[..., 1, :]], -1))
 
 
+@FEATURES.register("ages")
+@feature("global", width=OTHERS)
+def _ages(v: FeatureCache) -> Tensor:
+    """Ages of what is known of the UAVs that ``others`` describes, over ten seconds, [*, N, 4]."""
+    age = v.messages.age(v.context.now) / v.context.age_scale
+    return _four(_of_nearest(v, age.unsqueeze(-1)).clamp(max=1))
+
+
 @FEATURES.register("timeline")
 @feature("timeline", width=None, low=-1.0)
 def _timeline(v: FeatureCache) -> Tensor:
@@ -106,20 +114,31 @@ def _timeline(v: FeatureCache) -> Tensor:
     return _four(_ways_to_nearest(v, places, known.unsqueeze(-1)).flatten(-2))
 
 
-def _ways_to_nearest(v: FeatureCache, places: Tensor, known: Tensor) -> Tensor:
-    """Ways to places [*, N, P, 2] of the nearest other UAVs, the nearest first, and 1, [*, N, 4, P, 3].
+def _nearest(v: FeatureCache) -> Tensor:
+    """Indices of at most four other UAVs, those with the nearest targets, the nearest first, [*, N, 4]."""
+    own = v.wanted(v.messages.target).unsqueeze(-2)
+    n, device = v.messages.target.shape[-2], own.device
+    itself = torch.eye(n, dtype=torch.bool, device=device)
+    itself = itself.unsqueeze(-2) if v.own_only else itself
+    ways = (v.messages.target.unsqueeze(-3) - own) / (v.context.scale / 2)[..., None, None, None]
+    distance = ways.square().sum(-1).masked_fill(itself, torch.inf)  # [*, N, N]
+    return distance.argsort(dim=-1, stable=True)[..., : min(OTHERS, n - 1)]
 
-    Zeros where a place is not ``known`` [*, N, P, 1]. Nearest are those whose targets are the nearest.
+
+def _of_nearest(v: FeatureCache, table: Tensor) -> Tensor:
+    """The rows of a table [*, N, F] for the nearest other UAVs of each, [*, N, 4, F]."""
+    nearest = v(_nearest)
+    rows = table.unsqueeze(-3).expand(*nearest.shape[:-1], *table.shape[-2:])
+    return rows.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, table.shape[-1]))
+
+
+def _ways_to_nearest(v: FeatureCache, places: Tensor, known: Tensor) -> Tensor:
+    """Ways to places [*, N, P, 2] of the nearest other UAVs, and 1, [*, N, 4, P, 3].
+
+    Zeros where a place is not ``known`` [*, N, P, 1].
     """
     half, own = v.context.scale / 2, v.wanted(v.messages.target).unsqueeze(-2)
-    itself = torch.eye(places.shape[-3], dtype=torch.bool, device=places.device)
-    itself = itself.unsqueeze(-2) if v.own_only else itself
-    ways = (v.messages.target.unsqueeze(-3) - own) / half[..., None, None, None]
-    distance = ways.square().sum(-1).masked_fill(itself, torch.inf)  # [*, N, N]
-    nearest = distance.argsort(dim=-1, stable=True)[..., : min(OTHERS, len(itself) - 1)]
-    table = torch.cat([places, known], -1).flatten(-2).unsqueeze(-3)
-    index = nearest.unsqueeze(-1).expand(*nearest.shape, table.shape[-1])
-    found = table.expand(*distance.shape, -1).gather(-2, index).unflatten(-1, (-1, 3))
+    found = _of_nearest(v, torch.cat([places, known], -1).flatten(-2)).unflatten(-1, (-1, 3))
     places, known = found.split([2, 1], -1)
     ways = ((places - own.unsqueeze(-2)) / half[..., None, None, None, None]).clamp(-1, 1)
     return torch.cat([ways * known, known], -1)

@@ -270,6 +270,8 @@ class HeldOut(Settings):
 
     overrides: list[str] = setting([], "Overrides of ``damian train``, such as another region.")
     tasks: list[str] | None = setting(None, "Tasks to change; all of them if not given.")
+    delays: list[str] | None = setting(None, "Delays of the training; all of them if not given.")
+    arms: list[str] | None = setting(None, "Arms whose policies are flown; all of them if not given.")
 
 
 @dataclass
@@ -288,8 +290,8 @@ class Experiment(Settings):
         super().__post_init__()
         for kind in ("tasks", "delays", "arms", "held_out"):
             for name in getattr(self, kind):
-                good = re.fullmatch(r"[\w.-]+", name) and name not in TAKEN
-                should = "cannot name a folder: use letters, digits, _ . - but not none, random or script"
+                good = re.fullmatch(r"[\w.+-]+", name) and name not in TAKEN
+                should = "cannot name a folder: use letters, digits, _ . + - but not none, random or script"
                 checks.require(bool(good), f"experiment.{kind}", name, should)
         for kind in ("tasks", "arms"):
             self.refuse(
@@ -297,8 +299,9 @@ class Experiment(Settings):
             )
         self._check_arms()
         for name, held_out in self.held_out.items():
-            for task in held_out.tasks or ():
-                checks.one_of(f"experiment.held_out.{name}.tasks", task, self.tasks)
+            for kind in ("tasks", "delays", "arms"):
+                for each in getattr(held_out, kind) or ():
+                    checks.one_of(f"experiment.held_out.{name}.{kind}", each, getattr(self, kind))
 
     def _check_arms(self) -> None:
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]

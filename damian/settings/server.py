@@ -22,7 +22,7 @@ GLOBAL_FEATURES = (
     "spotting_agents",
 )
 """Features of all UAVs, in the order of the paper's Table 2."""
-SURROUNDINGS = (("place", "time_left", "number"), ("others", "coverage_map"))
+SURROUNDINGS = (("place", "time_left", "number"), ("others", "ages", "coverage_map"))
 """Local and global features of what surrounds a UAV, beyond Table 2 (``damian.server.surroundings``)."""
 BELIEF_FEATURES = ("belief_gain", "belief_moments", "belief_map")
 """Features of the belief."""
