@@ -190,7 +190,7 @@ class TimedReport(Report):
     """A row of a log of which only the times count; its places need not be complete."""
 
     @model_validator(mode="after")
-    def _places_are_complete(self) -> "Report":
+    def _places_are_complete(self) -> "TimedReport":
         return self
 
 

@@ -158,8 +158,9 @@ def _choose(features: list[_Feature], index: Any, where: Any) -> list[_Feature]:
             choice = listed(f"{each.place} {show(each.properties)}" for each in chosen)
             problem = "choose by region.index=NUMBER or region.where=PROPERTY:VALUE, one or a list"
             raise InputError(f"{len(chosen)} features are areas: {problem}: {choice}")
-    if wrong := [each for each in chosen or features if each.fault] or not features:
-        faults = listed(f"{each.place} {each.fault}" for each in wrong) if features else "it has no features"
+    wrong = [f"{each.place} {each.fault}" for each in chosen or features if each.fault]
+    if wrong or not features:
+        faults = listed(wrong or ["it has no features"])
         raise InputError(f"{faults}; a region is an area: draw a closed outline (Polygon)")
     return chosen
 
