@@ -63,7 +63,7 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the made pages."""
-    pages = {name: (ROOT / source).read_text() for source, name in TEXTS.items()}
+    pages = {name: (ROOT / source).read_text(encoding="utf-8") for source, name in TEXTS.items()}
     pages |= {"commands/index.md": commands(), **{f"commands/{name}.md": settings(name) for name in SHOWN}}
     pages |= {"api/index.md": public_names(), **{f"api/{name}.md": package(name) for name in PACKAGES}}
     pages |= {f"examples/{path}.md": example(path) for path in examples()}
@@ -174,12 +174,12 @@ def examples() -> list[str]:
 def example(path: str) -> str:
     """The page of an example."""
     language = "yaml" if path.endswith(".yaml") else "python"
-    return f"# {path}\n\n```{language}\n{(ROOT / 'examples' / path).read_text()}```\n"
+    return f"# {path}\n\n```{language}\n{(ROOT / 'examples' / path).read_text(encoding='utf-8')}```\n"
 
 
 def notebook(path: Path) -> str:
     """The page of a notebook, without the outputs."""
-    cells = json.loads(path.read_text())["cells"]
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     texts = [("".join(cell["source"]), cell["cell_type"] == "code") for cell in cells]
     link = f"[{path.name}]({path.name}) runs in Jupyter."
     parts = [f"```python\n{text}\n```" if is_code else text for text, is_code in texts]
@@ -188,4 +188,4 @@ def notebook(path: Path) -> str:
 
 def docstring(path: Path) -> str:
     """The docstring of a module."""
-    return ast.get_docstring(ast.parse(path.read_text())) or ""
+    return ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""

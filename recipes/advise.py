@@ -21,7 +21,16 @@ from tensordict.nn import TensorDictModuleBase
 
 import damian
 from damian.advice.clock import Clock
-from damian.advice.fitting import fit, law_summary, plot_delays, read_log, steps_of, summary, trace_rows
+from damian.advice.fitting import (
+    check_clocks,
+    fit,
+    law_summary,
+    plot_delays,
+    read_log,
+    steps_of,
+    summary,
+    trace_rows,
+)
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.node import Node, for_uavs, scenario_of_service
 from damian.advice.rows import as_csv, as_rows, read_file
@@ -104,7 +113,8 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
 
 def fit_delays(config: AdviseConfig, folder: Path) -> None:
     """Write the delays of a log of reports as a trace, draw them, and print which law fits them best."""
-    fitted = fit(read_log(Path(str(config.fit))))
+    log = Path(str(config.fit))
+    check_clocks(fitted := fit(read_log(log)), log)
     save_config(without_token(config), folder)
     trace = folder / "trace.csv"
     write_atomically(trace, "\n".join(["delay", *trace_rows(fitted), ""]))

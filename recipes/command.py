@@ -3,6 +3,7 @@
 Help and wrong words are answered before TorchRL, which takes seconds to import, is loaded.
 """
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -34,6 +35,9 @@ SETTINGS = {name: name for name in PROGRAMS if name not in ("export", "results")
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the program that the first word names with the other words."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a pipe of Windows may be unable to carry every letter
+            stream.reconfigure(errors="backslashreplace")
     # Threads that wait for each other soon sleep: where other programs run, a training whose threads keep
     # spinning takes several times as long. OpenMP reads this when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")

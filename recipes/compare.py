@@ -166,7 +166,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
     if not results.rows:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
     report(config, results, missing, folder)
-    print((folder / MARKDOWN).read_text())
+    print((folder / MARKDOWN).read_text(encoding="utf-8"))
     print(f"results: {cli.shown(folder)}")
     if failed:
         sys.exit(1)

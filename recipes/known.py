@@ -182,7 +182,7 @@ def default_options(program: str) -> dict[str, str]:
     if program in FILELESS:
         return default_options("defaults")
     found: dict[str, str] = {}
-    for each in yaml.safe_load((CONF / f"{program}.yaml").read_text())["defaults"]:
+    for each in yaml.safe_load((CONF / f"{program}.yaml").read_text(encoding="utf-8"))["defaults"]:
         if each == "defaults":
             found |= default_options("defaults")
         elif not isinstance(each, str):

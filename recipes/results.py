@@ -72,7 +72,7 @@ def sweep_rows(folder: Path) -> tuple[list[str], list[dict[str, Any]]]:
 def is_comparison(folder: Path) -> bool:
     """Has a comparison stored its results in a folder? A sweep stores them under the same name."""
     path = folder / ROWS
-    return path.is_file() and "arm" in path.read_text().partition("\n")[0].split(",")
+    return path.is_file() and "arm" in path.read_text(encoding="utf-8").partition("\n")[0].split(",")
 
 
 def _value(text: str | None) -> Any:
@@ -135,7 +135,7 @@ def run() -> None:
         raise InputError("damian results FOLDER: give one folder, of a run, a sweep or a comparison")
     folder = Path(words[0])
     if is_comparison(folder) and (folder / MARKDOWN).exists():
-        print((folder / MARKDOWN).read_text())
+        print((folder / MARKDOWN).read_text(encoding="utf-8"))
     elif is_comparison(folder) or (folder / RESULTS).exists():
         print(_listed(rows_of(folder)))
     else:

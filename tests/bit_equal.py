@@ -96,7 +96,9 @@ def training(overrides: list[str]) -> dict[str, list[str]]:
 def record(path: Path, word: str = "") -> None:
     """Write the record of the version that is installed, of all cases whose name has a word."""
     cases = [[*scenario, *delay] for scenario in SCENARIOS for delay in DELAYS] + OTHERS
-    content = json.loads(path.read_text()) if path.exists() else {}  # what a stopped call has recorded
+    content = (
+        json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    )  # what a stopped call has recorded
     for kind, overrides in [*(("rollout", case) for case in cases), *(("training", c) for c in TRAININGS)]:
         name = f"{kind} {' '.join(overrides)}"
         if word not in name or name in content:
@@ -106,12 +108,12 @@ def record(path: Path, word: str = "") -> None:
             content[name] = rollout(overrides) if kind == "rollout" else training(overrides)
         except subprocess.CalledProcessError as error:
             raise SystemExit(f"{name}: {error.stderr.decode()}") from error
-        path.write_text(json.dumps(content, indent=1))
+        path.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def compare(before: Path, after: Path) -> int:
     """Print what differs between two records; returns the number of differences."""
-    old, new = json.loads(before.read_text()), json.loads(after.read_text())
+    old, new = json.loads(before.read_text(encoding="utf-8")), json.loads(after.read_text(encoding="utf-8"))
     differences = 0
     for name, entries in ((name, old[name]) for name in old if name in new):
         for key in [key for key in entries if key in new.get(name, {})]:

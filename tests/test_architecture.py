@@ -37,7 +37,7 @@ MODULES = {".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path f
 
 def imported(path: Path) -> Iterator[str]:
     """Every module, or name within one, that a file imports."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -101,6 +101,16 @@ def test_no_modules_import_each_other_in_a_circle():
 
 def test_every_file_says_in_a_sentence_what_it_is_for():
     assert not [path for path in FILES if not ast.get_docstring(ast.parse(path.read_text()))]
+
+
+def test_text_is_read_and_written_as_utf_8_everywhere():
+    """Where the type of a path is not known, ruff (PLW1514) does not see that the encoding is missing."""
+    for path in (
+        each for folder in ("damian", "recipes", "examples") for each in (ROOT.parent / folder).rglob("*.py")
+    ):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("read_text", "write_text"):
+                assert "encoding" in {each.arg for each in node.keywords}, f"{path}:{node.lineno}"
 
 
 def test_every_public_name_exists_and_is_loaded_on_demand():

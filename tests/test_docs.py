@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 import damian
-import damian.transforms
 from damian.recipes.command import PROGRAMS, SETTINGS
 from damian.recipes.known import check_words
 
@@ -29,7 +28,7 @@ def test_the_readmes_python_runs(capsys):
 
 def commands(file: Path) -> Iterator[tuple[str, list[str]]]:
     """The commands that a file names: program and words."""
-    text = file.read_text().replace("\\\n", "")
+    text = file.read_text(encoding="utf-8").replace("\\\n", "")
     for line in re.findall(r"(?:^[ #]*|`)damian ([a-z]+ [^`\n|]*)", text, re.MULTILINE):
         command = re.split(r"  +[#(]", line)[0]  # an explanation stands behind some spaces
         name, *words = shlex.split(command, comments=True)

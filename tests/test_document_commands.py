@@ -122,7 +122,7 @@ def write_journal(path: Path) -> None:
         row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
     path.parent.mkdir(exist_ok=True)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
 
 
 @pytest.mark.slow

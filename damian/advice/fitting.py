@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from damian.advice.journal import SUFFIX, Received, read_head, read_lines
-from damian.advice.rows import Report, read_file
+from damian.advice.rows import Report, TimedReport, read_file
 from damian.common.errors import InputError
 from damian.common.plotting import COLOURS
 from damian.common.text_files import named
@@ -20,6 +20,8 @@ REGULAR = 0.2
 """Share of a period by which the time between two reports may differ from whole periods."""
 MOST = 0.8
 """Share of the times between reports that must be whole periods, for the reports to count as regular."""
+LATEST_MEDIAN = 1800.0
+"""Longest median delay of a UAV [s]; a longer one is a clock of another time zone, or one since the start."""
 LONGEST_GAP = 1000
 """Most messages that are taken as lost between two that came in: longer gaps are pauses."""
 
@@ -37,7 +39,12 @@ class Message(NamedTuple):
     @property
     def delay(self) -> float:
         """How late it came in [s]; nan if it never did."""
-        return math.nan if self.received is None else max(self.received - self.time, 0.0)
+        return max(self.difference, 0.0)  # stays nan
+
+    @property
+    def difference(self) -> float:
+        """From its time to its receive time [s], below 0 if their clocks differ; nan if it never came in."""
+        return math.nan if self.received is None else self.received - self.time
 
 
 class Fit(NamedTuple):
@@ -57,7 +64,7 @@ def read_log(path: Path) -> list[Report]:
         reports = [report for line in lines if isinstance(line, Received) for report in line.reports]
     else:
         with named(path):
-            rows = read_file(path)
+            rows = read_file(path, TimedReport)
             for where, report in rows:
                 said = report.model_fields_set
                 if "time" not in said or not {"received", "aoi"} & said:
@@ -78,9 +85,13 @@ def fit(reports: Iterable[Report]) -> Fit:
     """
     found: list[Message] = []
     kinds: set[str] = set()
-    by_uav = sorted(reports, key=lambda report: (report.id, report.time, report.received))
+
+    def identity(report: Report) -> tuple[float, int]:  # a UAV that starts anew counts from 0
+        return (report.time, -1 if report.sequence is None else report.sequence)
+
+    by_uav = sorted(reports, key=lambda report: (report.id, *identity(report), report.received))
     for uav, own in groupby(by_uav, lambda report: report.id):
-        first_copies = [next(copies) for _, copies in groupby(own, lambda report: report.time)]
+        first_copies = [next(copies) for _, copies in groupby(own, identity)]
         gaps, kind = _gaps(first_copies)
         kinds.add(kind)
         times = [report.time for report in first_copies]
@@ -110,6 +121,17 @@ def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
     return [0] * len(between), "not to be seen (no numbers, no period)"
 
 
+def check_clocks(fitted: Fit, path: Path) -> None:
+    """Refuse a log whose messages mostly came in before they were generated, or far too late."""
+    for uav, own in groupby(fitted.messages, lambda message: message.uav):
+        typical = float(np.nanmedian([message.difference for message in own]))
+        if not 0 <= typical <= LATEST_MEDIAN:
+            raise InputError(
+                f"{path}: the clocks of {uav} and of the receiver differ: receive times are in the median "
+                f"{abs(typical):.3g} s {'before' if typical < 0 else 'after'} times; correct one of them"
+            )
+
+
 def trace_rows(fitted: Fit) -> list[str]:
     """The column ``delay`` of a trace, a row for each message: times, which a simulation rounds up."""
     return [LOST if m.received is None else f"{m.delay:.6f}s" for m in fitted.messages]
@@ -128,11 +150,14 @@ def summary(fitted: Fit) -> str:
     uavs, n = {message.uav for message in fitted.messages}, len(fitted.messages)
     times, n_lost = [message.time for message in fitted.messages], n - len(delays)
     median, most, nearly_all = np.quantile(delays, [0.5, 0.9, 0.99])
+    early = [-message.difference for message in fitted.messages if message.difference < 0]
+    problem = "came in before their time, because clocks differ, and count as 0 s late; the earliest by"
+    clocks = f"\n{len(early)} {problem} {max(early):.3g} s" if early else ""
     return (
         f"{n} messages of {len(uavs)} UAVs over {max(times) - min(times):.0f} s; lost: {n_lost} "
         f"({n_lost / n:.1%}), {fitted.losses}\n"
         f"delay [s]: mean {delays.mean():.3f}, median {median:.3f}, 90 % {most:.3f}, 99 % {nearly_all:.3f}, "
-        f"longest {delays.max():.3f}"
+        f"longest {delays.max():.3f}{clocks}"
     )
 
 

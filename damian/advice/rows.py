@@ -186,6 +186,14 @@ class Report(Row):
         return self
 
 
+class TimedReport(Report):
+    """A row of a log of which only the times count; its places need not be complete."""
+
+    @model_validator(mode="after")
+    def _places_are_complete(self) -> "TimedReport":
+        return self
+
+
 @lru_cache(1000)
 def _column(name: str) -> str:
     return name.strip().lower().replace("_", " ").replace("-", " ")
@@ -200,10 +208,10 @@ Found = list[tuple[str, Any]]
 Rows = list[tuple[str, Report]]
 
 
-def read_file(path: Path) -> Rows:
+def read_file(path: Path, kind: type[Report] = Report) -> Rows:
     """Reports of a file: JSON if its name ends with ``.json``, or else CSV."""
     text = read_text(path)
-    return reports_of(rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text))
+    return reports_of(rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text), kind)
 
 
 def rows_of_csv(text: str) -> Found:
@@ -217,11 +225,11 @@ def rows_of_json(text: str | bytes) -> Found:
     return [(f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)]
 
 
-def reports_of(found: Found) -> Rows:
+def reports_of(found: Found, kind: type[Report] = Report) -> Rows:
     """Rows as reports."""
     if not found:
         raise InputError("there are no rows")
-    return [(where, validated(Report, row, where)) for where, row in found]
+    return [(where, validated(kind, row, where)) for where, row in found]
 
 
 def acknowledgements_of(found: Found) -> list[Acknowledgement]:

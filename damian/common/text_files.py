@@ -5,6 +5,7 @@ import difflib
 import io
 import os
 import reprlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple
 
 from damian.common.errors import InputError
 
+MAX_COLUMNS = 1000
+"""Most columns of a table."""
 MAX_LINE = 1000
 """Characters of an error; the middle of a longer one is left out."""
 
@@ -46,9 +49,11 @@ def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
     except csv.Error as error:
         raise InputError(f"line {reader.line_num}: {error}; give comma-separated values") from None
     (first, header), *lines = [row for row in lines if any(row[1])] or [(1, [])]
+    if len(header) > MAX_COLUMNS:
+        raise InputError(f"line {first}: {len(header)} columns are more than {MAX_COLUMNS}")
     if missing := [column for column in columns if column not in header]:
         raise InputError(f"line {first}: no column {', '.join(missing)}; {near(missing[0], header)}")
-    if doubled := [column for column in header if column and header.count(column) > 1]:
+    if doubled := [column for column, times in Counter(header).items() if column and times > 1]:
         raise InputError(f"line {first}: the column {show(doubled[0])} appears twice")
     for number, cells in lines:
         if len(cells) != len(header):

@@ -65,8 +65,8 @@ class TimeStorage(LazyTensorStorage):
 
     def dumps(self, path: str | Path) -> None:
         super().dumps(path)
-        (Path(path) / _LAST).write_text(json.dumps(self._last))
+        (Path(path) / _LAST).write_text(json.dumps(self._last), encoding="utf-8")
 
     def loads(self, path: str | Path) -> None:
         super().loads(path)
-        self._last_cursor = json.loads((Path(path) / _LAST).read_text())
+        self._last_cursor = json.loads((Path(path) / _LAST).read_text(encoding="utf-8"))

@@ -77,7 +77,7 @@ def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Lo
     stored = folder / "wandb_id.txt"
     if not stored.exists():
         write_atomically(stored, secrets.token_hex(8))
-    number = stored.read_text()
+    number = stored.read_text(encoding="utf-8")
     logger: Any = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
     logger.close = library.finish
     return logger

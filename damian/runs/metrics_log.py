@@ -64,7 +64,7 @@ class MetricsLog:
         if self._path and new:  # a learner may log more once it has begun to learn
             write_atomically(self._path, self._text(self.rows, head=True))
         elif self._path:
-            with writing(self._path), self._path.open("a", newline="") as file:
+            with writing(self._path), self._path.open("a", encoding="utf-8", newline="") as file:
                 file.write(self._text([row]))
 
     def sync(self) -> None:
@@ -114,7 +114,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     if not path.exists():
         return []
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
         reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
         rows = [{name: float(number) for name, number in row.items()} for row in reader]
     except OSError as error:

@@ -47,7 +47,7 @@ def commit() -> str | None:
         return None
     git = ["git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes"]
     try:
-        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(git, capture_output=True, encoding="utf-8", check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
 
@@ -67,7 +67,7 @@ def timed(folder: Path) -> Iterator[None]:
 def read_record(folder: Path) -> dict[str, Any]:
     """The record of a run; empty if there is none that can be read."""
     try:
-        record = json.loads((folder / RECORD).read_text())
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return record if isinstance(record, dict) and "damian" in record else {}

@@ -190,4 +190,4 @@ def check_place(key: str, place: Any) -> None:
     good, example = set(place) == {"lat", "lon"}, "{lat: 53.1, lon: -4.5}"
     checks.require(good, key, place, f"is not {{lat: ..., lon: ...}} in degrees, such as {example}")
     checks.in_range(f"{key}.lat", place["lat"], -90.0, 90.0, "deg")
-    checks.in_range(f"{key}.lon", place["lon"], -180.0, 180.0, "deg")
+    checks.in_range(f"{key}.lon", place["lon"], -360.0, 360.0, "deg")

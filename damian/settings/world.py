@@ -1,5 +1,6 @@
 """Settings of the simulated world: UAVs, region, motion, signal source, batteries and actions."""
 
+import re
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -30,11 +31,17 @@ class RegionConfig(Settings):
     max_area: float = setting(200000.0, "Largest area of a random region [m^2].", above=0, kinds=RANDOM)
     pool: int = setting(1, "Number of random regions, drawn once per seed.", low=1, high=10_000, kinds=RANDOM)
     vertices: list = setting([], "Polygon corners, [x, y] each [m].", kinds=("vertices",))
-    path: str = setting("", "File to read, such as damian:fir.csv of the package.", kinds=("fir", "geojson"))
+    path: str = setting(
+        "",
+        "File, such as park.geojson, .kml, .gpkg, .shp, .plan (fir: damian:fir.csv).",
+        kinds=("fir", "geojson"),
+    )
     id: str = setting("", "Airspace ID of the region in the FIR table.", kinds=("fir",))
-    index: int | None = setting(None, "Index of the GeoJSON feature, from 0.", low=0, kinds=GEOJSON)
-    where: str | None = setting(
-        None, "Property that selects the feature of the GeoJSON file, as ``property:value``.", kinds=GEOJSON
+    index: Any = setting(
+        None, "Index of the feature in the file, from 0, or a list of several to unite.", kinds=GEOJSON
+    )
+    where: Any = setting(
+        None, "Property of the feature in the file, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
     lattice_step: float = setting(30.0, "Distance between landing points of a lattice row [m].", above=0)
     lattice_angle: float = setting(45.0, "Slant of the landing-point lattice [deg].", above=0, high=90)
@@ -58,6 +65,17 @@ class RegionConfig(Settings):
             self.refuse(not getattr(self, name), name, f"is missing: region.kind={self.kind} needs it")
         problem = "means nothing without a region of your own (region.kind=package.module:function)"
         self.refuse(self.options is not None and ":" not in self.kind, "options", problem)
+        indices = self.index if isinstance(self.index, list) else [self.index]
+        good = indices == [None] or (indices and all(type(each) is int and each >= 0 for each in indices))
+        self.refuse(not good, "index", "is not a feature's number, counted from 0, or a list of numbers")
+        texts = self.where if isinstance(self.where, list) else [self.where]
+        good = texts == [None] or (
+            texts and all(isinstance(each, str) and re.search(".[:=]", each) for each in texts)
+        )
+        problem = "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
+        self.refuse(not good, "where", problem)
+        both = self.index is not None and self.where is not None
+        self.refuse(both, "where", "and region.index both choose; give one of them")
         self.refuse_unread()
         for place in self.start_positions or []:
             check_place("region.start_positions", place)

@@ -197,7 +197,7 @@ def jaxmarl_ms(worlds: int) -> float | None:
     if not JAXMARL_PYTHON.exists():
         return None
     words = [str(JAXMARL_PYTHON), str(Path(__file__).with_name("bench_jaxmarl.py")), str(worlds)]
-    return float(subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()[-1])
+    return float(subprocess.run(words, capture_output=True, encoding="utf-8", check=True).stdout.split()[-1])
 
 
 def ratios(times: Mapping[str, Measured], name: str) -> list[float]:
@@ -380,7 +380,7 @@ def measure(quick: bool) -> None:
         report.append(part())
         print(report[-1])
     target = Path("runs/bench.md")
-    target.write_text("\n".join(report))
+    target.write_text("\n".join(report), encoding="utf-8")
     print(f"results: {target}, figure: {target.with_suffix('.png')}")
 
 

@@ -52,7 +52,9 @@ def start(folder: Path, words: Sequence[str]) -> tuple[subprocess.Popen, int]:
     code = "from damian.recipes.command import main; main()"
     given = [*words, "port=0", f"token={TOKEN}", f"hydra.run.dir={folder}/run"]
     process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", code, "advise", *given], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-W", "ignore", "-c", code, "advise", *given],
+        stdout=subprocess.PIPE,
+        encoding="utf-8",
     )
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(process.pid, {sorted(os.sched_getaffinity(0))[0]})
@@ -131,7 +133,7 @@ def load(connections: Sequence[Connection], seconds: float, rate: float | None) 
 
 def processor_time(process: subprocess.Popen) -> float:
     """Processor time that a process has used [s]."""
-    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    fields = Path(f"/proc/{process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
@@ -174,11 +176,11 @@ def fly_an_hour(folder: Path, words: Sequence[str], n_fleets: int) -> None:
     session._unsaved.clear()  # it was killed: nothing is stored at its end
     session.close()
     journal, snapshot = folder / "f10000.jsonl", folder / "f10000.snapshot"
-    text = journal.read_text()
+    text = journal.read_text(encoding="utf-8")
     sizes = [each.stat().st_size / 1e6 for each in (journal, snapshot)]
     print(f"a journal has {sizes[0]:.2f} MB and", text.count("\n"), f"lines, a snapshot {sizes[1]:.2f} MB")
     for fleet in range(10_001, 10_000 + n_fleets):
-        (folder / f"f{fleet}.jsonl").write_text(text.replace("f10000", f"f{fleet}", 1))
+        (folder / f"f{fleet}.jsonl").write_text(text.replace("f10000", f"f{fleet}", 1), encoding="utf-8")
         (folder / f"f{fleet}.snapshot").write_bytes(snapshot.read_bytes())
 
 

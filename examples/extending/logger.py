@@ -22,7 +22,7 @@ class Progress:
         if name != "train/hindsight_return":
             return
         if self.seen % self.every == 0:
-            with self.file.open("a") as file:
+            with self.file.open("a", encoding="utf-8") as file:
                 file.write(f"{step} steps: {value / self.goal:.0%}\n")
         self.seen += 1
 

@@ -1,5 +1,7 @@
 """A bridge between the service of ``damian advise`` and vehicles that speak MAVLink (ArduCopter).
 
+For now, it is for simulation and supervised trials only: see README.md beside it.
+
     python examples/mavlink/bridge.py --service http://127.0.0.1:8000 --fleet north \
         --vehicle A=udpin:127.0.0.1:14551 --vehicle B=udpin:127.0.0.1:14552    # the token: DAMIAN_TOKEN
 

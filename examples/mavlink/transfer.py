@@ -137,7 +137,7 @@ def write_reports(folder: Path) -> Path:
             own = f"{path.stem}-{report.id}", f"{report.time:.6f}", f"{report.received:.6f}"
             rows.append([*own, report.lat, report.lon, report.fla, report.sequence])
     table = folder / "reports.csv"
-    with table.open("w", newline="") as file:
+    with table.open("w", encoding="utf-8", newline="") as file:
         head = ["ID", "time", "receive time", "lat", "lon", "FLA", "sequence"]
         csv.writer(file).writerows([head, *rows])
     return table

@@ -203,11 +203,11 @@ def table(results: Results, args: Namespace) -> str:
         for name in found[0]:
             values = [returns[name] for returns in found]
             rows.append([arm, name, *(f"{value:.0f}" for value in (statistics.mean(values), *values))])
-    with (args.out / "results.csv").open("w", newline="") as file:
+    with (args.out / "results.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows(rows)
     title = f"# {args.env}, SAC, {args.steps} steps: return, mean of {args.episodes} episodes"
     text = f"{title}\n\n{markdown_table(rows[0], [row for row in rows[1:] if 'after' not in row[1]])}\n"
-    (args.out / "results.md").write_text(text)
+    (args.out / "results.md").write_text(text, encoding="utf-8")
     return text
 
 

@@ -166,7 +166,7 @@ def run_arm(name: str, seed: int, args: Namespace) -> dict[str, dict[str, float]
 
 def table(results: Results, args: Namespace) -> str:
     """Write the results as results.csv and table.md; returns the latter's text."""
-    with (args.out / "results.csv").open("w", newline="") as file:
+    with (args.out / "results.csv").open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["arm", "delay", "seed", *ACTING])
         for (arm, seed), returns in results.items():
@@ -186,7 +186,7 @@ def table(results: Results, args: Namespace) -> str:
         lines += [[f"{arm}, published", *map(str, known), ""] for arm, known in PUBLISHED.items()]
         parts += [f"## Actions: {how}", markdown_table(["arm", *EVALUATED, "recovery"], lines)]
     text = "\n\n".join(parts) + "\n"
-    (args.out / "table.md").write_text(text)
+    (args.out / "table.md").write_text(text, encoding="utf-8")
     return text
 
 

@@ -33,7 +33,9 @@ def carried_out(args: Namespace, run_arm: Callable[[str, int, Namespace], dict[s
     settings = {k: v for k, v in vars(args).items() if k not in ("arms", "seeds", "out", "jobs")}
     files = {(arm, seed): args.out / f"seed{seed}_{arm}.json" for seed in args.seeds for arm in args.arms}
     args.out.mkdir(parents=True, exist_ok=True)
-    stored = {run: json.loads(file.read_text()) for run, file in files.items() if file.exists()}
+    stored = {
+        run: json.loads(file.read_text(encoding="utf-8")) for run, file in files.items() if file.exists()
+    }
     for run, found in stored.items():
         if found["settings"] != settings:
             sys.exit(
@@ -43,7 +45,7 @@ def carried_out(args: Namespace, run_arm: Callable[[str, int, Namespace], dict[s
 
     def keep(run: tuple[str, int], returns: dict[str, Any]) -> None:
         stored[run] = {"settings": settings, "returns": returns}
-        files[run].write_text(json.dumps(stored[run]))
+        files[run].write_text(json.dumps(stored[run]), encoding="utf-8")
 
     if args.jobs == 1:
         for run in todo:

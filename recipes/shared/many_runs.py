@@ -86,7 +86,7 @@ class Run:
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """The rows of results in a CSV file."""
     kinds = dict.fromkeys(WORDS, str) | {"seed": int}
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         return [{k: kinds.get(k, float)(x) for k, x in row.items()} for row in csv.DictReader(file)]
 
 
@@ -184,7 +184,11 @@ def _end_with_parent() -> None:
 def perform_run(run: Run) -> None:
     """Carry out one run, resuming it if it has a checkpoint."""
     run.folder.mkdir(parents=True, exist_ok=True)
-    with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
+    with (
+        (run.folder / LOG).open("a", encoding="utf-8", buffering=1) as log,
+        redirect_stdout(log),
+        redirect_stderr(log),
+    ):
         try:
             if run.needs is not None and not (run.needs / RESULTS).exists():
                 raise InputError(f"checkpoint: {run.needs} has no finished policy")

@@ -78,6 +78,32 @@ def test_a_uav_that_is_silent_in_flight_loses_nothing(log):
     assert "lost" not in trace_rows(fitted)
 
 
+def test_numbered_reports_of_one_second_are_different_messages_also_without_places(log):
+    numbers = [n for n in range(300) if n % 50 != 7]
+    lines = [f"A,{n // 5},{n // 5 + 0.9},{n}" for n in [*numbers, 100]]  # one of them twice
+    fitted = fit(read_log(log("\n".join(["ID,time,receive time,sequence", *lines]))))
+    assert summary(fitted).startswith("300 messages of 1 UAVs over 59 s; lost: 6 (2.0%), by their numbers")
+    assert trace_rows(fitted)[7] == "lost"
+
+
+@pytest.mark.parametrize(("shift", "said"), [(-2.0, "1.5 s before"), (3600.0, "3.6e+03 s after")])
+def test_clocks_that_differ_are_named_before_anything_is_written(log, tmp_path, capsys, shift, said):
+    lines = [f"{uav},{i},{i + 0.5 + own}" for i in range(10, 30) for uav, own in (("A", 0), ("B", shift))]
+    path = log("\n".join(["ID,time,receive time", *lines]))
+    with pytest.raises(SystemExit):
+        main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+    (line,) = capsys.readouterr().err.splitlines()
+    start = f"error: {path}: the clocks of B and of the receiver differ: receive times are in the median"
+    assert line.startswith(f"{start} {said} times; correct one of them")
+    assert not (tmp_path / "run" / "trace.csv").exists()
+
+
+def test_a_few_messages_that_came_in_before_their_time_are_named(log):
+    few = log("\n".join(["ID,time,receive time", "A,0,0.5", "A,1,0.8", "A,2,2.5"]))
+    told = "1 came in before their time, because clocks differ, and count as 0 s late; the earliest by 0.2 s"
+    assert summary(fit(read_log(few))).endswith(told)
+
+
 def test_the_law_of_the_delays_is_a_setting_and_bursts_are_named(log, tmp_path, capsys):
     lines = [f"A,{i},{i + (5.5 if i % 25 < 5 else 0.5)},53.1,-4.5,{i}" for i in range(500) if i % 25]
     path = log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))

@@ -25,7 +25,7 @@ SCRIPT = ["policy=script", "actions.distances=[0,30,60]", "region.initial_condit
 def run(tmp_path, monkeypatch):
     """Run the program with overrides in an empty folder; returns its run folder."""
     monkeypatch.chdir(tmp_path)
-    Path("table.csv").write_text(TABLE)
+    Path("table.csv").write_text(TABLE, encoding="utf-8")
 
     def run_recipe(*overrides: str) -> Path:
         monkeypatch.setattr(sys, "argv", ["advise.py", *overrides, "hydra.run.dir=run"])
@@ -62,7 +62,7 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["train.py", *words, "hydra.run.dir=trained"])
     train()
     rows = TABLE.splitlines()
-    Path("two.csv").write_text("\n".join(rows[:3]))
+    Path("two.csv").write_text("\n".join(rows[:3]), encoding="utf-8")
     for word in ("motion=instant", "motion=polynomial"):  # what is given now does not change the training
         check_refused(
             lambda word=word: run("checkpoint=trained", "reports=two.csv", word), "motion: instant: ", capsys

@@ -59,10 +59,14 @@ def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
     before = contents(copied)
     n_bytes = len(before["checkpoint.pt"]) // 2
     assert ended(forked(["resume=run", "hydra.run.dir=unused"], lambda: limit_files_to(n_bytes))) == 3
-    errors = [line for line in Path("output.txt").read_text().splitlines() if "error" in line.lower()]
+    errors = [
+        line
+        for line in Path("output.txt").read_text(encoding="utf-8").splitlines()
+        if "error" in line.lower()
+    ]
     assert len(errors) == 1
     assert errors[0].startswith("error: run/checkpoint.pt: it cannot be written: File too large")
-    assert "Traceback" not in Path("output.txt").read_text()
+    assert "Traceback" not in Path("output.txt").read_text(encoding="utf-8")
     after = contents(copied)
     assert {name for name in after if after[name] != before.get(name)} <= {
         "metrics.csv",

@@ -97,7 +97,7 @@ def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, mo
     words = ["frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "hydra.run.dir=trained"]
     monkeypatch.setattr(sys, "argv", ["train.py", *flown, *words, "episode.max_steps=20"])
     train()
-    with Path("trained", "result.csv").open(newline="") as file:
+    with Path("trained", "result.csv").open(encoding="utf-8", newline="") as file:
         measured = {row["policy"]: float(row["perceived_return"]) for row in csv.DictReader(file)}
     for policy, own in (("deterministic", ["checkpoint=trained"]), ("script", flown)):
         words = [*own, f"policy={policy}", "eval_episodes=6", "episode.max_steps=20"]

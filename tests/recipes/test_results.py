@@ -1,6 +1,9 @@
 """``damian.load`` reads trained policies, ``damian.results`` the results of runs, sweeps and comparisons."""
 
 import csv
+import os
+import subprocess
+import sys
 from pathlib import Path
 from statistics import fmean
 
@@ -74,6 +77,22 @@ def test_a_sweep_ends_with_a_table_of_means_over_seeds(sweep, capsys):
     main(["results", str(sweep)])
     assert capsys.readouterr().out.startswith("| delay.obs |")
     assert {path.name: path.read_bytes() for path in sweep.glob("*.csv")} == before
+
+
+def test_results_are_utf_8_whatever_the_locale_and_shown_also_where_it_lacks_a_letter(tmp_path):
+    text = "policy,episodes,return\nŁąka,4,1.5\n"
+    (tmp_path / "result.csv").write_text(text, encoding="utf-8")
+    ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    command = [sys.executable, "-c", "from damian.recipes.command import main; main()"]
+    done = subprocess.run(
+        [*command, "results", str(tmp_path)],
+        env=os.environ | ascii_only,
+        capture_output=True,
+        encoding="ascii",
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "| \\u0141\\u0105ka |" in done.stdout
 
 
 @pytest.mark.slow

@@ -92,7 +92,7 @@ def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int])
         begun = Path(folder, "config.yaml").exists()
         again = [f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"]
         code = stop(again) if stops < STOPS_PER_RUN else ended(forked(again))
-        assert code in STOPPED, Path("output.txt").read_text()[-2000:]
+        assert code in STOPPED, Path("output.txt").read_text(encoding="utf-8")[-2000:]
         if code == 0:
             return stops
     raise AssertionError("a run that nothing stops does not end")

@@ -1,18 +1,23 @@
-"""FIR tables and GeoJSON: regions of valid files, and the one-line error of each invalid file."""
+"""FIR tables and maps: regions of valid files, and the one-line error of each invalid file."""
 
 import json
+import sys
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
+import pyogrio
+import pyproj
 import pytest
 import shapely
 from shapely.geometry import Polygon
 
 import damian
 from damian.common.errors import InputError
+from damian.settings.world import RegionConfig
+from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon
-from damian.world.regions.geojson import read_geojson
 from damian.world.regions.region import Region
 
 DATA = Path(__file__).parents[1] / "data" / "regions"
@@ -53,7 +58,7 @@ def test_rows_of_a_table_are_ordered_by_sequence_number():
 
 
 def test_a_hole_stays_a_hole_and_heights_are_ignored():
-    region = read_geojson(ZONES, where="name=lake")
+    region = read_area(ZONES, where="name=lake")
     assert len(region.polygon.interiors) == 1
     outer_area = Polygon(region.polygon.exterior).area
     assert region.polygon.area == pytest.approx(outer_area * 8 / 9, rel=1e-3)
@@ -61,6 +66,7 @@ def test_a_hole_stays_a_hole_and_heights_are_ignored():
 
 
 SQUARE = [[[8.0, 45.0], [8.01, 45.0], [8.01, 45.01], [8.0, 45.01], [8.0, 45.0]]]
+RING = SQUARE[0]
 POINT = {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [8, 45]}}
 
 
@@ -89,11 +95,170 @@ def _collection(*features):
 def test_each_kind_of_geojson_yields_its_only_area(tmp_path, document):
     file = tmp_path / "square.geojson"
     file.write_text(json.dumps(document), encoding="utf-8-sig")
-    region = read_geojson(file)
+    region = read_area(file)
     corners = [[45, 8], [45, 8.01], [45.01, 8.01], [45.01, 8], [45, 8]]
     area = (0.01 * DEGREE_M) ** 2 * np.cos(np.radians(45.005))
     assert region.polygon.area == pytest.approx(area, rel=1e-4)
     assert sorted(_places(region).round(9).tolist()) == sorted(corners)
+
+
+def _written(folder, name, content) -> Path:
+    file = folder / name
+    file.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    return file
+
+
+UNEVEN = [[[8.0, 45.0, 10], [8.01, 45.0], [8.01, 45.01, 11, 5], [8.0, 45.01], [8.0, 45.0, 10]]]
+PARTLY_EMPTY = {"type": "MultiPolygon", "coordinates": [[], SQUARE]}
+FOLDED = {"type": "GeometryCollection", "geometries": [POINT["geometry"], _polygon(*SQUARE)]}
+
+
+@pytest.mark.parametrize(
+    "geometry",
+    [_polygon(*UNEVEN), PARTLY_EMPTY, FOLDED, {"type": "GeometryCollection", "geometries": [FOLDED]}],
+)
+def test_heights_empty_parts_and_collections_do_not_hide_an_area(tmp_path, geometry):
+    empty = _feature(_polygon())
+    file = _written(tmp_path, "square.geojson", _collection(empty, _feature(None), _feature(geometry)))
+    plain = read_area(_written(tmp_path, "plain.json", _polygon(*SQUARE)))
+    assert read_area(file).polygon.equals(plain.polygon)
+
+
+def _in_metres() -> tuple[list, str]:
+    """Corners of the square in the grid of Europe (its axes: north, east) [m], and the name of its crs."""
+    turned = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:3035", always_xy=True)
+    return [list(turned.transform(*corner)) for corner in SQUARE[0]], "urn:ogc:def:crs:EPSG::3035"
+
+
+def _crs(name):
+    return {"type": "name", "properties": {"name": name}}
+
+
+@pytest.mark.parametrize("holder", ["collection", "feature", "geometry"])
+def test_the_coordinate_reference_system_of_geojson_is_obeyed(tmp_path, holder):
+    ring, name = _in_metres()
+    geometry = _polygon(ring)
+    feature = _feature(geometry)
+    document = _collection(feature)
+    document["crs"] = _crs("EPSG:3857")  # the innermost counts
+    {"collection": document, "feature": feature, "geometry": geometry}[holder]["crs"] = _crs(name)
+    corners = _places(read_area(_written(tmp_path, "utm.geojson", document)))
+    np.testing.assert_allclose(corners, np.array(SQUARE[0])[:, ::-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("turns", [-1, 0])
+def test_longitudes_of_an_area_across_the_antimeridian_may_go_beyond_180_degrees(tmp_path, turns):
+    lon, lat = np.array([[179.99, -17], [180.01, -17], [180.01, -16.99], [179.99, -16.99]]).T
+    found = []
+    for written in (lon + 360 * turns, (lon + 180) % 360 - 180):
+        ring = np.column_stack([written, lat]).tolist()
+        found.append(read_area(_written(tmp_path, "fiji.geojson", _polygon(ring))))
+    beyond, wrapped = found
+    assert beyond.polygon.equals_exact(wrapped.polygon, 1e-6)
+    assert beyond.origin == pytest.approx(wrapped.origin)
+
+
+PLACEMARK = """<Folder><Placemark><name>{}</name><Polygon><outerBoundaryIs><LinearRing><coordinates>
+{}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></Folder>"""
+
+
+def _map(file: Path, crs: str = "EPSG:4326", ring: list = RING) -> Path:
+    """Two areas with heights in a file of a suffix that GDAL knows."""
+    areas = {
+        "Łąka: a=b": [[*corner, 100.0] for corner in ring],
+        "yard": [[x + 0.01, y, 0.0] for x, y in ring],
+    }
+    if file.suffix == ".kml":
+        rings = {
+            name: " ".join(",".join(map(str, corner)) for corner in area) for name, area in areas.items()
+        }
+        folders = "".join(PLACEMARK.format(name, ring) for name, ring in rings.items())
+        kml = f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{folders}</Document></kml>'
+        return _written(file.parent, file.name, kml)
+    about = {"geometry_type": "Polygon Z", "crs": crs, "encoding": "UTF-8"}
+    wkb = shapely.to_wkb(np.array([Polygon(area) for area in areas.values()]))
+    pyogrio.raw.write(file, wkb, [np.array([*areas], dtype=object)], ["Name"], **about)
+    return file
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".shp", ".kml", ".kmz"])
+def test_maps_of_other_kinds_are_read_by_their_suffix(tmp_path, suffix):
+    file = _map(tmp_path / f"map{suffix.replace('z', 'l')}")
+    if suffix == ".kmz":
+        with ZipFile(tmp_path / "map.kmz", "w") as archive:
+            archive.write(file, "doc.kml")
+        file = tmp_path / "map.kmz"
+    square = read_area(_written(tmp_path, "square.geojson", _polygon(RING)))
+    region = read_area(file, where="Name:Łąka: a=b")
+    assert region.name == "Łąka: a=b"
+    assert region.polygon.normalize().equals_exact(square.polygon.normalize(), 1e-6)
+    assert read_area(file, index=1).name == "yard"
+
+
+def test_a_map_in_metres_is_read_by_its_coordinate_reference_system(tmp_path):
+    file = _map(tmp_path / "utm.shp", "EPSG:3035", _in_metres()[0])
+    corners = np.unique(_places(read_area(file, index=0)).round(8), axis=0)
+    np.testing.assert_allclose(corners, np.unique(np.array(RING)[:, ::-1], axis=0), atol=1e-7)
+    file.with_suffix(".prj").unlink()
+    _assert_one_line_error(file, "no name (crs, or a file .prj)", lambda: read_area(file, index=0))
+
+
+def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(tmp_path):
+    def fence(ring, inclusion):
+        return {"inclusion": inclusion, "polygon": [[lat, lon] for lon, lat in ring[:-1]], "version": 1}
+
+    inner = [[8.0, 45.0], [8.005, 45.0], [8.005, 45.01], [8.0, 45.01], [8.0, 45.0]]
+    fences = {"circles": [], "polygons": [fence(inner, False), fence(SQUARE[0], True)]}
+    plan = {"fileType": "Plan", "geoFence": fences}
+    whole = read_area(_written(tmp_path, "square.geojson", _polygon(*SQUARE))).polygon.area
+    half = read_area(_written(tmp_path, "fence.plan", plan))
+    assert half.polygon.area == pytest.approx(whole / 2, rel=1e-4)
+    assert half.origin == pytest.approx((45.005, 8.0075), abs=1e-6)
+    fences["circles"] = [{"circle": {"center": [45, 8], "radius": 40}, "inclusion": False}]
+    file = _written(tmp_path, "circle.plan", plan)
+    _assert_one_line_error(file, "geoFence.circles: a circle is not read", lambda: read_area(file))
+
+
+@pytest.mark.parametrize("choice", [{"index": [1, 2]}, {"where": ["name:a", "name=b"]}])
+def test_several_features_are_united_by_choice(tmp_path, choice):
+    east = [[lon + 0.01, lat] for lon, lat in RING]
+    features = [POINT, _feature(_polygon(RING), name="a"), _feature(_polygon(east), name="b")]
+    both = read_area(_written(tmp_path, "two.geojson", _collection(*features)), **choice)
+    assert (both.name, both.polygon.geom_type) == ("a, b", "Polygon")
+    assert both.polygon.area == pytest.approx(
+        2 * (0.01 * DEGREE_M) ** 2 * np.cos(np.radians(45.005)), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("key", ["name", "ISO 3166:2", "a=b"])
+@pytest.mark.parametrize("value", ["park", "12:30", "x=y:z"])
+@pytest.mark.parametrize("sign", [":", "="])
+def test_a_property_and_its_value_may_have_any_characters(tmp_path, key, value, sign):
+    features = [_feature(_polygon(*SQUARE), **{key: "other"}), _feature(_polygon(*SQUARE), **{key: value})]
+    file = _written(tmp_path, "two.geojson", _collection(*features))
+    assert read_area(file, where=f"{key}{sign}{value}").name in (value, "two features[1]")
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"where": "park"}, "region.where: park must be PROPERTY:VALUE, for example region.where=name:park"),
+        ({"where": []}, "region.where: it must be PROPERTY:VALUE"),
+        ({"index": [0, -1]}, "region.index: .* is not a feature's number"),
+        ({"index": 0, "where": "name:park"}, "region.where: .* both choose"),
+    ],
+)
+def test_a_wrong_choice_of_features_is_refused_by_its_key(choice, message):
+    with pytest.raises(InputError, match=f"^{message}"):
+        RegionConfig(kind="geojson", path="park.geojson", **choice)
+
+
+def test_a_missing_extra_is_named(tmp_path, monkeypatch):
+    file = _map(tmp_path / "map.gpkg")
+    monkeypatch.setitem(sys.modules, "pyogrio", None)
+    _assert_one_line_error(
+        file, "needs pyogrio, which is missing: pip install 'damian[gis]'", lambda: read_area(file)
+    )
 
 
 def test_parts_cut_at_the_antimeridian_are_united(tmp_path):
@@ -101,7 +266,7 @@ def test_parts_cut_at_the_antimeridian_are_united(tmp_path):
     east = [[-180, 1], [-179.9, 1], [-179.9, 1.1], [-180, 1.1], [-180, 1]]
     file = tmp_path / "cut.geojson"
     file.write_text(json.dumps({"type": "MultiPolygon", "coordinates": [[west], [east]]}))
-    region = read_geojson(file)
+    region = read_area(file)
     assert isinstance(region.polygon, Polygon)
     assert region.polygon.area == pytest.approx(0.2 * 0.1 * DEGREE_M**2, rel=1e-3)
 
@@ -119,6 +284,11 @@ def _table(*last_rows: str, header: str = HEADER) -> str:
 
 INVALID_TABLES = {
     "not UTF-8": (b"Airspace ID\xff", "byte 11 is not UTF-8"),
+    "a wide table": (",".join("x" * 1001), "line 1: 1001 columns are more than 1000"),
+    "a column twice": (
+        _table(header=HEADER.replace("Latitude", "Latitude,Latitude")),
+        "'Latitude' appears twice",
+    ),
     "latitude 95": (_table("A,0,60,2,95,-4.12"), "line 4: Latitude 95 deg is not between -90"),
     "crossing edges": (_table() + "A,0,60,3,52.79,-4.125\n", "A: edges cross at [-4.1225, 52.8] deg"),
 }
@@ -132,7 +302,6 @@ def test_an_invalid_table_raises_one_line_that_names_the_file_and_the_fault(tmp_
 
 
 FAR_HOLE = [[18, 45], [18.01, 45], [18.01, 45.01], [18, 45]]
-RING = SQUARE[0]
 TWO_FEATURES = _collection(_feature(_polygon(RING), zone="a"), _feature(_polygon(RING), zone="b"))
 
 INVALID_GEOJSON = {
@@ -140,9 +309,37 @@ INVALID_GEOJSON = {
     "no choice": (
         TWO_FEATURES,
         {},
-        "2 features are areas: choose one by index or property=value: features[0]",
+        "2 features are areas: choose by region.index=NUMBER or region.where=PROPERTY:VALUE, one or a list",
     ),
     "where no value": (TWO_FEATURES, {"where": "zone=c"}, "fits 0 features, not one; the file has 'a', 'b'"),
+    "empty": (_collection(_feature(_polygon())), {}, "features[0] is a Polygon without corners; a region is"),
+    "no geometry": (
+        _collection(_feature(None)),
+        {"index": 0},
+        "features[0] has no geometry; a region is an area",
+    ),
+    "a line": (
+        _feature({"type": "LineString", "coordinates": RING}),
+        {},
+        "feature is a LineString; a region is an area: draw a closed outline (Polygon)",
+    ),
+    "no features": (_collection(), {}, "it has no features; a region is an area"),
+    "index 2": (TWO_FEATURES, {"index": [0, 2]}, "region.index: 2 is not between 0 and 1"),
+    "metres": (
+        _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]]),
+        {},
+        "[500000.0, 4000000.0] is not a longitude",
+    ),
+    "unknown crs": (
+        _polygon(RING) | {"crs": _crs("EPSG:999999")},
+        {},
+        "reference system is not understood: ",
+    ),
+    "linked crs": (
+        _polygon(RING) | {"crs": {"type": "link", "properties": {"href": "a.prj"}}},
+        {},
+        "coordinate reference system has no name",
+    ),
     "hole outside": (_polygon(RING, FAR_HOLE), {}, "hole lies outside shell at [18, 45] deg"),
 }
 
@@ -153,7 +350,7 @@ def test_an_invalid_geojson_raises_one_line_that_names_the_file_and_the_fault(
 ):
     file = tmp_path / "bad.geojson"
     file.write_text(content if isinstance(content, str) else json.dumps(content))
-    _assert_one_line_error(file, message, lambda: read_geojson(file, **choice))
+    _assert_one_line_error(file, message, lambda: read_area(file, **choice))
 
 
 def _assert_one_line_error(file: Path, message: str, read) -> None:

@@ -1,1 +1,1 @@
-"""Regions that UAVs fly over: random polygons, given vertices, or areas of FIR tables and GeoJSON files."""
+"""Regions that UAVs fly over: random polygons, given vertices, or areas of FIR tables and maps."""

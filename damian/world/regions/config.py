@@ -1,4 +1,4 @@
-"""The sources of regions: random polygons, vertices, tables of airspaces, GeoJSON, and your own."""
+"""The sources of regions: random polygons, vertices, tables of airspaces, maps, and your own."""
 
 import inspect
 from collections.abc import Callable
@@ -9,8 +9,8 @@ import numpy as np
 from damian.common import checks
 from damian.common.registry import Registry
 from damian.settings.world import RegionConfig
+from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
-from damian.world.regions.geojson import read_geojson
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon
 from damian.world.regions.region import Region, centred
 
@@ -41,8 +41,8 @@ def _region_of_fir_table(config: RegionConfig, rng: np.random.Generator) -> list
 
 
 @REGION_SOURCES.register("geojson")
-def _region_of_geojson(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    return [read_geojson(_file(config.path), config.index, config.where)]
+def _region_of_map(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+    return [read_area(_file(config.path), config.index, config.where)]
 
 
 def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:

@@ -12,7 +12,7 @@ from damian.world.regions.region import Region, local_region
 _ID, _SEQUENCE = "Airspace ID", "Sequence Number"
 _BOUNDS = {
     "Latitude": (-90.0, 90.0, "deg"),
-    "Longitude": (-180.0, 180.0, "deg"),
+    "Longitude": (-360.0, 360.0, "deg"),
     "Min Flight Level": (0.0, 1000.0, "FL"),
     "Max Flight Level": (0.0, 1000.0, "FL"),
     _SEQUENCE: (0.0, 1e6, ""),

@@ -67,6 +67,7 @@ def local_region(
     name: str,
     levels: tuple[float, float] | None,
     source: str,
+    excluded: Sequence[Sequence[Floats]] = (),
 ) -> Region:
     """Build a region in metres about the centroid of its area on the sphere from polygon parts in degrees.
 
@@ -77,13 +78,22 @@ def local_region(
         name: of the region.
         levels: lowest and highest flight level [FL], if known.
         source: prefix of error messages.
+        excluded: parts that are cut out.
     """
-    reference = parts[0][0][0, 0]
-    unwrapped = [[_unwrap_longitude(ring, reference) for ring in rings] for rings in parts]
-    unit = "deg (longitude, latitude)"
-    polygons = [polygon_from_rings(rings, source, unit) for rings in unwrapped]
+    reference, unit = parts[0][0][0, 0], "deg (longitude, latitude)"
+    polygons, holes = (
+        [
+            polygon_from_rings([_unwrap_longitude(ring, reference) for ring in rings], source, unit)
+            for rings in some
+        ]
+        for some in (parts, excluded)
+    )
     # Parts that were cut at the antimeridian share an edge, which a valid MultiPolygon must not.
     shape = cast(Polygon | MultiPolygon, shapely.union_all(polygons))
+    if excluded:
+        shape = cast(Polygon | MultiPolygon, shape - shapely.union_all(holes))
+        if shape.is_empty:
+            raise InputError(f"{source}: all of it is excluded; take a larger region")
     if shape.bounds[2] - shape.bounds[0] > 180:
         raise InputError(f"{source}: more than 180 deg of longitude wide; take a smaller region")
     oriented = shapely.get_parts(shapely.orient_polygons(shape))

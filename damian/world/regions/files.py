@@ -1,0 +1,224 @@
+"""Reads areas of maps: GeoJSON (RFC 7946), fences of QGroundControl plans, KML, GeoPackage, shapefiles."""
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from shapely.geometry import mapping
+
+from damian.common.errors import InputError
+from damian.common.text_files import listed, named, near, read_text, show
+from damian.world.regions.geodesy import Floats
+from damian.world.regions.region import Region, local_region
+
+_AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
+_DEGREES = re.compile(r"(CRS:?84|EPSG:[\d.]*:?4326)$", re.IGNORECASE)
+"""Names of WGS 84, the coordinate reference system of GPS and of GeoJSON."""
+_REMEDY = "save the map in WGS 84 (EPSG:4326)"
+
+
+class _Feature(NamedTuple):
+    """One feature of a file; ``place`` is its path in the document, such as ``features[2]``."""
+
+    place: str
+    properties: dict[str, Any]
+    geometry: dict[str, Any]
+    """As in GeoJSON."""
+    crs: Any = None
+    """Coordinate reference system: a name, an object of GeoJSON, or None for longitude and latitude."""
+    is_excluded: bool = False
+    """Whether UAVs must keep out of it."""
+
+    @property
+    def polygons(self) -> list[list[Any]]:
+        return list(_polygons(self.geometry))
+
+    @property
+    def fault(self) -> str:
+        """Why it cannot be a region; empty if it can."""
+        if self.polygons:
+            return "is excluded" if self.is_excluded else ""
+        kind = self.geometry.get("type")
+        return f"is a {kind}{' without corners' * (kind in _AREAS)}" if kind else "has no geometry"
+
+
+def read_area(path: str | os.PathLike[str], index: Any = None, where: Any = None) -> Region:
+    """Read one area of a file, or unite several; the suffix of the file says how it is read.
+
+    An area is a Polygon, a MultiPolygon, or what a GeometryCollection has of them. Heights are ignored.
+    Parts that touch or overlap are united; those that a plan excludes are cut out.
+
+    Args:
+        path: the file.
+        index: the feature's index, counted from 0 over all features of the file, or a list of them.
+        where: a property that only the feature has, as ``property:value`` or ``property=value``, or a list
+            of them. Neither ``index`` nor ``where`` is needed if only one feature is an area.
+
+    Raises:
+        InputError: the file cannot be read, the chosen geometry is invalid, or the choice does not single
+            out features.
+    """
+    path = Path(path)
+    read, kind = _READERS.get(path.suffix.lower(), (_from_geojson, "GeoJSON"))
+    with named(path):
+        try:
+            features = read(path)
+            chosen = _choose(features, index, where)
+            parts, excluded = (
+                [[_degrees(ring, each) for ring in rings] for each in some for rings in each.polygons]
+                for some in (chosen, [each for each in features if each.is_excluded])
+            )
+        except InputError:
+            raise
+        except Exception as error:  # a file can hold anything at any place
+            raise InputError(f"is not {kind}: {error!r}") from None
+        names = [_name(each) or f"{path.stem} {each.place}" for each in chosen]
+        return local_region(parts, listed(names), None, listed(each.place for each in chosen), excluded)
+
+
+def _name(feature: _Feature) -> str:
+    """The name of a feature among its properties, which KML writes with a capital."""
+    names = (value for key, value in feature.properties.items() if key.lower() == "name")
+    return next((name for name in names if isinstance(name, str)), "")
+
+
+def _from_geojson(path: Path) -> list[_Feature]:
+    """All features of GeoJSON; a bare geometry counts as a feature without properties."""
+    document = json.loads(read_text(path))
+    if document["type"] not in ("Feature", "FeatureCollection"):
+        return [_Feature("geometry", {}, document, document.get("crs"))]
+    alone, found = document["type"] == "Feature", []
+    for i, each in enumerate([document] if alone else document["features"]):
+        geometry = each.get("geometry") or {}
+        crs = next(filter(None, (holder.get("crs") for holder in (geometry, each, document))), None)
+        place = "feature" if alone else f"features[{i}]"
+        found.append(_Feature(place, each.get("properties") or {}, geometry, crs))
+    return found
+
+
+def _from_plan(path: Path) -> list[_Feature]:
+    """The polygons of the fence of a plan, whose corners are latitude and longitude."""
+    fence, found = json.loads(read_text(path))["geoFence"], []
+    if fence.get("circles"):
+        raise InputError("geoFence.circles: a circle is not read; draw a polygon in its place")
+    for i, each in enumerate(fence["polygons"]):
+        ring = [[lon, lat] for lat, lon in each["polygon"]]
+        geometry, is_excluded = {"type": "Polygon", "coordinates": [ring]}, not each["inclusion"]
+        found.append(_Feature(f"geoFence.polygons[{i}]", {}, geometry, None, is_excluded))
+    return found
+
+
+def _from_map(path: Path) -> list[_Feature]:
+    """All features of all layers of a file that GDAL reads."""
+    pyogrio, found = _extra("pyogrio", f"a file {path.suffix}"), []
+    if not path.is_file():
+        raise InputError("no such file")
+    for layer in pyogrio.list_layers(path)[:, 0]:
+        about, _, shapes, columns = pyogrio.raw.read(path, layer=layer, force_2d=True)
+        columns = [column.tolist() for column in columns]
+        for i, shape in enumerate(shapes):
+            properties = {name: column[i] for name, column in zip(about["fields"], columns, strict=True)}
+            geometry = {} if shape is None else mapping(shapely.from_wkb(shape))
+            found.append(_Feature(f"features[{len(found)}]", properties, geometry, about["crs"] or {}))
+    return found
+
+
+_READERS = {".plan": (_from_plan, "a plan of QGroundControl")} | {
+    suffix: (_from_map, f"a map ({suffix})") for suffix in (".kml", ".kmz", ".gpkg", ".shp")
+}
+"""How files are read that are not GeoJSON, and what they are, by their suffixes."""
+
+
+def _extra(module: str, what: str) -> Any:
+    """A module of the extra ``gis``."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError:
+        raise InputError(f"{what} needs {module}, which is missing: pip install 'damian[gis]'") from None
+
+
+def _choose(features: list[_Feature], index: Any, where: Any) -> list[_Feature]:
+    """Find the features chosen by ``index`` or ``where``, or else the only one that is an area."""
+    if index is not None:
+        numbers = index if isinstance(index, list) else [index]
+        if max(numbers) >= len(features):
+            raise InputError(f"region.index: {max(numbers)} is not between 0 and {len(features) - 1}")
+        chosen = [features[number] for number in numbers]
+    elif where is not None:
+        chosen = [_fitting(features, each) for each in (where if isinstance(where, list) else [where])]
+    else:
+        chosen = [each for each in features if not each.fault]
+        if len(chosen) > 1:
+            choice = listed(f"{each.place} {show(each.properties)}" for each in chosen)
+            problem = "choose by region.index=NUMBER or region.where=PROPERTY:VALUE, one or a list"
+            raise InputError(f"{len(chosen)} features are areas: {problem}: {choice}")
+    wrong = [f"{each.place} {each.fault}" for each in chosen or features if each.fault]
+    if wrong or not features:
+        faults = listed(wrong or ["it has no features"])
+        raise InputError(f"{faults}; a region is an area: draw a closed outline (Polygon)")
+    return chosen
+
+
+def _fitting(features: list[_Feature], where: str) -> _Feature:
+    """Find the only feature with this property value, which may be written as in Python or as in JSON."""
+    # Properties and values may have : and = in them, too.
+    pairs = [(where[: sign.start()], where[sign.end() :]) for sign in re.finditer("[:=]", where)]
+    found = [each for each in features if any(value in _spellings(each, key) for key, value in pairs)]
+    if len(found) != 1:
+        names = {name for each in features for name in each.properties}
+        key, value = next((pair for pair in pairs if pair[0] in names), pairs[0])
+        known = {str(each.properties[key]) for each in features if key in each.properties}
+        hint = near(value, known) if known else near(key, names)
+        raise InputError(f"region.where: {show(where)} fits {len(found)} features, not one; {hint}")
+    return found[0]
+
+
+def _spellings(feature: _Feature, key: str) -> Iterable[str]:
+    value = feature.properties.get(key)
+    return (str(value), json.dumps(value, ensure_ascii=False, default=str))
+
+
+def _polygons(geometry: dict[str, Any]) -> Iterator[list[Any]]:
+    """The rings of each polygon of a geometry, the shell first; those without corners are left out."""
+    kind = geometry.get("type")
+    if kind == "GeometryCollection":
+        for each in geometry["geometries"]:
+            yield from _polygons(each)
+    elif kind in _AREAS:
+        coordinates = geometry["coordinates"]
+        for rings in [coordinates] if kind == "Polygon" else coordinates:
+            if rings and rings[0]:
+                yield [ring for ring in rings if ring]
+
+
+def _degrees(ring: Any, feature: _Feature) -> Floats:
+    """Corners without their heights in degrees (longitude, latitude), [V, 2]."""
+    corners = np.array([position[:2] for position in ring], dtype=np.float64).reshape(len(ring), 2)
+    degrees = corners if feature.crs is None else _from_crs(corners, feature.crs)
+    # Areas across the antimeridian have corners beyond 180 degrees.
+    outside = np.flatnonzero(~(np.abs(degrees) <= [360, 90]).all(axis=1))
+    if len(outside):
+        problem = "is not a longitude between -360 and 360 deg and a latitude between -90 and 90 deg"
+        raise InputError(f"{feature.place}: {corners[outside[0]].tolist()} {problem}; {_REMEDY}")
+    return degrees
+
+
+def _from_crs(corners: Floats, crs: Any) -> Floats:
+    """Convert corners [V, 2] (east, north) of a coordinate reference system to longitude and latitude."""
+    name = crs if isinstance(crs, str) else crs.get("properties", {}).get("name")
+    if not isinstance(name, str):
+        raise InputError(f"its coordinate reference system has no name (crs, or a file .prj): {_REMEDY}")
+    if _DEGREES.search(name):
+        return corners
+    pyproj = _extra("pyproj", f"the coordinate reference system {show(name)}")
+    try:
+        to_degrees = pyproj.Transformer.from_crs(name, "OGC:CRS84", always_xy=True)
+        return np.column_stack(to_degrees.transform(*corners.T))
+    except pyproj.exceptions.ProjError as error:
+        raise InputError(f"its coordinate reference system is not understood: {error}; {_REMEDY}") from None
