@@ -242,8 +242,8 @@ def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, int
     due = state.progress.updates % config.checkpoint_every == 0
     if due or finished or asked:
         log.sync()
-        if due:
-            state.save_best()
+        if due or finished:
+            state.save_best(due)
         state.save()
     return finished or asked
 

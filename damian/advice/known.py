@@ -234,12 +234,13 @@ class UavLog:
             stops = [(filled.point, filled.step), *stops]
         if report.previous is not None:
             points = [filled.point, *map(self.ground.landing_point, report.previous)]
-            known = zip_longest(points, stops[: len(points)], fillvalue=(-1, -1))
-            stops = [(point, step if point == stop else -1) for point, (stop, step) in known]
+            same = [point == stop for point, (stop, _) in zip(points, stops, strict=False)]
+            steps = [step if known else -1 for known, (_, step) in zip(same, stops, strict=False)]
+            stops = [*zip_longest(points, steps, fillvalue=-1)]
         if report.landed is not None:
             ago = (round((report.time - time) / self.dt) for time in report.landed[: len(stops)])
-            steps = (filled.step - n_steps for n_steps in ago)
-            stops = [(point, step) for (point, _), step in zip_longest(stops, steps, fillvalue=-1)]
+            points, steps = [point for point, _ in stops], [filled.step - n_steps for n_steps in ago]
+            stops = [*zip_longest(points, steps, fillvalue=-1)]
         return tuple([*stops, *[(stops[-1][0], -1)] * self.n_stops][: self.n_stops])
 
 

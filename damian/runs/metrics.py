@@ -155,7 +155,8 @@ class EpisodeLog:
         """Add the episodes that end in a batch [B, T], with the entries of ``EpisodeTotals``."""
         steps = cast(TensorDictBase, batch["next"])
         done = steps[keys.DONE].to("cpu")
-        totals = torch.stack([steps[key].flatten(2).float().mean(2) for key in _TOTALS], -1)
+        of_episodes = (cast(Tensor, steps[key]) for key in _TOTALS)
+        totals = torch.stack([each.flatten(2).float().mean(2) for each in of_episodes], -1)
         self._perceived.add(totals.to("cpu").masked_fill(~done, torch.nan))
         if self.hindsight:
             self._settled.add(self.hindsight.add(batch).to("cpu").unsqueeze(-1))
@@ -227,7 +228,7 @@ class HindsightReturns:
         self._store(steps)
         self._waiting += len(steps)
         n_settled = max(self._waiting - self.storage.longest, 0)
-        settled = self.storage.steps[self.storage.latest(self._waiting)[:n_settled]]
+        settled: Any = self.storage.steps[self.storage.latest(self._waiting)[:n_settled]]
         self._waiting -= n_settled
         if not n_settled:
             return torch.full((self.worlds, 0), torch.nan)
@@ -245,7 +246,7 @@ class HindsightReturns:
         """Write steps [T, W] behind the latest ones, and correct all by what has arrived."""
         index = torch.arange(self._written, self._written + len(steps))
         self._written += len(steps)
-        write = super(BackupdateStorage, self.storage).set if corrected else self.storage.set
+        write: Any = super(BackupdateStorage, self.storage).set if corrected else self.storage.set
         write(index % (self.storage.max_size // self.worlds), steps)
 
     def state_dict(self) -> dict[str, Any]:

@@ -73,14 +73,19 @@ class TrainingState:
         self.saved = self.progress.updates
         self._replay.remove_old()
 
-    def save_best(self) -> None:
-        """Store the learner if the mean return in hindsight is the best so far; ``save`` must follow."""
+    def save_best(self, due: bool) -> None:
+        """Store the learner if the mean return in hindsight is the best at a ``due`` update so far.
+
+        If none was due yet, it is stored anyway, until one is. ``save`` must follow.
+        """
         mean = self.episodes.means()["hindsight_return"]
-        if mean > self.progress.best:
+        if due and mean > self.progress.best:
             self.progress.best = mean
-            training = _states({"progress": self.progress})
-            content = {"components": _states(self.components), "training": training}
-            write_checkpoint(self.folder / BEST, content)
+        elif self.progress.best > -math.inf:
+            return
+        training = _states({"progress": self.progress})
+        content = {"components": _states(self.components), "training": training}
+        write_checkpoint(self.folder / BEST, content)
 
     def load(self) -> None:
         """Continue from the checkpoint of the run, and remove what a killed run has left beside it."""
