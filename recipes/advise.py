@@ -46,7 +46,7 @@ from damian.world.vehicles import MOTION_MODELS
 from . import cli
 from .evaluate import stored_actor
 from .known import key_of
-from .shared.runs import run_folder, save_config, stored_config
+from .shared.runs import run_folder, save_config, stored_values
 
 BACKLOG = 64
 """Connections that wait to be accepted."""
@@ -86,7 +86,7 @@ def check_motion(config: AdviseConfig) -> None:
     """Refuse a policy whose UAVs flew in no time in its training, unless it is asked for."""
     if not config.learnt or config.instant:
         return
-    trained = stored_config(run_folder(Path(str(config.checkpoint))), "checkpoint", trust=True).motion.kind
+    trained = stored_values(run_folder(Path(str(config.checkpoint))), "checkpoint")["motion"]["kind"]
     for kind in (trained, config.motion.kind):
         if MOTION_MODELS.get(kind, "motion.kind").instant:
             problem = "the policy's UAVs were at their targets at once: train one with motion=polynomial"

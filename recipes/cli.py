@@ -5,12 +5,13 @@ Nothing here imports torch, so that help and a misspelt word are answered at onc
 """
 
 import os
+import re
 import shlex
 import sys
 import traceback
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +24,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -30,7 +32,8 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import YAMLError
 
 from damian.common.errors import RUN_ERROR, InputError, RunError
-from damian.common.text_files import one_line
+from damian.common.registry import stored_settings
+from damian.common.text_files import one_line, show
 from damian.runs.interrupt import end_interrupted, number_of
 from damian.runs.run_lock import locked
 from damian.settings import LEARNERS, TrainConfig
@@ -41,11 +44,14 @@ from .known import (
     CHOSEN,
     CONF,
     FILELESS,
-    LOGGERS,
+    OWN,
     PLAIN,
     SCHEMAS,
     check_words,
+    groups,
+    is_known,
     key_of,
+    known_settings,
     no_such_key,
     parsed,
     whole_laws,
@@ -87,9 +93,8 @@ def _node(group: str, option: str) -> DictConfig:
             node.pool = 16  # a single random region would be learnt by heart
         return node
     if group == "logger":
-        own = {name: [path] for name, path in LOGGERS.items()}
         files = {"tensorboard": option != "csv", "csv": option != "tensorboard"}
-        return OmegaConf.create({**files, **({"custom": own[option]} if option in own else {})})
+        return OmegaConf.create({**files, **({"custom": [option]} if option == "wandb" else {})})
     return OmegaConf.create({"kind": option} if group == "actions" else {})
 
 
@@ -128,9 +133,8 @@ def _register() -> None:
     for learner, space in SEARCHES.items():
         store.store(group="search", name=learner, node=space)
     for group, options in PLAIN.items():
-        own = group in ("region", "motion", "learner")
-        store.repo[group] = _Options(group) if own else {}
-        for option in () if own else options:
+        store.repo[group] = _Options(group) if group in OWN else {}
+        for option in () if group in OWN else options:
             package = "_global_" if group == "aware" else None
             store.store(group=group, name=option, node=_node(group, option), package=package)
     store.store(group="kind", name="polynomial", node=_pruned(TrainConfig().motion, "polynomial"))
@@ -162,6 +166,44 @@ def composed(program: str, overrides: Sequence[str], own_folder: str | None = No
         GlobalHydra.instance().hydra = running
 
 
+def stored_words(words: Any, program: str, key: str, own_folder: str | None = None) -> list[str]:
+    """The words of a stored command line that choose settings, to be composed again.
+
+    They may come from anybody. Words that steer Hydra or this program are left out, and what is more than a
+    plain value is refused: interpolations, sweeps, and options that are files of other folders. ``key`` is
+    the setting that names where they are stored.
+    """
+    known, options, found = known_settings(program), groups(own_folder), []
+    given = [*map(str, words)] if isinstance(words, list) else []
+    try:
+        parsed = OverridesParser.create().parse_overrides(given)
+    except HydraException as error:
+        raise InputError(f"{key}: its command line cannot be read: {reason(error)}") from None
+    for each in parsed:
+        name, sweeps = each.key_or_group, each.is_sweep_override()
+        if re.split(r"\W", name)[0] in ("hydra", "trust", "checkpoint", "resume"):
+            continue
+        values = [] if sweeps else [*texts(each.value())]  # as Hydra reads them, without quotes and escapes
+        plain = not (sweeps or each.package or any("${" in value for value in values))
+        if name in options:
+            own = [value for value in values if name in OWN and ":" in value and Path(value).name == value]
+            plain = plain and {*values} <= {*options[name], *own}
+        if not plain or not (name in options or is_known(name, known)):
+            remedy = "repeat the --config-dir of the training, if it had one"
+            raise InputError(f"{key}: {show(each.input_line)} is not an option or a plain value; {remedy}")
+        found.append(str(each.input_line))
+    return found
+
+
+def texts(values: Any) -> Iterator[str]:
+    """Every text in nested mappings and lists."""
+    if isinstance(values, str):
+        yield values
+    elif isinstance(values, Mapping | Sequence):
+        for each in values.values() if isinstance(values, Mapping) else values:
+            yield from texts(each)
+
+
 def _tuned(found: DictConfig, given: set[str]) -> DictConfig:
     """Apply what the scenario says of the chosen learner (``tuning``), unless the command line says else."""
     with open_dict(found):
@@ -172,7 +214,7 @@ def _tuned(found: DictConfig, given: set[str]) -> DictConfig:
     return found
 
 
-def _without_hydra(found: DictConfig) -> DictConfig:
+def without_hydra(found: DictConfig) -> DictConfig:
     copied = found.copy()
     with open_dict(copied):
         copied.pop("hydra", None)
@@ -181,7 +223,7 @@ def _without_hydra(found: DictConfig) -> DictConfig:
 
 def checked(found: DictConfig, program: str = "train") -> Any:
     """A composed configuration as an instance of its dataclass, whose checks it passes."""
-    plain = _without_hydra(found)
+    plain = without_hydra(found)
     try:
         config: Any = OmegaConf.to_object(plain)
     except ERRORS as error:
@@ -214,7 +256,7 @@ def check(program: str, given: Namespace) -> str:
         return ""
     found = composed(program, given.overrides, given.config_dir)
     checked(found, program)
-    return OmegaConf.to_yaml(_without_hydra(found))
+    return OmegaConf.to_yaml(without_hydra(found))
 
 
 # ------------------------------------------------------------------------------------------ errors
@@ -303,10 +345,24 @@ def _start(
     again: bool = False,
 ) -> None:
     """Run a program once, for a sweep in ``job_folder``; a run that is refused leaves no folder."""
-    runs = import_module(".shared.runs", __package__)  # it imports torch
     given = composed(program, words, own_folder)
-    asked = shown(job_folder or Path(given.hydra.run.dir))
-    config, folder = runs.prepared(program, given, words, own_folder, asked, again)
+    with only_named_code(given):
+        asked = shown(job_folder or Path(given.hydra.run.dir))
+        runs = import_module(".shared.runs", __package__)  # it imports torch
+        config, folder = runs.prepared(program, given, words, own_folder, asked, again)
+        _perform(work, runs, config, folder, again)
+
+
+def only_named_code(given: DictConfig) -> AbstractContextManager[None]:
+    """While a run takes settings from a file, only code that the present command line names is imported."""
+    if not any(key in given and given[key] is not None for key in ("checkpoint", "resume", "journal")):
+        return nullcontext()
+    named = texts(OmegaConf.to_container(without_hydra(given), resolve=True))
+    return stored_settings([*named], bool(given.trust))
+
+
+def _perform(work: Work, runs: Any, config: Any, folder: Path, again: bool) -> None:
+    """Do the work of a run in its folder, which is locked, and removed if nothing was written."""
     key = "resume" if getattr(config, "resume", None) else "hydra.run.dir"
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:

@@ -49,8 +49,8 @@ PLAIN = {
     "aware": ["none"],
 }
 """Options of the groups that need no file, because they only choose a kind."""
-LOGGERS = {"wandb": "damian.runs.loggers:wandb"}
-"""Loggers of DAMIAN that stand in settings by their paths."""
+OWN = ("region", "motion", "learner")
+"""Groups in which an option may also be the path of the user's own, ``package.module:Name``."""
 SYNONYMS = {
     "learning_rate": "learner.lr",
     "belief": "aware=belief",
@@ -120,11 +120,11 @@ def check_words(program: str, words: Sequence[str], own_folder: str | None = Non
             names = [part for part in parts if part.replace("/", "").isidentifier()]
             if wrong := [name for name in names if name not in (*options[key], "null")]:
                 raise InputError(f"{key}: {wrong[0]} is not one of {', '.join(options[key])}")
-        elif not (_is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
+        elif not (is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
             raise InputError(no_such_key(key, program))
 
 
-def _is_known(key: str, known: "dict[str, Setting]") -> bool:
+def is_known(key: str, known: "dict[str, Setting]") -> bool:
     """Is a key that of a setting, or below one that holds anything, or of a learner of the user's own?"""
     parts = key.partition("@")[0].split(".")
     above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]

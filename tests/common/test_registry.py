@@ -57,7 +57,7 @@ REFUSED = {
     "key: nowhere:x: No module named 'nowhere'; nowhere must": lambda: greetings().get("nowhere:x", "key"),
     "key: math:pi is no function": lambda: greetings().get("math:pi", "key"),
     "key: math:pi is no int": lambda: Registry("int", int, "is no int").get("math:pi", "key"),
-    "key.too: 1 is no parameter of plain": lambda: check_parameters(polite, {"too": 1}, "plain", "key"),
+    "key.too: 1 is not a parameter of plain": lambda: check_parameters(polite, {"too": 1}, "plain", "key"),
 }
 
 
