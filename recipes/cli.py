@@ -161,7 +161,7 @@ def composed(program: str, overrides: Sequence[str], own_folder: str | None = No
             found = compose(program, words, return_hydra_config=True)
         return _tuned(found, {key_of(word) for word in overrides})
     except (*ERRORS, ValueError) as error:  # such as a group that is set to a number
-        raise InputError(reason(error, program)) from error
+        raise InputError(reason(error, program, words)) from error
     finally:
         GlobalHydra.instance().hydra = running
 
@@ -262,15 +262,17 @@ def check(program: str, given: Namespace) -> str:
 # ------------------------------------------------------------------------------------------ errors
 
 
-def reason(error: BaseException, program: str = "train") -> str:
+def reason(error: BaseException, program: str = "train", words: Sequence[str] = ()) -> str:
     """The deepest cause of an error on one line, with its key in front."""
-    while isinstance(error.__cause__, (*ERRORS, InputError)):
+    while not isinstance(error, InputError) and isinstance(error.__cause__, (*ERRORS, InputError)):
         error = error.__cause__
     key = getattr(error, "full_key", None)
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)) and key:
-        section = key.rpartition(".")[0]
-        beside = [f"{section}.{name}" for name in getattr(error, "parent_node", None) or ()]
-        return no_such_key(str(key), program, beside)
+        section, node = key.rpartition(".")[0], getattr(error, "parent_node", None) or {}
+        chosen = {key_of(word): word.partition("=")[2] for word in words}
+        kind = next((node[name] for name in ("kind", "name", "motion") if name in node), None)
+        beside = [f"{section}.{name}" for name in node]
+        return no_such_key(str(key), program, beside, chosen.get(section, kind))
     text = str(error)
     if isinstance(error, OmegaConfBaseException) and not text.partition("\n")[0].endswith(":"):
         text = text.partition("\n")[0]  # the others name types of OmegaConf

@@ -35,7 +35,7 @@ class Logger(Protocol):
 LOGGERS = Registry[Callable[..., Logger]](
     "logger",
     lambda found: callable(found) and (not isinstance(found, type) or hasattr(found, "log_scalar")),
-    "is no function (folder) -> logger, nor a class with a method log_scalar",
+    "is not a function (folder) -> logger, nor a class with a method log_scalar",
 )
 """Loggers by name or ``package.module:Name``: functions or classes that get the run folder."""
 
@@ -48,7 +48,7 @@ def make_loggers(config: LoggerConfig, folder: Path) -> list[Logger]:
         parameters = told | written if make is wandb else written
         with naming_errors(f"logger.custom: {path}"):
             logger = make(folder, **parameters)
-            should = "is no logger: it has no method log_scalar(name, value, step)"
+            should = "is not a logger: it has no method log_scalar(name, value, step)"
             checks.require(hasattr(logger, "log_scalar"), path, type(logger).__name__, should)
         loggers.append(logger)
     return loggers

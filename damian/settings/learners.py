@@ -22,7 +22,7 @@ def _is_learner(found: Any) -> bool:
 
 
 LEARNERS = Registry[type["LearnerConfig"]](
-    "learner", _is_learner, "is no @dataclass derived from damian.LearnerConfig with a method make"
+    "learner", _is_learner, "is not a @dataclass derived from damian.LearnerConfig with a method make"
 )
 """Settings of learners, by name; the user's own as ``package.module:Name``."""
 

@@ -80,7 +80,7 @@ REFUSALS = [
     (["policy=script"], "reports: nothing is not the only one of reports=FILE"),
     (["reports=nothing.csv"], "nothing.csv: no such file"),
     (["reports=table.csv", "uavs=[A,B,C,D]"], "table.csv: no advice yet: no report of D has come in"),
-    (["reports=table.csv", "uavs=[A,B]"], "table.csv: line 4: ID: 'C' is no UAV of this fleet: A, B"),
+    (["reports=table.csv", "uavs=[A,B]"], "table.csv: line 4: ID: 'C' is not a UAV of this fleet: A, B"),
 ]
 
 

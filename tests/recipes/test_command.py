@@ -43,9 +43,14 @@ def test_settings_help_and_wrong_words_need_no_torch(code):
     ("words", "message"),
     [
         (["trian"], "trian: no such program; the programs are train, evaluate"),
-        (["train", "agnts=3"], "agnts: no such key; did you mean agents?"),
-        (["train", "num_envs=8"], "num_envs: no such key; did you mean worlds?"),
-        (["train", "delay=3"], "delay: 3 is no option of this group; write delay.obs=3"),
+        (["train", "agnts=3"], "agnts: unknown setting; did you mean agents?"),
+        (["train", "num_envs=8"], "num_envs: unknown setting; did you mean worlds?"),
+        (["train", "delay=3"], "delay: 3 is not an option of this group; write delay.obs=3"),
+        (
+            ["train", "region.where=name:x", "region=usecase"],
+            "region.where: unknown setting for region=usecase",
+        ),
+        (["train", "source.speed=3"], "source.speed: unknown setting for source=static; another source="),
         (["train", "-m", "delay=none,papr"], "delay: papr is not one of"),
         (["train", "delay=-1"], "Config group override must be a string"),
         (["train", "seed=0,1"], "Ambiguous value for argument 'seed=0,1' 1. To use it as a list"),
@@ -99,7 +104,7 @@ def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_
     for text, message in (
         ("agents: 2\n\tseed: 3\n", "mine.yaml"),
         ("model: {hidden: 8}\n", "model.hidden"),
-        ("agnts: 8\n", "agnts: no such key; did you mean agents?"),
+        ("agnts: 8\n", "agnts: unknown setting; did you mean agents?"),
     ):
         file.write_text(f"# @package _global_\n{text}")
         assert message in refusal(capsys, *words)
