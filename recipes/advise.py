@@ -140,12 +140,21 @@ def advise(config: AdviseConfig, folder: Path) -> None:
         answer_table(config, folder)
         return
     journals = Path(config.journal) if config.journal else folder / "journals"
-    with closing(make_session(config, journals)) as session:
+    with listening(config) as listener, closing(make_session(config, journals)) as session:
         save_config(without_token(config), folder)
-        serve(config, session)
+        serve(config, session, listener)
 
 
-def serve(config: AdviseConfig, session: AdviceSession) -> None:
+def listening(config: AdviseConfig) -> socket.socket:
+    """The address of the service, which is refused before anything is written if it cannot be used."""
+    check_token("DAMIAN_TOKEN", config.token or os.environ.get("DAMIAN_TOKEN"))
+    try:
+        return socket.create_server((config.host, config.port or 0), backlog=BACKLOG)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
+
+
+def serve(config: AdviseConfig, session: AdviceSession, listener: socket.socket) -> None:
     """Answer over HTTP until the program is stopped."""
     try:
         uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
@@ -153,12 +162,7 @@ def serve(config: AdviseConfig, session: AdviceSession) -> None:
         missing = f"needs {error.name}, which is not installed: pip install 'damian[advise]'"
         raise InputError(f"port: {config.port} {missing}") from None
     given = config.token or os.environ.get("DAMIAN_TOKEN")
-    check_token("DAMIAN_TOKEN", given)
     token = given or secrets.token_urlsafe(24)
-    try:
-        listener = socket.create_server((config.host, config.port or 0), backlog=BACKLOG)
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
     most = most_connections()
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # or an answer in two parts takes 40 ms
     host, port = listener.getsockname()[:2]

@@ -25,6 +25,7 @@ from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -274,6 +275,8 @@ def reason(error: BaseException, program: str = "train", words: Sequence[str] = 
         beside = [f"{section}.{name}" for name in node]
         return no_such_key(str(key), program, beside, chosen.get(section, kind))
     text = str(error)
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        text = f"{error.filename}: {error.strerror}"
     if isinstance(error, OmegaConfBaseException) and not text.partition("\n")[0].endswith(":"):
         text = text.partition("\n")[0]  # the others name types of OmegaConf
     return one_line(f"{key}: {text}" if key else text)
@@ -316,7 +319,10 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
         first = [f"--config-dir={given.config_dir}"] if given.config_dir else []
         if any(key_of(word) == "checkpoint" and "," in word for word in given.overrides):
             first.append("hydra.job.config.override_dirname.exclude_keys=[]")  # else runs share a folder
-        sys.argv[1:] = ["-m", *first, *given.overrides]  # Hydra wants options first
+        sweep = Path(_first_run(program, given).hydra.sweep.dir).absolute()
+        made = [each for each in (sweep, *sweep.parents) if not each.exists()]
+        words = [*given.overrides, f"hydra.sweep.dir='{sweep}'"]
+        sys.argv[1:] = ["-m", *first, *words]  # Hydra wants options first
 
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
@@ -328,7 +334,28 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
                 with suppress(OSError):  # Hydra has made it; it is not empty unless the run was refused
                     output.rmdir()
 
-        job()
+        try:
+            job()
+        finally:
+            with suppress(OSError):
+                if [*sweep.iterdir()] == [sweep / "multirun.yaml"]:  # every run was refused
+                    (sweep / "multirun.yaml").unlink()
+                    for each in made:
+                        each.rmdir()
+
+
+def _first_run(program: str, given: Namespace) -> DictConfig:
+    """The checked configuration of the first run of a sweep, which is refused before a folder is made."""
+    words = [
+        f"{each.get_key_element()}={next(each.sweep_string_iterator())}"
+        if each.is_discrete_sweep() and not isinstance(each.value(), Glob)
+        else str(each.input_line)
+        for each in OverridesParser.create().parse_overrides(given.overrides)
+    ]
+    found = composed(program, words, given.config_dir)
+    if not {"checkpoint", "resume"} & set(map(key_of, words)):
+        checked(found, program)
+    return found
 
 
 class SweepReport(Callback):
