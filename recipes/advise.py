@@ -46,7 +46,7 @@ from damian.world.vehicles import MOTION_MODELS
 from . import cli
 from .evaluate import stored_actor
 from .known import key_of
-from .shared.runs import run_folder, save_config, stored_config
+from .shared.runs import run_folder, save_config, stored_values
 
 BACKLOG = 64
 """Connections that wait to be accepted."""
@@ -86,7 +86,7 @@ def check_motion(config: AdviseConfig) -> None:
     """Refuse a policy whose UAVs flew in no time in its training, unless it is asked for."""
     if not config.learnt or config.instant:
         return
-    trained = stored_config(run_folder(Path(str(config.checkpoint))), "checkpoint", trust=True).motion.kind
+    trained = stored_values(run_folder(Path(str(config.checkpoint))), "checkpoint")["motion"]["kind"]
     for kind in (trained, config.motion.kind):
         if MOTION_MODELS.get(kind, "motion.kind").instant:
             problem = "the policy's UAVs were at their targets at once: train one with motion=polynomial"
@@ -140,12 +140,21 @@ def advise(config: AdviseConfig, folder: Path) -> None:
         answer_table(config, folder)
         return
     journals = Path(config.journal) if config.journal else folder / "journals"
-    with closing(make_session(config, journals)) as session:
+    with listening(config) as listener, closing(make_session(config, journals)) as session:
         save_config(without_token(config), folder)
-        serve(config, session)
+        serve(config, session, listener)
 
 
-def serve(config: AdviseConfig, session: AdviceSession) -> None:
+def listening(config: AdviseConfig) -> socket.socket:
+    """The address of the service, which is refused before anything is written if it cannot be used."""
+    check_token("DAMIAN_TOKEN", config.token or os.environ.get("DAMIAN_TOKEN"))
+    try:
+        return socket.create_server((config.host, config.port or 0), backlog=BACKLOG)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
+
+
+def serve(config: AdviseConfig, session: AdviceSession, listener: socket.socket) -> None:
     """Answer over HTTP until the program is stopped."""
     try:
         uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
@@ -153,12 +162,7 @@ def serve(config: AdviseConfig, session: AdviceSession) -> None:
         missing = f"needs {error.name}, which is not installed: pip install 'damian[advise]'"
         raise InputError(f"port: {config.port} {missing}") from None
     given = config.token or os.environ.get("DAMIAN_TOKEN")
-    check_token("DAMIAN_TOKEN", given)
     token = given or secrets.token_urlsafe(24)
-    try:
-        listener = socket.create_server((config.host, config.port or 0), backlog=BACKLOG)
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
     most = most_connections()
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # or an answer in two parts takes 40 ms
     host, port = listener.getsockname()[:2]

@@ -5,12 +5,13 @@ Nothing here imports torch, so that help and a misspelt word are answered at onc
 """
 
 import os
+import re
 import shlex
 import sys
 import traceback
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +24,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -30,7 +33,8 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import YAMLError
 
 from damian.common.errors import RUN_ERROR, InputError, RunError
-from damian.common.text_files import one_line
+from damian.common.registry import stored_settings
+from damian.common.text_files import one_line, show
 from damian.runs.interrupt import end_interrupted, number_of
 from damian.runs.run_lock import locked
 from damian.settings import LEARNERS, TrainConfig
@@ -41,11 +45,14 @@ from .known import (
     CHOSEN,
     CONF,
     FILELESS,
-    LOGGERS,
+    OWN,
     PLAIN,
     SCHEMAS,
     check_words,
+    groups,
+    is_known,
     key_of,
+    known_settings,
     no_such_key,
     parsed,
     whole_laws,
@@ -87,9 +94,8 @@ def _node(group: str, option: str) -> DictConfig:
             node.pool = 16  # a single random region would be learnt by heart
         return node
     if group == "logger":
-        own = {name: [path] for name, path in LOGGERS.items()}
         files = {"tensorboard": option != "csv", "csv": option != "tensorboard"}
-        return OmegaConf.create({**files, **({"custom": own[option]} if option in own else {})})
+        return OmegaConf.create({**files, **({"custom": [option]} if option == "wandb" else {})})
     return OmegaConf.create({"kind": option} if group == "actions" else {})
 
 
@@ -128,9 +134,8 @@ def _register() -> None:
     for learner, space in SEARCHES.items():
         store.store(group="search", name=learner, node=space)
     for group, options in PLAIN.items():
-        own = group in ("region", "motion", "learner")
-        store.repo[group] = _Options(group) if own else {}
-        for option in () if own else options:
+        store.repo[group] = _Options(group) if group in OWN else {}
+        for option in () if group in OWN else options:
             package = "_global_" if group == "aware" else None
             store.store(group=group, name=option, node=_node(group, option), package=package)
     store.store(group="kind", name="polynomial", node=_pruned(TrainConfig().motion, "polynomial"))
@@ -157,9 +162,47 @@ def composed(program: str, overrides: Sequence[str], own_folder: str | None = No
             found = compose(program, words, return_hydra_config=True)
         return _tuned(found, {key_of(word) for word in overrides})
     except (*ERRORS, ValueError) as error:  # such as a group that is set to a number
-        raise InputError(reason(error, program)) from error
+        raise InputError(reason(error, program, words)) from error
     finally:
         GlobalHydra.instance().hydra = running
+
+
+def stored_words(words: Any, program: str, key: str, own_folder: str | None = None) -> list[str]:
+    """The words of a stored command line that choose settings, to be composed again.
+
+    They may come from anybody. Words that steer Hydra or this program are left out, and what is more than a
+    plain value is refused: interpolations, sweeps, and options that are files of other folders. ``key`` is
+    the setting that names where they are stored.
+    """
+    known, options, found = known_settings(program), groups(own_folder), []
+    given = [*map(str, words)] if isinstance(words, list) else []
+    try:
+        parsed = OverridesParser.create().parse_overrides(given)
+    except HydraException as error:
+        raise InputError(f"{key}: its command line cannot be read: {reason(error)}") from None
+    for each in parsed:
+        name, sweeps = each.key_or_group, each.is_sweep_override()
+        if re.split(r"\W", name)[0] in ("hydra", "trust", "checkpoint", "resume"):
+            continue
+        values = [] if sweeps else [*texts(each.value())]  # as Hydra reads them, without quotes and escapes
+        plain = not (sweeps or each.package or any("${" in value for value in values))
+        if name in options:
+            own = [value for value in values if name in OWN and ":" in value and Path(value).name == value]
+            plain = plain and {*values} <= {*options[name], *own}
+        if not plain or not (name in options or is_known(name, known)):
+            remedy = "repeat the --config-dir of the training, if it had one"
+            raise InputError(f"{key}: {show(each.input_line)} is not an option or a plain value; {remedy}")
+        found.append(str(each.input_line))
+    return found
+
+
+def texts(values: Any) -> Iterator[str]:
+    """Every text in nested mappings and lists."""
+    if isinstance(values, str):
+        yield values
+    elif isinstance(values, Mapping | Sequence):
+        for each in values.values() if isinstance(values, Mapping) else values:
+            yield from texts(each)
 
 
 def _tuned(found: DictConfig, given: set[str]) -> DictConfig:
@@ -172,7 +215,7 @@ def _tuned(found: DictConfig, given: set[str]) -> DictConfig:
     return found
 
 
-def _without_hydra(found: DictConfig) -> DictConfig:
+def without_hydra(found: DictConfig) -> DictConfig:
     copied = found.copy()
     with open_dict(copied):
         copied.pop("hydra", None)
@@ -181,7 +224,7 @@ def _without_hydra(found: DictConfig) -> DictConfig:
 
 def checked(found: DictConfig, program: str = "train") -> Any:
     """A composed configuration as an instance of its dataclass, whose checks it passes."""
-    plain = _without_hydra(found)
+    plain = without_hydra(found)
     try:
         config: Any = OmegaConf.to_object(plain)
     except ERRORS as error:
@@ -214,22 +257,26 @@ def check(program: str, given: Namespace) -> str:
         return ""
     found = composed(program, given.overrides, given.config_dir)
     checked(found, program)
-    return OmegaConf.to_yaml(_without_hydra(found))
+    return OmegaConf.to_yaml(without_hydra(found))
 
 
 # ------------------------------------------------------------------------------------------ errors
 
 
-def reason(error: BaseException, program: str = "train") -> str:
+def reason(error: BaseException, program: str = "train", words: Sequence[str] = ()) -> str:
     """The deepest cause of an error on one line, with its key in front."""
-    while isinstance(error.__cause__, (*ERRORS, InputError)):
+    while not isinstance(error, InputError) and isinstance(error.__cause__, (*ERRORS, InputError)):
         error = error.__cause__
     key = getattr(error, "full_key", None)
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)) and key:
-        section = key.rpartition(".")[0]
-        beside = [f"{section}.{name}" for name in getattr(error, "parent_node", None) or ()]
-        return no_such_key(str(key), program, beside)
+        section, node = key.rpartition(".")[0], getattr(error, "parent_node", None) or {}
+        chosen = {key_of(word): word.partition("=")[2] for word in words}
+        kind = next((node[name] for name in ("kind", "name", "motion") if name in node), None)
+        beside = [f"{section}.{name}" for name in node]
+        return no_such_key(str(key), program, beside, chosen.get(section, kind))
     text = str(error)
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        text = f"{error.filename}: {error.strerror}"
     if isinstance(error, OmegaConfBaseException) and not text.partition("\n")[0].endswith(":"):
         text = text.partition("\n")[0]  # the others name types of OmegaConf
     return one_line(f"{key}: {text}" if key else text)
@@ -272,7 +319,10 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
         first = [f"--config-dir={given.config_dir}"] if given.config_dir else []
         if any(key_of(word) == "checkpoint" and "," in word for word in given.overrides):
             first.append("hydra.job.config.override_dirname.exclude_keys=[]")  # else runs share a folder
-        sys.argv[1:] = ["-m", *first, *given.overrides]  # Hydra wants options first
+        sweep = Path(_first_run(program, given).hydra.sweep.dir).absolute()
+        made = [each for each in (sweep, *sweep.parents) if not each.exists()]
+        words = [*given.overrides, f"hydra.sweep.dir='{sweep}'"]
+        sys.argv[1:] = ["-m", *first, *words]  # Hydra wants options first
 
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
@@ -284,7 +334,28 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
                 with suppress(OSError):  # Hydra has made it; it is not empty unless the run was refused
                     output.rmdir()
 
-        job()
+        try:
+            job()
+        finally:
+            with suppress(OSError):
+                if [*sweep.iterdir()] == [sweep / "multirun.yaml"]:  # every run was refused
+                    (sweep / "multirun.yaml").unlink()
+                    for each in made:
+                        each.rmdir()
+
+
+def _first_run(program: str, given: Namespace) -> DictConfig:
+    """The checked configuration of the first run of a sweep, which is refused before a folder is made."""
+    words = [
+        f"{each.get_key_element()}={next(each.sweep_string_iterator())}"
+        if each.is_discrete_sweep() and not isinstance(each.value(), Glob)
+        else str(each.input_line)
+        for each in OverridesParser.create().parse_overrides(given.overrides)
+    ]
+    found = composed(program, words, given.config_dir)
+    if not {"checkpoint", "resume"} & set(map(key_of, words)):
+        checked(found, program)
+    return found
 
 
 class SweepReport(Callback):
@@ -303,10 +374,24 @@ def _start(
     again: bool = False,
 ) -> None:
     """Run a program once, for a sweep in ``job_folder``; a run that is refused leaves no folder."""
-    runs = import_module(".shared.runs", __package__)  # it imports torch
     given = composed(program, words, own_folder)
-    asked = shown(job_folder or Path(given.hydra.run.dir))
-    config, folder = runs.prepared(program, given, words, own_folder, asked, again)
+    with only_named_code(given):
+        asked = shown(job_folder or Path(given.hydra.run.dir))
+        runs = import_module(".shared.runs", __package__)  # it imports torch
+        config, folder = runs.prepared(program, given, words, own_folder, asked, again)
+        _perform(work, runs, config, folder, again)
+
+
+def only_named_code(given: DictConfig) -> AbstractContextManager[None]:
+    """While a run takes settings from a file, only code that the present command line names is imported."""
+    if not any(key in given and given[key] is not None for key in ("checkpoint", "resume", "journal")):
+        return nullcontext()
+    named = texts(OmegaConf.to_container(without_hydra(given), resolve=True))
+    return stored_settings([*named], bool(given.trust))
+
+
+def _perform(work: Work, runs: Any, config: Any, folder: Path, again: bool) -> None:
+    """Do the work of a run in its folder, which is locked, and removed if nothing was written."""
     key = "resume" if getattr(config, "resume", None) else "hydra.run.dir"
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:

@@ -62,7 +62,8 @@ def _run(name: str, words: Sequence[str]) -> None:
         if {"-h", "--help"} & {*words}:
             _show(program_help(name))
         else:
-            import_module(f".{name}", __package__).run()
+            with import_module(".cli", __package__).one_line_errors():
+                import_module(f".{name}", __package__).run()
         return
     program, given = SETTINGS[name], parsed(words)
     if given.help:

@@ -25,6 +25,7 @@ from damian.settings import TrainConfig
 
 from . import cli
 from .shared.runs import save_config, with_policy_of
+from .shared.settings import check_components
 
 MEANING = """untrained: the same network before any training; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
@@ -91,9 +92,13 @@ def load(
         >>> rollout = env.rollout(50, policy, break_when_any_done=False)
     """
     words = [f"checkpoint='{run}'", *overrides, *["trust=true"] * trust]
-    config, _ = with_policy_of(cli.composed("train", words), "train", words, None)
-    env = make_env(config.eval_scenario, worlds, config.eval_seed if seed is None else seed, config.device)
-    policy = stored_actor(config, env).eval().requires_grad_(False)
+    given = cli.composed("train", words)
+    with cli.only_named_code(given):
+        config, _ = with_policy_of(given, "train", words, None)
+        check_components(config)  # imports all of the user's own that is ever needed
+        eval_seed = config.eval_seed if seed is None else seed
+        env = make_env(config.eval_scenario, worlds, eval_seed, config.device)
+        policy = stored_actor(config, env).eval().requires_grad_(False)
     add_recurrent_state(env, policy)
     kind = InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
     setattr(policy[-1], "default_interaction_type", kind)  # noqa: B010 (a module declares no such attribute)

@@ -79,7 +79,7 @@ def export(run: Path, trust: bool = False) -> Path:
     policy, target = ExportedPolicy(actor).eval(), run_folder(run) / EXPORT
     examples = tuple(env.reset()[key] for key in policy.in_keys)
     sizes = {0: torch.export.Dim("worlds", min=1)}
-    if any_number_of_uavs(stored_config(run_folder(run), "checkpoint", trust)):
+    if any_number_of_uavs(stored_config(run_folder(run), "checkpoint")):
         sizes[1] = torch.export.Dim("uavs", min=1)
     target.mkdir(exist_ok=True)
     with torch.no_grad(), warnings.catch_warnings():

@@ -33,7 +33,8 @@ from damian.show.replay_page import save_page
 from . import cli
 from .evaluate import stored_actor
 from .known import key_of
-from .shared.runs import require_trust, save_config, without
+from .shared.runs import save_config, without
+from .shared.settings import check_components
 
 
 def fly(config: FlyConfig) -> list[Episode]:
@@ -60,10 +61,9 @@ def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
     told = read_head(Path(str(config.journal))).about.overrides
     of_advice = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
     replaced = [*map(key_of, config.overrides), *of_advice, "checkpoint", "eval_episodes"]
-    overrides = [*without(told, [*replaced, "hydra", "trust"]), *config.overrides]
-    found = cli.composed("fly", overrides)
-    require_trust(found, "journal", config.trust, config.overrides)
-    settings: FlyConfig = cli.checked(found, "fly")
+    overrides = [*without(cli.stored_words(told, "advise", "journal"), replaced), *config.overrides]
+    settings: FlyConfig = cli.checked(cli.composed("fly", overrides), "fly")
+    check_components(settings)
     settings.overrides = overrides
     return settings
 

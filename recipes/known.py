@@ -49,8 +49,8 @@ PLAIN = {
     "aware": ["none"],
 }
 """Options of the groups that need no file, because they only choose a kind."""
-LOGGERS = {"wandb": "damian.runs.loggers:wandb"}
-"""Loggers of DAMIAN that stand in settings by their paths."""
+OWN = ("region", "motion", "learner")
+"""Groups in which an option may also be the path of the user's own, ``package.module:Name``."""
 SYNONYMS = {
     "learning_rate": "learner.lr",
     "belief": "aware=belief",
@@ -91,7 +91,7 @@ def parsed(words: Sequence[str]) -> Namespace:
     parser.add_argument("overrides", nargs="*")
     given = parser.parse_intermixed_args(list(words))
     if given.config_dir and not Path(given.config_dir).is_dir():
-        raise InputError(f"--config-dir: {show(given.config_dir)} is no folder")
+        raise InputError(f"--config-dir: {show(given.config_dir)} is not a folder")
     return given
 
 
@@ -116,15 +116,15 @@ def check_words(program: str, words: Sequence[str], own_folder: str | None = Non
             raise InputError(f"{show(word)}: this word is not of the form KEY=VALUE")
         if key in options:
             if key == "delay" and value[:1].isdigit():
-                raise InputError(f"delay: {value} is no option of this group; write delay.obs={value}")
+                raise InputError(f"delay: {value} is not an option of this group; write delay.obs={value}")
             names = [part for part in parts if part.replace("/", "").isidentifier()]
             if wrong := [name for name in names if name not in (*options[key], "null")]:
                 raise InputError(f"{key}: {wrong[0]} is not one of {', '.join(options[key])}")
-        elif not (_is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
+        elif not (is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
             raise InputError(no_such_key(key, program))
 
 
-def _is_known(key: str, known: "dict[str, Setting]") -> bool:
+def is_known(key: str, known: "dict[str, Setting]") -> bool:
     """Is a key that of a setting, or below one that holds anything, or of a learner of the user's own?"""
     parts = key.partition("@")[0].split(".")
     above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
@@ -192,7 +192,7 @@ def default_options(program: str) -> dict[str, str]:
 
 
 def groups(own_folder: str | None = None) -> dict[str, list[str]]:
-    """Options of every group, by the group's name; a file _NAME.yaml is no option, but what options share."""
+    """Options of every group, by the group's name; a file _NAME.yaml is what options share."""
     options: dict[str, list[str]] = {}
     for root in map(Path, filter(None, [own_folder, CONF])):
         for file in sorted(root.rglob("[!_]*.yaml")):
@@ -202,19 +202,21 @@ def groups(own_folder: str | None = None) -> dict[str, list[str]]:
     return {g: [*options.get(g, []), *PLAIN.get(g, [])] for g in dict.fromkeys([*options, *PLAIN])}
 
 
-def no_such_key(key: str, program: str = "train", section: Sequence[str] = ()) -> str:
-    """The message for an unknown key, with the nearest known one."""
+def no_such_key(
+    key: str, program: str = "train", section: Sequence[str] = (), option: str | None = None
+) -> str:
+    """The message for an unknown key, with the nearest known one; ``option`` is that of its group."""
     if key in SYNONYMS:
-        return f"{key}: no such key; did you mean {SYNONYMS[key]}?"
+        return f"{key}: unknown setting; did you mean {SYNONYMS[key]}?"
     known, group = known_settings(program), key.partition(".")[0]
     if key in known and group in CHOSEN:
-        return f"{key}: no such key of the chosen {group}; another {group}=OPTION has it"
+        return f"{key}: unknown setting for {group}={option or 'none'}; another {group}=OPTION has it"
     if program == "compare" and (key in known_settings("train") or key in default_options("train")):
         return f"{key}: it is a setting of the runs; all of them get it by \"overrides=['{key}=...']\""
     names = [*section, *known, *default_options(program)]
     near = difflib.get_close_matches(key, names, n=1, cutoff=0.7)
     near = near or [name for name in names if name.rpartition(".")[2] == key][:1]
-    return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in near)
+    return f"{key}: unknown setting" + "".join(f"; did you mean {name}?" for name in near)
 
 
 # ------------------------------------------------------------------------------------------ help

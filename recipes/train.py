@@ -39,7 +39,7 @@ from damian.settings.fields import leaves
 from . import cli
 from .evaluate import make_eval_env, own_code, report
 from .shared.collectors import learning_env, make_collector, read_by, ticks
-from .shared.runs import names_own_code, run_folder, save_config, stored_config
+from .shared.runs import names_own_code, run_folder, save_config, stored_values
 from .shared.settings import (
     backupdates,
     check_learning,
@@ -174,7 +174,7 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
             made.frames - made.frames / max(made.updates, 1) < config.frames, "frames", config.frames, should
         )
     elif config.checkpoint:
-        trained = stored_config(run_folder(Path(config.checkpoint)), "checkpoint", trust=True).learner.name
+        trained = stored_values(run_folder(Path(config.checkpoint)), "checkpoint")["learner"]["name"]
         names = ["actor", "critic"] if trained == config.learner.name else ["actor"]
         networks = {name: state.components[name] for name in names if name in state.components}
         load_networks(Path(config.checkpoint), "checkpoint", networks)

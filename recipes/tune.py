@@ -114,7 +114,7 @@ class Search:
         """The trainings that are still to be done, each asked for when the ones before have been told."""
         for _ in range(self.config.trials - self.n_finished):
             trial = self.study.ask(self.space)
-            folder = trial.user_attrs.get(FOLDER) or f"trial_{trial.number}"
+            folder = Path(trial.user_attrs.get(FOLDER) or f"trial_{trial.number}").name
             trial.set_user_attr(FOLDER, folder)
             written = {key: trial.params[key] for key in self.space}
             chosen = {k: f"{x:.6g}" if isinstance(x, float) else str(x) for k, x in written.items()}

@@ -166,7 +166,7 @@ class Fleet:
     def number_of(self, uav: str, key: str = "ID") -> int:
         """Number of a UAV of the fleet."""
         if uav not in self.number:
-            raise InputError(f"{key}: {show(uav)} is no UAV of this fleet: {listed(self.uavs)}")
+            raise InputError(f"{key}: {show(uav)} is not a UAV of this fleet: {listed(self.uavs)}")
         return self.number[uav]
 
     def _check_life(self, now: float) -> None:

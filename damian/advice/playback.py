@@ -218,7 +218,7 @@ def _messages(
 def _of_members(
     view: ServerView, rows: Sequence[Tensor], uavs: Sequence[str], stays: bool = False
 ) -> NDArray[Any]:
-    """Rows of the members [N, ...] as columns of all UAVs [S, U, ...]; 0 while a UAV is no member.
+    """Rows of the members [N, ...] as columns of all UAVs [S, U, ...]; 0 while a UAV is not a member.
 
     With ``stays`` it is then where it was last, and before it joins, where it will be first.
     """

@@ -1,19 +1,50 @@
-"""Components by name, or by the path of a class or function of a user's own: ``package.module:Name``."""
+"""Components by name, or by the path of a class or function of a user's own: ``package.module:Name``.
+
+Nothing else in the package imports what a setting names, because importing a module runs it.
+"""
 
 import functools
 import importlib
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib.metadata import entry_points
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from damian.common import checks
 from damian.common.errors import InputError, described
 
 T = TypeVar("T")
 Component = TypeVar("Component")
+IMPORTED: set[str] = set()
+"""Every path that a registry of this process has imported."""
+
+
+class _Door(NamedTuple):
+    """What may be imported while settings that come from a file are in use."""
+
+    named: Collection[str]
+    trust: bool
+
+
+_door: ContextVar[_Door | None] = ContextVar("door", default=None)
+
+
+@contextmanager
+def stored_settings(named: Collection[str] = (), trust: bool = False) -> Iterator[None]:
+    """While settings that come from a file are in use, import only the paths that are ``named`` elsewhere.
+
+    The file may come from anybody. What has been registered or imported before stays usable. With ``trust``
+    any path is imported. Of nested ones the outermost decides.
+    """
+    before = _door.set(_door.get() or _Door(frozenset(named), trust))
+    try:
+        yield
+    finally:
+        _door.reset(before)
 
 
 class Registry(Generic[T]):
@@ -27,7 +58,7 @@ class Registry(Generic[T]):
     Args:
         kind: what a component is called in errors, such as ``law``.
         fits: the class of components, or a function that says whether an imported object is one.
-        problem: what is wrong with an object that does not fit, as in ``is no law``.
+        problem: what is wrong with an object that does not fit, as in ``is not a law``.
     """
 
     def __init__(self, kind: str, fits: type | Callable[[Any], bool], problem: str) -> None:
@@ -58,11 +89,16 @@ class Registry(Generic[T]):
                 return self._components[name]
             known = f"one of {', '.join(self._components)}, nor " if self._components else ""
             raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
+        door = _door.get()
+        if door and not door.trust and name not in door.named:
+            remedy = "repeat that override, or add trust=true if you know where the run comes from"
+            raise InputError(f"{key}: this run uses code outside DAMIAN ({name}): {remedy}")
         component = _import_path(name, key)
         fits = self._fits
         good = isinstance(component, fits) if isinstance(fits, type) else fits(component)
         checks.require(good, key, name, self._problem)
         self._imported[name] = component
+        IMPORTED.add(name)
         return component
 
     def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:
@@ -100,10 +136,16 @@ def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], pat
     accepted = inspect.signature(function).parameters
     known = {name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY}
     for name, value in given.items():
-        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}"
+        problem = f"is not a parameter of {path}, which has {', '.join(known) or 'none'}"
         checks.require(name in known, f"{key}.{name}", value, problem)
     missing = [name for name, each in known.items() if each.default is each.empty and name not in given]
     checks.require(not missing, key, path, f"needs a value for {', '.join(missing)}")
+
+
+def resolved(path: str) -> Any:
+    """The class or function at a path that code names, not a setting; it is imported when it is needed."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 def _import_path(path: str, key: str) -> Any:

@@ -83,7 +83,7 @@ _NO_DELAY = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
 LAWS = Registry[type[Law]](
     "law",
     lambda found: isinstance(found, type) and issubclass(found, Law) and is_dataclass(found),
-    "is no dataclass derived from damian.Law",
+    "is not a dataclass derived from damian.Law",
 )
 """Laws by name; ``law_of`` also takes the path of a class outside the package, ``package.module:Class``."""
 
@@ -284,7 +284,7 @@ class Distance(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.place(f"{key}.receiver", self.receiver)
         longest = in_steps(f"{key}.longest", self.longest, dt)
-        in_steps(f"{key}.base", self.base, dt)  # refuses what is no delay
+        in_steps(f"{key}.base", self.base, dt)  # refuses what is not a delay
         base = _seconds(f"{key}.base", self.base) / dt if isinstance(self.base, str) else self.base
         loses, compute = math.isfinite(self.range), partial(self.delays, base)
         reads = {"reads": ["position"], "optional_reads": ["receiver_position"]}
@@ -352,7 +352,7 @@ def law_of(written: Any, key: str = "delay") -> Law:
     if callable(written) and not isinstance(written, type):
         return Function(cast(Any, written))
     if isinstance(written, str) and (written in LAWS or ":" in written):
-        raise InputError(f"{key}: {written} is no delay; that law is written {{law: {written}}}")
+        raise InputError(f"{key}: {written} is not a delay; that law is written {{law: {written}}}")
     if not isinstance(written, Mapping):
         return Constant(_number(written))
     kind = written.get("law")
@@ -360,7 +360,7 @@ def law_of(written: Any, key: str = "delay") -> Law:
     values = {name: _number(value) for name, value in written.items() if name != "law"}
     names = [field.name for field in fields(law)]
     for name, value in values.items():
-        should = f"is no setting of the law {kind}, which has {', '.join(names) or 'none'}"
+        should = f"is not a setting of the law {kind}, which has {', '.join(names) or 'none'}"
         checks.require(name in names, f"{key}.{name}", value, should)
     return law(**values)
 

@@ -3,12 +3,13 @@
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
-from damian.common.errors import InputError, naming_errors
+from damian.common.errors import naming_errors
 from damian.common.registry import Registry, check_parameters
 from damian.settings import LoggerConfig
 
@@ -34,9 +35,9 @@ class Logger(Protocol):
 LOGGERS = Registry[Callable[..., Logger]](
     "logger",
     lambda found: callable(found) and (not isinstance(found, type) or hasattr(found, "log_scalar")),
-    "is no function (folder) -> logger, nor a class with a method log_scalar",
+    "is not a function (folder) -> logger, nor a class with a method log_scalar",
 )
-"""Loggers of the user's own as ``package.module:Name``: functions or classes that get the run folder."""
+"""Loggers by name or ``package.module:Name``: functions or classes that get the run folder."""
 
 
 def make_loggers(config: LoggerConfig, folder: Path) -> list[Logger]:
@@ -47,7 +48,7 @@ def make_loggers(config: LoggerConfig, folder: Path) -> list[Logger]:
         parameters = told | written if make is wandb else written
         with naming_errors(f"logger.custom: {path}"):
             logger = make(folder, **parameters)
-            should = "is no logger: it has no method log_scalar(name, value, step)"
+            should = "is not a logger: it has no method log_scalar(name, value, step)"
             checks.require(hasattr(logger, "log_scalar"), path, type(logger).__name__, should)
         loggers.append(logger)
     return loggers
@@ -63,15 +64,15 @@ def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
     key, entry = "logger.custom", written if isinstance(written, Mapping) else {"logger": written}
     path, make, parameters = LOGGERS.read(entry, key, "logger")
     check_parameters(make, parameters, path, key)
+    missing = make is wandb and not find_spec("wandb")
+    checks.require(not missing, "logger", path, "is not installed; pip install wandb")
     return path, make, parameters
 
 
+@LOGGERS.register("wandb")
 def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Logger:
     """A run of Weights & Biases, named as the run folder; a resumed training continues it."""
-    try:
-        library = import_module("wandb")
-    except ImportError:
-        raise InputError("logger: wandb is not installed; pip install wandb") from None
+    library = import_module("wandb")
     from torchrl.record.loggers import WandbLogger  # noqa: PLC0415 (takes seconds to import)
 
     stored = folder / "wandb_id.txt"

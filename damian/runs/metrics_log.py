@@ -120,7 +120,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     except OSError as error:
         raise InputError(f"{path}: it cannot be read: {error.strerror}") from None
     except (TypeError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: it is no table of numbers ({error})") from None
+        raise InputError(f"{path}: it is not a table of numbers ({error})") from None
     if rows and _FIRST_COLUMN not in rows[0]:
         raise InputError(f"{path}: it has no column {_FIRST_COLUMN}")
     return rows

@@ -187,7 +187,9 @@ def feature(
     return lambda compute: Feature(compute, scope, width, low, high)
 
 
-FEATURES = Registry[Feature]("feature", Feature, "is no feature: decorate the function with damian.feature")
+FEATURES = Registry[Feature](
+    "feature", Feature, "is not a feature: decorate the function with damian.feature"
+)
 """Features by name; those outside the package as ``package.module:name``."""
 
 

@@ -55,7 +55,7 @@ def reward_term(
 
 
 REWARD_TERMS = Registry[RewardTerm](
-    "reward term", RewardTerm, "is no reward term: decorate it with damian.reward_term"
+    "reward term", RewardTerm, "is not a reward term: decorate it with damian.reward_term"
 )
 """Reward terms from outside the package, by name or as ``package.module:name``."""
 

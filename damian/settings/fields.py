@@ -14,6 +14,7 @@ from types import UnionType
 from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
 
 from damian.common import checks
+from damian.common.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,18 @@ def leaves(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield from leaves(value, f"{path}{name}.")
         elif not rule.fixed and (":" in kind or not rule.kinds or kind in rule.kinds):
             yield f"{path}{name}", value
+
+
+def filled(default: Any, values: Mapping[str, Any], path: str = "") -> Any:
+    """Settings like ``default`` with these plain values, whose sections are mappings; no text is resolved."""
+    known = {name for name, rule in rules(type(default)).items() if not rule.fixed}
+    if unknown := sorted({*values} - known):
+        raise InputError(f"{path}{unknown[0]} is not a setting of damian train: no policy was trained there")
+    changed = {}
+    for name, value in values.items():
+        old = getattr(default, name)
+        changed[name] = filled(old, value, f"{path}{name}.") if dataclasses.is_dataclass(old) else value
+    return dataclasses.replace(default, **changed)
 
 
 _hints = functools.cache(get_type_hints)

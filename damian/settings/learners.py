@@ -1,12 +1,11 @@
 """Settings of the networks and of the learners. A learner's settings name the class that learns with them."""
 
 from dataclasses import dataclass
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from damian import keys
 from damian.common import checks
-from damian.common.registry import Registry
+from damian.common.registry import Registry, resolved
 from damian.settings.fields import Settings, constant, setting
 
 if TYPE_CHECKING:
@@ -23,15 +22,9 @@ def _is_learner(found: Any) -> bool:
 
 
 LEARNERS = Registry[type["LearnerConfig"]](
-    "learner", _is_learner, "is no @dataclass derived from damian.LearnerConfig with a method make"
+    "learner", _is_learner, "is not a @dataclass derived from damian.LearnerConfig with a method make"
 )
 """Settings of learners, by name; the user's own as ``package.module:Name``."""
-
-
-def resolved(path: str) -> Any:
-    """The class or function at ``package.module:Name``, which is imported when it is needed."""
-    module, _, name = path.partition(":")
-    return getattr(import_module(module), name)
 
 
 @dataclass

@@ -183,7 +183,7 @@ class Episode:
             return cls(**fixed, **columns)
         except (AttributeError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
             problem = f"no {error}" if isinstance(error, KeyError) else one_line(str(error))
-            raise InputError(f"{path}: it is no episode of version {VERSION}: {problem}") from error
+            raise InputError(f"{path}: it is not an episode of version {VERSION}: {problem}") from error
 
 
 COLUMNS = {f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")}  # type: ignore[union-attr]

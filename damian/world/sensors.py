@@ -49,7 +49,7 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
     return lambda compute: Sensor(compute, width, compute.__name__)
 
 
-SENSORS = Registry[Sensor]("sensor", Sensor, "is no sensor: decorate the function with damian.sensor")
+SENSORS = Registry[Sensor]("sensor", Sensor, "is not a sensor: decorate the function with damian.sensor")
 """Sensors, as ``package.module:name``."""
 
 

@@ -114,7 +114,7 @@ class MotionModel(ABC):
 MOTION_MODELS = Registry[type[MotionModel]](
     "motion model",
     lambda found: isinstance(found, type) and issubclass(found, MotionModel),
-    "is no class derived from damian.world.vehicles.MotionModel",
+    "is not a class derived from damian.world.vehicles.MotionModel",
 )
 """Motion models by ``motion.kind``, or as ``package.module:Class``."""
 

@@ -1,6 +1,9 @@
 """The environment of a training, and its batches: each lies between two ticks of the system clock."""
 
+import os
+import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import cast
 
 import torch
@@ -26,12 +29,31 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     messages = measures_hindsight(config) or config.clock.trigger is not None
     privileged = config.critic == "privileged"
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
+    warn_of_memory(config)
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
     if config.compiles:
         env.compile()
     env.append_transform(EpisodeTotals())
     return env
+
+
+def warn_of_memory(config: TrainConfig) -> None:
+    """Say on one line if the steps of a batch alone take more memory than there is; small ones never do."""
+    steps = config.worlds * config.update_steps
+    if steps * config.agents < 10**8 or config.device != "cpu" or not hasattr(os, "sysconf"):
+        return
+    region = replace(config.region, pool=1, initial_conditions=1)
+    one = make_env(replace(config.train_scenario, region=region), 1)
+    needed, there = (
+        one.fake_tensordict().bytes() * steps,
+        os.sysconf("SC_PAGESIZE") * os.sysconf("SC_PHYS_PAGES"),
+    )
+    if needed > there:
+        what = (
+            f"the steps of {config.worlds} worlds of {config.agents} UAVs take at least {needed / 1e9:.0f} GB"
+        )
+        print(f"worlds: {what}, and this machine has {there / 1e9:.0f} GB: choose fewer", file=sys.stderr)
 
 
 def make_collector(

@@ -36,7 +36,7 @@ from damian.settings import TrainConfig
 from damian.settings.fields import leaves
 
 from ..cli import Work
-from .runs import POLICY, perform, stored_config
+from .runs import POLICY, perform, stored_values
 
 WORDS = ("task", "delay", "arm", "regime", "policy")
 """Columns of results that are not numbers."""
@@ -95,14 +95,16 @@ def check_stored(run: Run) -> None:
     if not (run.folder / CONFIG).exists():
         return
     try:
-        stored = stored_config(run.folder, "hydra.run.dir", named=[repr(dict(leaves(run.config)))])
+        stored = stored_values(run.folder, "hydra.run.dir")
     except InputError as error:
         raise InputError(f"{error}; delete the folder") from error
-    old, new = dict(leaves(stored)), dict(leaves(run.config))
-    for key in (new | old).keys() - {"resume", "overrides", "checkpoint", "learner.teacher"}:
-        if old.get(key) != new.get(key):
+    for key, new in leaves(run.config):
+        old: Any = stored
+        for name in key.split("."):
+            old = old.get(name) if isinstance(old, dict) else None
+        if old != new and key not in ("resume", "overrides", "checkpoint", "learner.teacher"):
             raise InputError(
-                f"{run.folder}: {key} is {old.get(key)} in this stored run, and {new.get(key)} is asked "
+                f"{run.folder}: {key} is {old} in this stored run, and {new} is asked "
                 "for: delete the folder, or choose another one with hydra.run.dir"
             )
 

@@ -1,7 +1,7 @@
 """Runs in their folders: starting and resuming them, and taking settings and policy of a stored one."""
 
 import random
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, cast
@@ -12,16 +12,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from damian.common.atomic_files import remove_unfinished, write_atomically
 from damian.common.errors import InputError
+from damian.common.registry import IMPORTED, stored_settings
 from damian.common.text_files import show
 from damian.runs.checkpoint import digest
 from damian.runs.run_folder import CONFIG
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
 from damian.settings import LEARNERS, PredictiveMappoConfig, ScenarioConfig, TrainConfig
-from damian.settings.fields import leaves
+from damian.settings.fields import filled, leaves
 
-from ..cli import Work, checked, command, composed, reason, shown
-from ..known import LOGGERS, SCHEMAS, check_words, key_of
+from ..cli import Work, checked, command, composed, reason, shown, stored_words, texts
+from ..known import SCHEMAS, check_words, key_of
 from .settings import check_components
 
 OVERRIDES = "overrides"
@@ -66,19 +67,14 @@ def with_policy_of(
     given: DictConfig, program: str, words: list[str], own_folder: str | None
 ) -> tuple[Any, list[str]]:
     """The settings and overrides of a run that flies, or begins with, the policy of a stored run."""
-    folder, trust = run_folder(Path(given.checkpoint)), bool(given.trust)
-    stored, run_words = stored_config(folder, "checkpoint", trust, words), read_record(folder).get(OVERRIDES)
-    before = [w for w in map(str, run_words or []) if key_of(w) not in ("trust", "checkpoint", "resume")]
-    # Hydra imports a learner, and reads files that may name one, while it composes.
-    named = [word.partition("=")[2].strip("'\"") for word in before]
-    require_trust(named, "checkpoint", trust, words)
+    folder = run_folder(Path(given.checkpoint))
+    stored = stored_config(folder, "checkpoint")
+    before = stored_words(read_record(folder).get(OVERRIDES), "train", "checkpoint", own_folder)
     defaults = {each.name: each.default for each in fields(TrainConfig)}
     others = [f.name for f in fields(SCHEMAS[program]) if f.default != defaults.get(f.name, f.default)]
     overrides = inherited(stored, before, words, others)
     check_words(program, overrides, own_folder)
-    found = composed(program, overrides, own_folder)
-    require_trust(found, "checkpoint", trust, words)
-    config = checked(found, program)
+    config = checked(composed(program, overrides, own_folder), program)
     check_policy_fits(config, stored)
     if changed := changes(config, stored):
         print(f"changed since the training: {changed}")
@@ -123,70 +119,43 @@ def run_folder(written: Path) -> Path:
     return written.parent if written.is_file() else written
 
 
-def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[str] = ()) -> TrainConfig:
-    """The settings of the run in a folder; the other arguments are those of ``require_trust``."""
+def stored_values(folder: Path, key: str) -> dict[str, Any]:
+    """The settings in a run folder as plain data: no text in them is resolved, and no code is imported."""
     file = folder / CONFIG
     if not file.is_file():
         raise InputError(f"{key}: {folder} holds no {CONFIG}, so there is no run")
     check_version(folder, key)
     try:
-        saved = cast(DictConfig, OmegaConf.load(file))
-        require_trust(saved, key, trust, named)
-        for name in sorted({*map(str, saved)} - {each.name for each in fields(TrainConfig)}):
-            raise InputError(f"{name} is no setting of damian train: no policy was trained there")
-        learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
-        config = OmegaConf.merge(OmegaConf.structured(TrainConfig(learner=learner)), saved)
-        return cast(TrainConfig, OmegaConf.to_object(config))
-    except InputError as error:
-        raise InputError(str(error) if str(error).startswith(key) else f"{key}: {file}: {error}") from None
+        return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(file)))
     except Exception as error:  # a damaged file can raise anything
         raise InputError(f"{key}: {file}: {reason(error)}") from None
 
 
-def require_trust(found: Any, key: str, trust: bool, named: Sequence[str]) -> None:
-    """Refuse components of other code that stored settings name, unless the caller has named or trusts them.
-
-    Importing ``package.module:Name`` runs the module, and a stored file may come from anybody. So nothing is
-    made of ``found``, the stored settings, before. ``key`` is the setting that names them, and ``named`` are
-    the words of the command line.
-    """
-    typed = " ".join(named)
-    foreign = [path for path in _components(found) if path not in typed]
-    if foreign and not trust:
-        raise InputError(
-            f"{key}: its settings name {foreign[0]}, which is no part of DAMIAN; trust=true imports its code"
-        )
-
-
-def _components(node: Any) -> Iterator[str]:
-    """Every text ``package.module:Name`` in settings, but for DAMIAN's own."""
-    if isinstance(node, DictConfig | Mapping):
-        for key in node:
-            if key not in ("hydra", "where", "device"):  # where=PROPERTY:VALUE, device=cuda:0
-                yield from _components(node[key])
-    elif isinstance(node, str):
-        module, colon, last = node.partition(":")
-        path = all(part.isidentifier() for part in (*module.split("."), last))
-        if colon and path and node not in LOGGERS.values():
-            yield node
-    elif isinstance(node, Sequence):
-        for each in node:
-            yield from _components(each)
+def stored_config(folder: Path, key: str) -> TrainConfig:
+    """The settings of the run in a folder; ``key`` is the setting that names it."""
+    values = stored_values(folder, key)
+    try:
+        with stored_settings():
+            name = values["learner"]["name"]
+            learner = LEARNERS.get(name, "learner")(name=name)
+            return filled(TrainConfig(learner=learner), values)
+    except Exception as error:  # a damaged file can raise anything
+        raise InputError(f"{key}: {folder / CONFIG}: {reason(error)}") from None
 
 
 def names_own_code(config: TrainConfig) -> bool:
     """Do the settings name components of your own, which a program imports only with ``trust=true``?"""
-    return any(_components(asdict(config)))
+    return not IMPORTED.isdisjoint(texts(asdict(config)))
 
 
 def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfig:
     """The settings of a run to resume; only ``frames`` and ``episodes`` may change."""
-    allowed = ("resume", "frames", "episodes", "trust")
-    if refused := [word for word in words if key_of(word) not in allowed]:
+    allowed, stored = ("resume", "frames", "episodes", "trust"), read_record(folder).get(OVERRIDES) or ()
+    if refused := [word for word in words if key_of(word) not in allowed and word not in stored]:
         problem = "a resumed run keeps its configuration; only frames= and episodes= may change; checkpoint="
         problem += f"{folder} {refused[0]} begins a new run with its policy"
         raise InputError(f"{refused[0]}: {problem}")
-    config = stored_config(folder, "resume", given.trust, words)
+    config = stored_config(folder, "resume")
     checkpoint_file(folder, "resume")
     config.resume = str(folder)
     for key in {"frames", "episodes"} & set(map(key_of, words)):

@@ -2,14 +2,16 @@
 
 from damian import keys
 from damian.common import checks
-from damian.delays.config import check_laws, delay_sampler
+from damian.delays.config import check_laws, delay_sampler, link_reads
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.learners.schedule import SystemClock
 from damian.runs.loggers import check_loggers
 from damian.server.features import check_features
 from damian.server.rewards import own_terms
 from damian.settings import LearningSetup, PredictiveMappoConfig, TrainConfig
+from damian.world.regions.config import REGION_SOURCES
 from damian.world.sensors import sensors_of
+from damian.world.vehicles import MOTION_MODELS
 
 
 def late(config: TrainConfig) -> list[str]:
@@ -60,9 +62,12 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
 
 
 def check_components(config: TrainConfig) -> None:
-    """Check that the device, laws, features, terms, sensors and loggers that the settings name exist."""
+    """Check that the device and all components exist that the settings name, which imports them."""
     checks.device("device", config.device)
+    REGION_SOURCES.get(config.region.kind, "region.kind")
+    MOTION_MODELS.get(config.motion.kind, "motion.kind")
     check_laws(config.delay, config.clock.dt)
+    link_reads(config.links, config.clock.dt)
     check_features(config.observation)
     own_terms(config.reward)
     sensors_of(config.sensors)

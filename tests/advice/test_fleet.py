@@ -186,7 +186,7 @@ def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"uav": "d"}, "ID: 'd' is no UAV of this fleet: a, b, c"),
+        ({"uav": "d"}, "ID: 'd' is not a UAV of this fleet: a, b, c"),
         ({"time": START + 60}, "time: 1700000060 s is 60.0 s after it came in"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
     ],

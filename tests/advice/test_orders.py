@@ -136,7 +136,7 @@ def test_an_order_goes_only_forward_whatever_is_said(field, said, status, moved)
     assert found == status
     assert (field.booked("A") != 200) == moved
     assert field.say("B", answer, "accepted") == "unknown", "it is not an answer to B"
-    with pytest.raises(InputError, match="ID: 'C' is no UAV of this fleet"):
+    with pytest.raises(InputError, match="ID: 'C' is not a UAV of this fleet"):
         field.say("C", answer, "accepted")
 
 
@@ -341,12 +341,12 @@ def test_uavs_join_with_their_first_reports_and_leave(field):
     assert (field.ask("B").state, field.fleet.levels) == ("bound", [levels["B"], 30.0])
     for join, leave, problem in (
         (["B"], [], "join: B belongs to the fleet"),
-        ([], ["X"], "leave: 'X' is no UAV of this fleet"),
+        ([], ["X"], "leave: 'X' is not a UAV of this fleet"),
         ([], ["B", "C"], "uavs: a fleet has 1 to 100 UAVs"),
     ):
         with pytest.raises(InputError, match=problem):
             field.change(join, leave)
-    with pytest.raises(InputError, match="ID: 'A' is no UAV"):
+    with pytest.raises(InputError, match="ID: 'A' is not a UAV"):
         field.report("A", 200)
 
 

@@ -8,7 +8,7 @@ from damian.delays.laws import LAWS, law_of
 
 
 def greetings() -> Registry:
-    registry = Registry("greeting", callable, "is no function")
+    registry = Registry("greeting", callable, "is not a function")
 
     @registry.register("plain")
     def plain() -> str:
@@ -55,9 +55,9 @@ def test_an_installed_package_registers_names_by_its_entry_point(tmp_path, monke
 REFUSED = {
     "key: rude is not one of plain, nor a path such as": lambda: greetings().get("rude", "key"),
     "key: nowhere:x: No module named 'nowhere'; nowhere must": lambda: greetings().get("nowhere:x", "key"),
-    "key: math:pi is no function": lambda: greetings().get("math:pi", "key"),
-    "key: math:pi is no int": lambda: Registry("int", int, "is no int").get("math:pi", "key"),
-    "key.too: 1 is no parameter of plain": lambda: check_parameters(polite, {"too": 1}, "plain", "key"),
+    "key: math:pi is not a function": lambda: greetings().get("math:pi", "key"),
+    "key: math:pi is not an int": lambda: Registry("int", int, "is not an int").get("math:pi", "key"),
+    "key.too: 1 is not a parameter of plain": lambda: check_parameters(polite, {"too": 1}, "plain", "key"),
 }
 
 

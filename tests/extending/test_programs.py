@@ -125,7 +125,10 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
     [
         (["learner=learnr:X"], "learner: learnr:X: No module named 'learnr'; learnr must be installed"),
         (["learner=reader:ReaderConfig"], "learner: reader:ReaderConfig reads hindsight, which needs aware="),
-        (["logger.custom=[law:Satellite]"], "law:Satellite is no function (folder) -> logger, nor a class"),
+        (
+            ["logger.custom=[law:Satellite]"],
+            "law:Satellite is not a function (folder) -> logger, nor a class",
+        ),
     ],
 )
 def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):

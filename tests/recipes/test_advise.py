@@ -78,9 +78,10 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
 
 REFUSALS = [
     (["policy=script"], "reports: nothing is not the only one of reports=FILE"),
+    (["port=0", "host=no host"], "port: no host:0 cannot be used: "),
     (["reports=nothing.csv"], "nothing.csv: no such file"),
     (["reports=table.csv", "uavs=[A,B,C,D]"], "table.csv: no advice yet: no report of D has come in"),
-    (["reports=table.csv", "uavs=[A,B]"], "table.csv: line 4: ID: 'C' is no UAV of this fleet: A, B"),
+    (["reports=table.csv", "uavs=[A,B]"], "table.csv: line 4: ID: 'C' is not a UAV of this fleet: A, B"),
 ]
 
 
@@ -93,7 +94,7 @@ def test_what_cannot_be_is_refused_in_one_line(run, capsys, words, message):
 
 @pytest.mark.parametrize("word", ["token=", "++token="])
 def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
-    def advised(config, session):
+    def advised(config, session, _):
         assert config.token == TOKEN
         session.create("north", ["A"])
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
@@ -11,6 +12,7 @@ import damian
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
+from damian.recipes.shared.collectors import warn_of_memory
 
 
 def refusal(capsys, *words: str) -> str:
@@ -43,9 +45,14 @@ def test_settings_help_and_wrong_words_need_no_torch(code):
     ("words", "message"),
     [
         (["trian"], "trian: no such program; the programs are train, evaluate"),
-        (["train", "agnts=3"], "agnts: no such key; did you mean agents?"),
-        (["train", "num_envs=8"], "num_envs: no such key; did you mean worlds?"),
-        (["train", "delay=3"], "delay: 3 is no option of this group; write delay.obs=3"),
+        (["train", "agnts=3"], "agnts: unknown setting; did you mean agents?"),
+        (["train", "num_envs=8"], "num_envs: unknown setting; did you mean worlds?"),
+        (["train", "delay=3"], "delay: 3 is not an option of this group; write delay.obs=3"),
+        (
+            ["train", "region.where=name:x", "region=usecase"],
+            "region.where: unknown setting for region=usecase",
+        ),
+        (["train", "source.speed=3"], "source.speed: unknown setting for source=static; another source="),
         (["train", "-m", "delay=none,papr"], "delay: papr is not one of"),
         (["train", "delay=-1"], "Config group override must be a string"),
         (["train", "seed=0,1"], "Ambiguous value for argument 'seed=0,1' 1. To use it as a list"),
@@ -89,7 +96,7 @@ def test_a_refused_run_removes_only_the_folders_that_it_has_made(capsys, tmp_pat
 def test_a_refused_job_of_a_sweep_leaves_no_folder(capsys, tmp_path):
     words = ("-m", "settle=true", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
     assert "settle: True means nothing" in refusal(capsys, "train", *words)
-    assert [path.name for path in tmp_path.iterdir()] == ["multirun.yaml"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_path):
@@ -99,7 +106,7 @@ def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_
     for text, message in (
         ("agents: 2\n\tseed: 3\n", "mine.yaml"),
         ("model: {hidden: 8}\n", "model.hidden"),
-        ("agnts: 8\n", "agnts: no such key; did you mean agents?"),
+        ("agnts: 8\n", "agnts: unknown setting; did you mean agents?"),
     ):
         file.write_text(f"# @package _global_\n{text}")
         assert message in refusal(capsys, *words)
@@ -149,3 +156,41 @@ def test_help_explains_a_program_a_section_and_a_setting(capsys):
     assert "    paper: " in printed
     main(["train", "--cfg", "job", "agents=4"])
     assert "agents: 4" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train", "-m", "seed=a,b"], "seed: Value 'a' of type 'str' could not be converted to Integer"),
+        (["train", "-m", "seed=0,b"], "seed: Value 'b' of type 'str' could not be converted to Integer"),
+        (["train", "-m", "delay.obs={law: trace, path: no.csv}", "seed=0,1"], "no.csv: no such file"),
+        (["train", "logger=wandb"], "logger: wandb is not installed; pip install wandb"),
+    ],
+)
+def test_what_is_refused_leaves_no_folder(capsys, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert message in refusal(capsys, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    with pytest.raises(SystemExit):
+        main(["train", "-m", "seed=0,1", "hydra.sweep.dir=file/sweep"])
+    assert capsys.readouterr().err == f"error: {tmp_path}/file/sweep: Not a directory\n"
+    Path("run").mkdir()
+    Path("run/result.csv").write_text("policy,return,success_rate,steps,perceived_return,age\nx,1,0,1,1,0\n")
+    Path("results.csv.part").mkdir()
+    with pytest.raises(SystemExit):
+        main(["results", "."])
+    assert capsys.readouterr().err.startswith("error: results.csv: it cannot be written: Is a directory")
+
+
+def test_a_training_that_is_larger_than_the_machine_says_so(capsys):
+    warn_of_memory(cli.settings("worlds=1000000", "agents=50"))
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("worlds: the steps of 1000000 worlds of 50 UAVs take at least ")
+    warn_of_memory(cli.settings("worlds=64"))
+    assert not capsys.readouterr().err

@@ -229,7 +229,7 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
+        ([listed("framess=3")], "usecase2/none/undelayed: framess: unknown setting; did you mean frames?"),
         (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
         (["tasks=[spotting]"], "tasks: spotting is not one of usecase1, usecase2"),
     ],

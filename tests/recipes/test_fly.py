@@ -87,7 +87,7 @@ def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run,
         "policy=deterministic", "checkpoint=trained", folder="one"
     )  # not as many as the training evaluated
     assert [path.name for path in one.glob("episode_*.json")] == ["episode_0.json"]
-    refusal = "flown/config.yaml: formats is no setting of damian train: no policy was trained there"
+    refusal = "flown/config.yaml: formats is not a setting of damian train: no policy was trained there"
     check_refused(lambda: run("policy=deterministic", "checkpoint=flown", folder="two"), refusal, capsys)
 
 

@@ -86,5 +86,7 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
 def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, changes, problem):
     path = tmp_path / "episode.json"
     path.write_text(json.dumps({**flight().document(), **changes}))
-    with pytest.raises(InputError, match=rf"episode\.json: it is no episode of version 2: .*{problem}.*$"):
+    with pytest.raises(
+        InputError, match=rf"episode\.json: it is not an episode of version 2: .*{problem}.*$"
+    ):
         Episode.load(path)

@@ -19,7 +19,7 @@ RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]
 
 
 REGION_SOURCES = Registry[RegionSource](
-    "region source", inspect.isfunction, "is no function (config, rng) -> list[Region]"
+    "region source", inspect.isfunction, "is not a function (config, rng) -> list[Region]"
 )
 """Region sources by ``region.kind``, or as ``package.module:function``."""
 
