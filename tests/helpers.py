@@ -92,13 +92,14 @@ def square(**changed: Any) -> ScenarioConfig:
 
 def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) -> ScenarioConfig:
     """A scenario with every feature, every reward term, a walking intermittent source and batteries."""
+    in_order = getattr(changed.get("delay"), "order", "generation") == "generation"
     sections = {
         "region": RegionConfig(min_area=20_000, max_area=60_000, pool=3, initial_conditions=12),
         "motion": MotionConfig(kind=motion, max_speed=20.0, max_acceleration=10.0),
         "source": walking(emission="per_step", emission_probability=0.7),
         "battery": BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=20.0),
         "actions": ActionConfig(kind=kind),
-        "observation": ObservationConfig(local_features=list(LOCAL), global_features=list(GLOBAL)),
+        "observation": ObservationConfig(list(LOCAL), list(GLOBAL), timeline=3 * in_order),
         "reward": RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5), bonus=1.0, penalty=0.25),
         "episode": EpisodeConfig(max_steps=8, success_share=1.0, discharged_share=1.0),
     }
