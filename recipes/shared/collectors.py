@@ -26,7 +26,8 @@ from .settings import backupdates, measures_hindsight
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment of the training, [B], with what the learner and the logs need."""
-    messages = measures_hindsight(config) or config.clock.trigger is not None
+    triggered = config.clock.trigger is not None
+    messages = backupdates(config) or measures_hindsight(config) or triggered
     privileged = config.critic == "privileged"
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
     warn_of_memory(config)
