@@ -96,8 +96,8 @@ STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")
 ADVANTAGE = (AGENTS, "advantage")
 """Advantage of the action, [B, N, 1]."""
 BACKUPDATED = (AGENTS, "backupdated")
-"""Did back-updating replace the message that the server held at this step, [T, B, N, 1] bool; if only rewards
-are late: did it credit the step with a late reward."""
+"""Has a late message changed the stored reward of this step, [T, B, N, 1] bool; if only rewards are late: has
+it been credited with a late reward."""
 HINDSIGHT = (AGENTS, "hindsight")
 """Under ``"next"``, if a back-updating storage gets this key: the newest message sent by that step that has
 arrived by now, packed, [T, B, N, M]."""

@@ -109,7 +109,7 @@ def report(steps: TensorDictBase, collected: Tensor) -> None:
         ("message in hindsight", after["hindsight"], after["message"]),
     ):
         print(f"mean error of the {name}: {(estimate - true).abs().mean():.4f}")
-    print(f"steps at which a late message replaced the one held: {steps['backupdated'].float().mean():.1%}")
+    print(f"steps whose reward a late message has changed: {steps['backupdated'].float().mean():.1%}")
     print(f"steps after the end of an episode, not to learn from: {(~steps['valid']).float().mean():.1%}")
 
 

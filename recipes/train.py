@@ -33,6 +33,7 @@ from damian.runs.metrics import Evaluation, HindsightReturns, evaluate
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
 from damian.runs.training_state import RandomState, TrainingState, load_networks
+from damian.server.trial import not_finite
 from damian.settings import TrainConfig
 from damian.settings.fields import leaves
 
@@ -70,7 +71,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         with closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
             began = time.perf_counter()
             for batch in ticks(collector, clock, env.server) if not enough(config, state) else ():
-                update(config, learner, state, log, batch)
+                update(config, env, learner, state, log, batch)
                 frames = state.progress.frames
                 log.show(frames, {"steps_per_second": batch.numel() / (time.perf_counter() - began)})
                 if eval_env and state.progress.updates % cast(int, config.eval_every) == 0:
@@ -184,13 +185,20 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
 
 
 def update(
-    config: TrainConfig, learner: Learner, state: TrainingState, log: MetricsLog, batch: TensorDictBase
+    config: TrainConfig,
+    env: DelayedEnv,
+    learner: Learner,
+    state: TrainingState,
+    log: MetricsLog,
+    batch: TensorDictBase,
 ) -> None:
     """Make one update from a batch [B, T], and log its numbers."""
     progress, episodes = state.progress, state.episodes
     episodes.add(batch)
     progress.frames += batch.numel()
     progress.updates += 1
+    if problem := not_finite(env.server, env.uav_env.simulation, batch):
+        raise failure(state, problem)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(config.threads)
@@ -212,10 +220,13 @@ def check_convergence(config: TrainConfig, state: TrainingState, losses: dict[st
     """Stop a run whose learner has diverged, before its checkpoint is replaced."""
     if problem := divergence(state.components, losses):
         remedy = f"choose a smaller learner.lr than {config.learner.lr:g}"
-        saved = f"{state.folder / CHECKPOINT} is of update {state.saved} and intact"
-        raise RunError(
-            f"update {state.progress.updates}: {problem}: the learner has diverged; {remedy}; {saved}"
-        )
+        raise failure(state, f"{problem}: the learner has diverged; {remedy}")
+
+
+def failure(state: TrainingState, problem: str) -> RunError:
+    """The error of a run that cannot go on after an update."""
+    saved = f"{state.folder / CHECKPOINT} is of update {state.saved} and intact"
+    return RunError(f"update {state.progress.updates}: {problem}; {saved}")
 
 
 def progress_bar(config: TrainConfig, state: TrainingState) -> tqdm:

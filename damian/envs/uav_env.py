@@ -16,6 +16,7 @@ from damian.common import checks, counter_rng, devices
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
+from damian.server.trial import try_own_components
 from damian.settings import ScenarioConfig
 from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
@@ -87,6 +88,7 @@ class UavEnv(EnvBase):
         self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         self.simulation = simulation or make_simulation(self.scenario, seed)
         self.server = server or Server(self.scenario, self.simulation)
+        try_own_components(self.server, self.simulation)
         problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
         known = messages_only or self.server.grid is None
         checks.require(known, "observation.belief", self.server.observation.belief, problem)

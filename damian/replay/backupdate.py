@@ -43,8 +43,8 @@ class BackupdateStorage(TimeStorage):
 
     The storage adds: ``valid`` [T, B, 1], false where the episode had ended already, as the receiver knows
     now; ``reset_after`` [T, B, 1], true where the environment was reset (such a step is truncated if the task
-    had not ended after all); ``backupdated`` beside ``delay_key``, true where a late message replaced the one
-    that the receiver held (without messages: where a late reward has been paid); and the messages of
+    had not ended after all); ``backupdated`` beside ``delay_key``, true where late messages have changed the
+    stored reward (without messages: where a late reward has been paid); and the messages of
     ``hindsight_key`` with their ages.
 
     The entries of messages are at the root (one sender in each world: [T, B, M], delay and age [T, B, 1]) or
@@ -190,10 +190,12 @@ class BackupdateStorage(TimeStorage):
         if done in after:
             ended = torch.cat([ended[:n_right], after[done][n_right:]])
         over = ended_before(ended.squeeze(-1), begins, already_ended)
+        if self.recompute is not None:
+            added[self._backupdated] = _rewards_changed(after, steps, steps[self._backupdated])
         return {**after, **_before(steps, after, begins), **added, keys.VALID: ~over.unsqueeze(-1)}
 
     def _recompute_latest(self, steps: TensorDictBase) -> tuple[Entries, Entries]:
-        """What ``recompute`` returns for all that has arrived, and ``backupdated`` and ``hindsight_key``."""
+        """What ``recompute`` returns for all that has arrived, and ``hindsight_key``, or ``backupdated``."""
         delay = steps[self._delay]
         if self.recompute is None:
             late = cast(Correction, self._late_rewards)
@@ -206,11 +208,8 @@ class BackupdateStorage(TimeStorage):
             held = torch.cat([steps[self._hindsight][:1], held[1:]])
             age = torch.cat([steps[self._hindsight_age][:1], age[1:]])
         latest, age = latest_arrived(steps[self._sent], delay.squeeze(-1), held, age.squeeze(-1))
-        replaced = latest != steps[self._held]
-        added: Entries = {self._backupdated: replaced.any(-1, keepdim=True)}
-        if self._hindsight is not None:
-            added |= {self._hindsight: latest, self._hindsight_age: age.unsqueeze(-1)}
-        return self.recompute(steps, latest), added
+        hindsight = {self._hindsight: latest, self._hindsight_age: age.unsqueeze(-1)}
+        return self.recompute(steps, latest), cast(Entries, hindsight if self._hindsight else {})
 
     def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
         """Apply the corrections to what ``recompute`` returned for steps [T, B]."""
@@ -227,6 +226,17 @@ class BackupdateStorage(TimeStorage):
             same = stored is not None and (value.shape, value.dtype) == (stored.shape, stored.dtype)
             checks.require(same and key[0] == "next", "recompute", key, should)
         return entries
+
+
+def _rewards_changed(after: Entries, steps: TensorDictBase, changed: Tensor) -> Tensor:
+    """``changed`` [T, B, *, 1], now true also where the reward of a step is no longer the stored one."""
+    for key in after:
+        if keys.last_part(key) == keys.last_part(keys.REWARD):
+            now = after[key] != steps[key]
+            # All senders of a world may have changed a reward that is not of a sender.
+            of_sender = now if now.shape == changed.shape else expand_mask(now.flatten(2).any(-1), changed)
+            changed = changed | of_sender
+    return changed
 
 
 def _before(steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor) -> dict[NestedKey, Tensor]:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 
 RECORD = "run.json"
-PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy", "shapely")
-"""Packages whose versions a record names."""
+PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra", "numpy", "shapely")
+"""Modules whose versions a record names: a nightly build is a distribution of another name."""
 
 
 def write_record(folder: Path, command: str, **entries: Any) -> None:
@@ -32,7 +32,7 @@ def write_record(folder: Path, command: str, **entries: Any) -> None:
             "damian": damian.__version__,
             "commit": commit(),
             "python": platform.python_version(),
-            "packages": {name: version(name) for name in PACKAGES},
+            "packages": {name: str(import_module(name).__version__) for name in PACKAGES},
             "machine": {"system": platform.platform(), "cores": os.cpu_count()},
             **entries,
             "wall_time_s": 0.0,

@@ -24,7 +24,11 @@ class Sensor(NamedTuple):
 
     def read(self, state: State, world: Any) -> Tensor:
         """The values as columns, [B, N, width] float32."""
-        return self.compute(state, world).float().view(*state.track.shape, self.width)
+        values, shape = self.compute(state, world), (*state.track.shape, self.width)
+        same = values.shape == shape or (self.width == 1 and values.shape == shape[:-1])
+        problem = f"is not {[*shape]}, of its worlds, UAVs and width: return or declare another one"
+        checks.require(same, f"sensor {self.name}: shape", [*values.shape], problem)
+        return values.float().view(shape)
 
 
 def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:

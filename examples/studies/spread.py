@@ -92,12 +92,7 @@ def make_env(arm: Arm, worlds: int, delay: Law) -> TransformedEnv:
 
 def recompute(steps: TensorDictBase, blocks: Tensor) -> dict[NestedKey, Tensor]:
     """What critics would have observed after steps [T, B], had these blocks [T, B, K, 2] arrived at once."""
-    kinematics = steps[next_key(KINEMATICS)]
-    changed = (blocks != steps[next_key(HELD)]).any(-1).unflatten(-1, (kinematics.shape[-2], -1))
-    return {
-        next_key(keys.GLOBAL_OBSERVATION): observed(kinematics, blocks),
-        next_key(keys.BACKUPDATED): changed.any(-1, keepdim=True),
-    }
+    return {next_key(keys.GLOBAL_OBSERVATION): observed(steps[next_key(KINEMATICS)], blocks)}
 
 
 def make_learner(env: EnvBase, arm: Arm, frames: int) -> Mappo:

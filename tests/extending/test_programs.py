@@ -40,10 +40,12 @@ class Reader(Reinforce):
         storage = self.buffer.storage
         steps = storage.steps[storage.latest(batch.shape[1])]
         held, now = (steps["next"][key] for key in (keys.RECEIVED, keys.HINDSIGHT))
-        changed = (held != now).any(-1).float().mean().item()
+        late = (held != now).any(-1).float().mean().item()
+        collected = batch["next", "agents", "reward"].transpose(0, 1)
+        changed = (steps["next", "agents", "reward"] != collected).float().mean().item()
         marked = steps[keys.BACKUPDATED].float().mean().item()
         state = float(keys.STATE in batch.keys())
-        return super().learn(batch) | {"changed": changed, "marked": marked, "state": state}
+        return super().learn(batch) | {"late": late, "changed": changed, "marked": marked, "state": state}
 
 """
 
@@ -87,9 +89,10 @@ def test_a_scenario_of_ones_own_is_trained_with_a_learner_and_a_logger_of_ones_o
 
 def test_a_learner_gets_what_it_reads_and_what_was_held_before_and_after_back_updating(run, folder):
     (folder / "reader.py").write_text(READER)
-    metrics = last_metrics(run(*TINY, "learner=reader:ReaderConfig", "delay.obs=3", "aware=backupdate"))
+    words = ["scenario=tracking", "learner=reader:ReaderConfig", "delay.obs=3", "aware=backupdate"]
+    metrics = last_metrics(run(*TINY, *words))
     assert float(metrics["state"]) == 1
-    assert 0.5 < float(metrics["changed"]) == float(metrics["marked"]) < 1
+    assert 0 < float(metrics["changed"]) == float(metrics["marked"]) < float(metrics["late"])
 
 
 @pytest.mark.slow

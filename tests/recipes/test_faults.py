@@ -1,9 +1,11 @@
 """Faults around a run: a full disk, a folder in use, a learner that diverges, damaged folders, signals."""
 
 import os
+import re
 import resource
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -94,6 +96,39 @@ def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatc
     assert line.startswith("error: update 2: loss_critic is inf: the learner has diverged; choose a smaller")
     assert line.endswith("bad/checkpoint.pt is of update 1 and intact")
     assert read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 1
+
+
+LATE = """
+import torch
+from damian import feature, reward_term
+
+@feature("local")
+def late(cache):
+    return torch.where(cache.context.now.unsqueeze(-1) > 30, torch.nan, 0 * cache.messages.track)
+
+@reward_term(reads=["spotted"])
+def bad(features, counters):
+    return torch.where(counters.steps.unsqueeze(-1) > 30, torch.nan, features["spotted"])
+"""
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("observation.local_features=[spotted,late:late]", "feature late:late: a value is nan or infinite"),
+        ("reward.custom=[{term: late:bad}]", "reward term bad: a value is nan or infinite"),
+    ],
+)
+def test_a_nan_is_blamed_on_what_made_it_and_not_on_the_learner(
+    run, capsys, tmp_path, monkeypatch, word, message
+):
+    (tmp_path / "late.py").write_text(LATE)
+    monkeypatch.delitem(sys.modules, "late", raising=False)
+    with pytest.raises(SystemExit) as stopped:
+        run(*TINY, word, "episode.max_steps=60", "frames=4000", folder="bad")
+    assert stopped.value.code == 3
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert re.fullmatch(rf"error: update \d+: {message}; bad/checkpoint.pt is of update \d+ and intact", line)
 
 
 # Damaged folders.

@@ -3,6 +3,9 @@
 import shlex
 import sys
 
+import torch
+import torchrl
+
 from damian.recipes.cli import command
 from damian.runs.run_record import read_record, timed, write_record
 
@@ -16,6 +19,13 @@ def test_a_resumed_run_keeps_the_record_of_its_first_part(tmp_path):
     stored = read_record(tmp_path)
     assert (stored["command"], stored["overrides"]) == ("first", ["agents=2"])
     assert [part["command"] for part in stored["resumed"]] == ["second", "third"]
+
+
+def test_versions_are_those_of_what_is_imported_whatever_the_distribution_is_called(tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.metadata.Distribution.from_name", lambda name: 1 / 0)
+    write_record(tmp_path, "first")
+    packages = read_record(tmp_path)["packages"]
+    assert (packages["torchrl"], packages["torch"]) == (torchrl.__version__, torch.__version__)
 
 
 def test_a_command_can_be_typed_again_and_shows_no_password(monkeypatch):

@@ -1,7 +1,7 @@
 """What a back-updating storage refuses: one line for each kind of mistake."""
 
 import pytest
-from remote import make_env, make_storage, recompute_of, rollout, stored
+from remote import LONGEST, WORLDS, make_env, make_storage, recompute_of, rollout, stored
 from torchrl.data import ReplayBuffer
 from torchrl.envs import MultiStepTransform
 
@@ -48,6 +48,14 @@ def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused():
         storage.set(range(24), steps.reshape(-1))
     with pytest.raises(InputError, match="longest: -1 steps is not at least 0 steps"):
         BackupdateStorage(10, recompute_of(()), -1)
+
+
+def test_a_storage_holds_a_batch_and_twice_the_longest_delay_or_is_refused():
+    steps, least = rollout(make_env(()), 8), 8 + 2 * LONGEST
+    names = {f"{name}_key": name for name in ("message", "received", "delay", "age")}
+    stored(BackupdateStorage(least * WORLDS, recompute_of(()), LONGEST, **names), steps)
+    with pytest.raises(InputError, match=f"{least} steps of {WORLDS} worlds need {least * WORLDS}"):
+        stored(BackupdateStorage((least - 1) * WORLDS, recompute_of(()), LONGEST, **names), steps)
 
 
 def test_steps_that_a_transform_has_joined_are_refused():

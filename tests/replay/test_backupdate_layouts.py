@@ -1,6 +1,7 @@
 """Back-updating without UAVs, against a slow twin: messages at the root or in a group, and hindsight."""
 
 import pytest
+import torch
 from remote import (
     ENDS,
     WORLDS,
@@ -15,6 +16,7 @@ from remote import (
 )
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import ReplayBuffer
 
 from damian.keys import next_key
 
@@ -47,6 +49,29 @@ def test_stored_steps_become_what_a_slow_twin_says(group, order, parts):
     assert after["reset_after"].equal(steps["next", "done"])
     assert not after["valid"].all()
     assert 0.2 < replaced.float().mean() < 0.9
+
+
+@both_layouts
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(group, order):
+    reward, received = (next_key(key(group, name)) for name in ("reward", "received"))
+
+    def recompute(_: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        return {reward: (messages[..., 1:] > 0.3).float()}
+
+    collected = rollout(make_env(group, order=order), 60)
+    collected[reward] = recompute(collected, collected[received])[reward]
+    storage = make_storage(group, recompute, hindsight_key=key(group, "hindsight"))
+    buffer, known = ReplayBuffer(storage=storage), collected[reward].transpose(0, 1).clone()
+    changed = torch.zeros_like(known, dtype=torch.bool)
+    for end in range(5, 65, 5):
+        buffer.extend(collected[:, end - 5 : end])
+        now = storage[storage.latest()]
+        changed[:end] |= now[reward] != known[:end]
+        known[:end] = now[reward]
+    assert now[key(group, "backupdated")].equal(changed)
+    replaced = (now[next_key(key(group, "hindsight"))] != now[received]).any(-1)
+    assert 0 < changed.float().mean() < 0.8 * replaced.float().mean()
 
 
 @both_layouts

@@ -62,7 +62,8 @@ def test_an_older_message_that_arrives_last_never_replaces_a_newer_one():
     for part in steps.split(2, 1):
         buffer.extend(part)
     assert entry(kept) == [0.0, 1.0, *[2.0] * 18]
-    assert entry(kept, "backupdated") == [False, True, True, False, *[True] * 16]
+    # Every stored reward is 0, so that each message but the first one changes it.
+    assert entry(kept, "backupdated") == [False, *[True] * 19]
     assert entry(kept, "hindsight_age") == [0, 0, *range(18)]
 
 

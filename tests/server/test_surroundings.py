@@ -8,7 +8,7 @@ import torch
 
 from damian import keys, make_env
 from damian.server.surroundings import OTHERS, RINGS, SECTORS
-from damian.settings import DelayConfig, ObservationConfig, RegionConfig, ScenarioConfig
+from damian.settings import DelayConfig, MotionConfig, ObservationConfig, RegionConfig, ScenarioConfig
 
 NAMES = ["others", "coverage_map", "place", "time_left", "number"]
 """Features in the order of the observation."""
@@ -65,10 +65,14 @@ def check_others(rows, ways):
     assert not rows[len(ways) :].any()
 
 
-@pytest.mark.parametrize("agents", [1, 3, 7])
+@pytest.mark.parametrize(
+    ("agents", "motion"), [(1, "instant"), (3, "instant"), (7, "instant"), (7, "polynomial")]
+)
 @pytest.mark.parametrize("own", [False, True])
-def test_surroundings_equal_those_of_a_plain_loop(agents, own):
-    env, steps = rollout(agents, own, delay=DelayConfig(obs=2))
+def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
+    env, steps = rollout(
+        agents, own, delay=DelayConfig(obs=2), motion=MotionConfig(kind=motion, max_speed=10.0)
+    )
     received, sent = steps["next"][keys.RECEIVED], steps["next"][keys.MESSAGE]
     observed = steps["next"][keys.OBSERVATION]
     server = env.uav_env.server

@@ -77,4 +77,3 @@ def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm
         undelayed = torch.cat([late["next", *KINEMATICS], seen, torch.eye(3).expand(4, HORIZON, 3, 3)], -1)
         assert late["next", *keys.GLOBAL_OBSERVATION].equal(undelayed)
         assert not late["next", *keys.OBSERVATION][..., :17].equal(undelayed)
-        assert late["next", *keys.BACKUPDATED].any()

@@ -21,7 +21,7 @@ from helpers import (
 from damian.envs.uav_env import UavEnv
 from damian.server.termination import EpisodeConfig
 from damian.settings import ScenarioConfig
-from damian.world.battery import BatteryConfig
+from damian.world.battery import BatteryConfig, flight_drain
 from damian.world.landing import ActionConfig
 from damian.world.regions.config import RegionConfig
 from damian.world.state import State
@@ -117,6 +117,8 @@ def test_masked_actions_hold_and_legal_actions_lead_to_their_nearest_point(energ
         moved = (env.state.goal != state.goal).squeeze(-1)
         assert not moved[~legal].any()
         nearest = env.simulation.candidates.distance[state.goal[0, 0]]
+        drain = flight_drain(env.simulation.vehicles.vertical, nearest, battery) if energy else nearest * 0
+        assert legal.equal((nearest == 0) | (drain <= level))  # takeoff and landing count as well
         assert moved[legal].equal(nearest[legal] > 0)
         masked, reached = masked + int((~legal).sum()), reached + int(moved.sum())
     assert masked > 100
