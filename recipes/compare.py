@@ -21,7 +21,7 @@ from damian.compare.comparison import (
     Comparison,
     Row,
 )
-from damian.compare.figures import plot_curves, plot_norms
+from damian.compare.figures import plot_curves, plot_matrix, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.interrupt import end_interrupted, number_of
@@ -35,7 +35,7 @@ from .shared.runs import check_policy_fits
 from .shared.settings import check_learning, late
 from .train import train
 
-TABLE, CURVES = "table.csv", "curves.png"
+TABLE, CURVES, MATRIX = "table.csv", "curves.png", "matrix.png"
 EPISODES = 100
 """A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
 POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}
@@ -127,6 +127,7 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     write_atomically(folder / MARKDOWN, text)
     plot_curves(comparison, results.curves, folder / CURVES)
     plot_norms(comparison, folder / FIGURE)
+    plot_matrix(comparison, folder / MATRIX)
 
 
 def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> list[str]:

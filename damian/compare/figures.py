@@ -1,7 +1,7 @@
-"""Figures of a comparison: learning curves, and J_norm of each arm."""
+"""Figures of a comparison: learning curves, J_norm of each arm, and the matrix of held-out tasks."""
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -20,6 +20,7 @@ from damian.compare.comparison import (
     NOT_LATE,
     Comparison,
     Estimate,
+    mean_over_seeds,
 )
 from damian.compare.statistics import Floats, bootstrap
 from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
@@ -39,15 +40,19 @@ PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
 ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
 """Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
 _METHODS = (
-    f"undelayed {TRAINED},deployed_own rewards {SCRIPT},own_naive own_naive_tuned finetuned {RANDOM},"
-    "history history_tuned imitation,naive,memory memory_tuned,learnt critic server,own own_tuned backupdate,"
-    "own_history both,deployed own_memory,belief,untrained privileged"
+    f"undelayed {TRAINED},deployed backupdate+rewards {SCRIPT},naive naive+tuned finetuned {RANDOM},"
+    "naive+history naive+history+tuned imitation,naive+late_own naive+timeline,naive+gru naive+gru+tuned,"
+    "predictive backupdate+critic backupdate+ages server,backupdate backupdate+tuned,"
+    "backupdate+history both backupdate+gru+hold,deployed+late_own backupdate+gru,"
+    "belief timeline+gru qmix,untrained privileged timeline naive+gru+hold"
 ).split(",")
 """The arms of our experiments, and the policies of a run, that have each of these colours."""
 _LINES, _DOTTED, _MARKERS = ("-", "-.", "--"), (":", (0, (1, 4))), "os^D"
 """Of arms that train, of those that train nothing, and of points; later ones where two have one colour."""
 _POINTS = 200
 """Number of points of a learning curve."""
+_FLOWN = 4
+"""Least number of held-out tasks in which a policy flew, for a line in the matrix."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
@@ -89,6 +94,41 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
             axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
 
     _save(path, grid, panel, (3.0, 3.0), sharey=True)
+
+
+def plot_matrix(comparison: Comparison, path: Path) -> None:
+    """Draw the scores of policies over the held-out tasks in which they flew, a line for each training.
+
+    A task has a panel if policies of several trainings, or one in several ways, flew in four held-out tasks.
+    """
+    flown: dict[str, list[str]] = {}
+    for task in comparison.tasks():
+        trained_in, mark, _ = task.partition(HELD_OUT_MARK)
+        flown.setdefault(trained_in, []).extend([task] * bool(mark))
+
+    def lines(task: str) -> Iterator[tuple[str, str, dict[int, Estimate]]]:
+        trained = {(row["delay"], row["arm"]): None for row in comparison.rows if row["task"] in flown[task]}
+        for delay, arm in trained:
+            runs = (
+                comparison.values(each, delay, arm, comparison.policy, comparison.score)
+                for each in flown[task]
+            )
+            known = {x: mean_over_seeds([*of.values()], comparison.score) for x, of in enumerate(runs) if of}
+            if len(known) >= _FLOWN:
+                yield delay, arm, known
+
+    def panel(axis: Axes, task: str) -> None:
+        names = [each.partition(HELD_OUT_MARK)[2].removeprefix("delay_") for each in flown[task]]
+        for number, (delay, arm, known) in enumerate(lines(task)):
+            style = {
+                "color": ARM_COLOURS[number % len(ARM_COLOURS)],
+                "marker": _MARKERS[number % len(_MARKERS)],
+            }
+            _error_bars(axis, [*known.items()], label=f"{arm}, trained at {delay}", linewidth=1.2, **style)
+        axis.set_xticks(range(len(names)), names, rotation=90)
+        axis.set(title=task, xlabel="delay of the flight [steps], or its law", ylabel=comparison.score)
+
+    _save(path, [[task] for task in flown if [*lines(task)]], panel, (6.4, 3.6))
 
 
 def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Path) -> None:
