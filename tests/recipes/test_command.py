@@ -181,7 +181,9 @@ def test_a_folder_that_cannot_be_written_is_one_line(capsys, tmp_path, monkeypat
         main(["train", "-m", "seed=0,1", "hydra.sweep.dir=file/sweep"])
     assert capsys.readouterr().err == f"error: {tmp_path}/file/sweep: Not a directory\n"
     Path("run").mkdir()
-    Path("run/result.csv").write_text("policy,return,success_rate,steps,perceived_return,age\nx,1,0,1,1,0\n")
+    Path("run/result.csv").write_text(
+        "policy,return,success_rate,steps,perceived_return,age\nx,1,0,1,1,0\n", encoding="utf-8"
+    )
     Path("results.csv.part").mkdir()
     with pytest.raises(SystemExit):
         main(["results", "."])

@@ -74,9 +74,12 @@ def stored(tmp_path_factory):
         patch.syspath_prepend(folder)
         main(["train", *TINY, "hydra.run.dir=run"])
         for name in ("evilmod", "evil-mod", "mine"):
-            Path(f"{name}.py").write_text(MODULE.format(folder / "imported"))
-        Path("table.csv").write_text(TABLE)
-        yield Path("run/config.yaml").read_text(), json.loads(Path("run/run.json").read_text())
+            Path(f"{name}.py").write_text(MODULE.format(folder / "imported"), encoding="utf-8")
+        Path("table.csv").write_text(TABLE, encoding="utf-8")
+        yield (
+            Path("run/config.yaml").read_text(encoding="utf-8"),
+            json.loads(Path("run/run.json").read_text(encoding="utf-8")),
+        )
 
 
 @pytest.fixture
@@ -88,8 +91,10 @@ def store(stored):
         changed = OmegaConf.create(config)
         if key is not None:
             OmegaConf.update(changed, key, value, merge=False, force_add=True)
-        Path("run/config.yaml").write_text(OmegaConf.to_yaml(changed))
-        Path("run/run.json").write_text(json.dumps({**record, "overrides": [*record["overrides"], *words]}))
+        Path("run/config.yaml").write_text(OmegaConf.to_yaml(changed), encoding="utf-8")
+        Path("run/run.json").write_text(
+            json.dumps({**record, "overrides": [*record["overrides"], *words]}), encoding="utf-8"
+        )
 
     write()
     yield write
@@ -143,7 +148,9 @@ def test_comparisons_searches_and_tables_of_results_read_stored_runs_as_data(sto
     store("learner.name", EVIL)
     arms = "tasks: {{t: [agents=3]}}\narms: {{a: {{delayed: false, overrides: [{}]}}}}\n"
     Path("conf/experiment").mkdir(parents=True, exist_ok=True)
-    Path("conf/experiment/x.yaml").write_text(arms.format(", ".join(f"'{word}'" for word in TINY)))
+    Path("conf/experiment/x.yaml").write_text(
+        arms.format(", ".join(f"'{word}'" for word in TINY)), encoding="utf-8"
+    )
     shutil.copytree("run", "old/t/none/a/seed_0", dirs_exist_ok=True)
     words = ["compare", "--config-dir=conf", "experiment=x", "seeds=1", "hydra.run.dir=old"]
     check_refuses(lambda: main(words), capsys, "learner.name is evilmod:X in this stored run")
@@ -205,7 +212,7 @@ def test_a_value_with_a_colon_is_no_name(store):
     park = {"type": "Feature", "properties": {"name": "park"}}
     corners = [[8, 45], [8.01, 45], [8.01, 45.008], [8, 45.008], [8, 45]]
     park["geometry"] = {"type": "Polygon", "coordinates": [corners]}
-    Path("park.geojson").write_text(json.dumps(park))
+    Path("park.geojson").write_text(json.dumps(park), encoding="utf-8")
     words = ("region=geojson", "region.path=park.geojson", "region.where=name:park")
     store("region", {"kind": "geojson", "path": "park.geojson", "where": "name:park"}, words)
     _, env = damian.load("run")
