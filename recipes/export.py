@@ -142,6 +142,8 @@ def exported(
     sizes = {0: torch.export.Dim("worlds", min=1)}
     if any_number:
         sizes[1] = torch.export.Dim("uavs", min=1)
+        if inputs[0].shape[1] == 1:  # torch would take a single UAV for a constant
+            examples = tuple(each.repeat_interleave(2, 1) for each in examples)
     # ONNX does not let an output have the name of an input.
     outputs = [f"next_{name}" if name == "hidden" else name for name in policy.outputs]
     logging.getLogger("torch").setLevel(logging.ERROR)  # it misses torchvision, which nobody needs

@@ -51,8 +51,8 @@ _LINES, _DOTTED, _MARKERS = ("-", "-.", "--"), (":", (0, (1, 4))), "os^D"
 """Of arms that train, of those that train nothing, and of points; later ones where two have one colour."""
 _POINTS = 200
 """Number of points of a learning curve."""
-_FLOWN = 4
-"""Least number of held-out tasks in which a policy flew, for a line in the matrix."""
+_DELAY, _FLOWN = "delay_", 4
+"""Begin of the name of a held-out delay; least number of them under which a policy flew, to be drawn."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
@@ -97,14 +97,15 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
 
 
 def plot_matrix(comparison: Comparison, path: Path) -> None:
-    """Draw the scores of policies over the held-out tasks in which they flew, a line for each training.
+    """Draw the scores of policies over the held-out delays under which they flew, a line for each training.
 
-    A task has a panel if policies of several trainings, or one in several ways, flew in four held-out tasks.
+    Held-out tasks of delays have names that begin with ``delay_``; a policy must have flown under four.
     """
     flown: dict[str, list[str]] = {}
     for task in comparison.tasks():
-        trained_in, mark, _ = task.partition(HELD_OUT_MARK)
-        flown.setdefault(trained_in, []).extend([task] * bool(mark))
+        trained_in, _, change = task.partition(HELD_OUT_MARK)
+        flown.setdefault(trained_in, []).extend([task] * change.startswith(_DELAY))
+    flown = {task: sorted(tasks, key=lambda name: (len(name), name)) for task, tasks in flown.items()}
 
     def lines(task: str) -> Iterator[tuple[str, str, dict[int, Estimate]]]:
         trained = {(row["delay"], row["arm"]): None for row in comparison.rows if row["task"] in flown[task]}
@@ -118,7 +119,7 @@ def plot_matrix(comparison: Comparison, path: Path) -> None:
                 yield delay, arm, known
 
     def panel(axis: Axes, task: str) -> None:
-        names = [each.partition(HELD_OUT_MARK)[2].removeprefix("delay_") for each in flown[task]]
+        names = [each.partition(HELD_OUT_MARK)[2].removeprefix(_DELAY) for each in flown[task]]
         for number, (delay, arm, known) in enumerate(lines(task)):
             style = {
                 "color": ARM_COLOURS[number % len(ARM_COLOURS)],
