@@ -47,7 +47,7 @@ def test_the_timeline_of_a_broadcast_line():
     sent, nothing, held = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool), []
     for t in range(4):
         line.write(memory, [torch.tensor([10.0 + t])])
-        memory = line.step(memory, nothing if t else sent)
+        memory, _ = line.step(memory, nothing if t else sent)
         held.append(line.held(memory)[0].tolist())
     assert held == [[0.0, 0.0], [10.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
 
