@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from damian.delays.laws import Burst, Constant, Distance, Function, Geometric, Lag, Law, Trace, Uniform
-    from damian.delays.samplers import ContextSampler, MessageContext
+    from damian.delays.samplers import ContextSampler, MessageContext, Sampler, TableSampler
     from damian.envs.pipeline import make_env
     from damian.envs.uav_env import UavEnv
     from damian.recipes.evaluate import load  # type: ignore[import-not-found]
@@ -50,7 +50,7 @@ _MODULES = {
         "Trace",
         "Uniform",
     ],
-    "damian.delays.samplers": ["ContextSampler", "MessageContext"],
+    "damian.delays.samplers": ["ContextSampler", "MessageContext", "Sampler", "TableSampler"],
     "damian.envs.pipeline": ["make_env"],
     "damian.envs.uav_env": ["UavEnv"],
     "damian.recipes.evaluate": ["load"],
@@ -100,8 +100,10 @@ __all__ = [
     "ObservationTimeline",
     "RewardDelay",
     "SampleAndHold",
+    "Sampler",
     "ScenarioConfig",
     "ServerNode",
+    "TableSampler",
     "Trace",
     "UavEnv",
     "Uniform",

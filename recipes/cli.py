@@ -13,6 +13,7 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
+from functools import reduce
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -25,10 +26,10 @@ from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob
+from hydra.core.override_parser.types import Glob, QuotedString
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import YAMLError
 
@@ -38,7 +39,7 @@ from damian.common.text_files import one_line, show
 from damian.runs.interrupt import end_interrupted, number_of
 from damian.runs.run_lock import locked
 from damian.settings import LEARNERS, TrainConfig
-from damian.settings.fields import rules
+from damian.settings.fields import Settings, is_whole, rules
 from damian.settings.programs import SEARCHES
 
 from .known import (
@@ -76,6 +77,16 @@ def _pruned(settings: Any, kind: str | None = None) -> DictConfig:
             del node[name]
         elif is_dataclass(value := getattr(settings, name)) and name not in CHOSEN:
             node[name] = _pruned(value)
+    return _untyped(node, type(settings))
+
+
+def _untyped(node: DictConfig, kind: type) -> DictConfig:
+    """A schema whose whole numbers have no type: ``Settings`` checks them and takes 1e6; Hydra would not."""
+    OmegaConf.set_struct(node, False)
+    for name in rules(kind):
+        if name in node and is_whole(kind, name):
+            value = node.pop(name)
+            node[name] = list(value) if isinstance(value, ListConfig) else value
     OmegaConf.set_struct(node, None)
     return node
 
@@ -122,7 +133,7 @@ def _register() -> None:
     """Give Hydra the schemas and the options that need no file."""
     store = ConfigStore.instance()
     for name, kind in SCHEMAS.items():
-        schema = OmegaConf.structured(kind) if name == "compare" else _pruned(kind())
+        schema = _untyped(OmegaConf.structured(kind), kind) if name == "compare" else _pruned(kind())
         if name != "compare":
             OmegaConf.set_struct(schema, False)
             schema.tuning = {}
@@ -345,16 +356,26 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
 
 
 def _first_run(program: str, given: Namespace) -> DictConfig:
-    """The checked configuration of the first run of a sweep, which is refused before a folder is made."""
+    """The configuration of the first run of a sweep; what is wrong in any is refused before a folder is made.
+
+    The first is checked, and each whole number of the others by itself; Hydra checks the rest of the types.
+    """
+    parsed = OverridesParser.create().parse_overrides(given.overrides)
+    swept = [each for each in parsed if each.is_discrete_sweep() and not isinstance(each.value(), Glob)]
     words = [
-        f"{each.get_key_element()}={next(each.sweep_string_iterator())}"
-        if each.is_discrete_sweep() and not isinstance(each.value(), Glob)
-        else str(each.input_line)
-        for each in OverridesParser.create().parse_overrides(given.overrides)
+        f"{each.get_key_element()}={next(each.sweep_string_iterator())}" if each in swept else each.input_line
+        for each in parsed
     ]
     found = composed(program, words, given.config_dir)
-    if not {"checkpoint", "resume"} & set(map(key_of, words)):
-        checked(found, program)
+    if {"checkpoint", "resume"} & set(map(key_of, words)):
+        return found
+    config = checked(found, program)
+    for each in swept:
+        *sections, name = each.get_key_element().split(".")
+        section = reduce(lambda at, part: getattr(at, part, None), sections, config)
+        if isinstance(section, Settings) and name in rules(type(section)) and is_whole(type(section), name):
+            for value in each.sweep_iterator():
+                section.checked(name, value.text if isinstance(value, QuotedString) else value)
     return found
 
 

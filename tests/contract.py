@@ -8,7 +8,7 @@ from environments import KINDS
 from helpers import square, walking
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from damian.envs.uav_env import UavEnv
@@ -66,6 +66,20 @@ class Drift(EnvBase):
         """The environment has no randomness."""
 
 
+class Servos(Drift):
+    """``Drift``, pushed by the sum of two entries of an action: a place and the index of a gear."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_spec = Composite(
+            place=Bounded(-1.0, 1.0, (3, 2)), gear=Categorical(5, shape=(3,)), shape=(3,)
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        pushed = tensordict["place"] + tensordict["gear"].unsqueeze(-1)
+        return super()._step(TensorDict({"action": pushed}, [3]))
+
+
 cartpole, uavs = KINDS["CartPole"].make, KINDS["UAVs"].make
 
 
@@ -100,6 +114,7 @@ CASES = {
     "Belief": Case(uavs, _belief),
     "ActionDelay, one world": Case(cartpole, lambda: ActionDelay(LATE)),
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
+    "ActionDelay, two entries": Case(Servos, lambda: ActionDelay(LATE, ["place", "gear"], loss=0.2)),
     "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
     "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
     "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),

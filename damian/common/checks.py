@@ -5,6 +5,7 @@ long before a computer refuses a number.
 """
 
 import math
+import string
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeGuard
 
@@ -23,7 +24,8 @@ LARGEST = {"m": METRES, "m^2": METRES**2, "s": SECONDS, "dB": 300.0, "deg": 360.
 HUGE, TINY = 1e9, 1e-9
 """Largest number of any other unit or of none, and smallest one where a check asks for one above 0."""
 
-_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+UNITS_OF_TIME = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+"""Seconds of each unit in which a time may be written."""
 
 
 def require(condition: bool, key: str, value: Any, should: str) -> None:
@@ -57,13 +59,13 @@ def above(key: str, value: float, low: float, unit: str = "") -> None:
 
 
 def seconds(key: str, value: str | float, zero: bool = False) -> float:
-    """Convert ``"2s"``, ``"0.5m"``, ``"1h"``, or a number to seconds, which are 0 only with ``zero``."""
+    """Convert ``"2s"``, ``"133ms"``, ``"2min"``, or a number to seconds, which are 0 only with ``zero``."""
     text = str(value).strip()
-    number, unit = (text[:-1], text[-1]) if text[-1:] in _SECONDS else (text, "s")
+    number = text.rstrip(string.ascii_lowercase)
     try:
-        time = float(number) * _SECONDS[unit]
-    except ValueError:
-        raise InputError(f"{key}: {value} is not a time such as 2s, 0.5m or 1h") from None
+        time = float(number) * UNITS_OF_TIME[text[len(number) :] or "s"]
+    except (ValueError, KeyError):
+        raise InputError(f"{key}: {value} is not a time such as 2s, 133ms, 2min or 1h") from None
     if not (zero and time == 0):
         above(key, time, 0.0, "s")
     return time

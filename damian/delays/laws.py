@@ -1,11 +1,11 @@
-"""Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"0.5m"``)."""
+"""Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"133ms"``)."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
-from numbers import Integral
+from numbers import Real
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,6 +24,7 @@ from damian.delays.samplers import (
     MessageContext,
     Recorded,
     Sampler,
+    TableSampler,
 )
 from damian.settings.delays import LONGEST, is_matrix
 from damian.settings.fields import rules, setting
@@ -43,7 +44,11 @@ class Law(ABC):
 
     @abstractmethod
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        """Build the sampler of this law, for steps of ``dt`` seconds; ``key`` names the law in errors."""
+        """Build the sampler of this law, for steps of ``dt`` seconds; ``key`` names the law in errors.
+
+        It is a ``TableSampler``, a ``ContextSampler``, or one derived from ``Sampler`` that may have a state
+        of its own (docs/extending.md). A share ``loss`` of the messages is lost, whatever the law.
+        """
 
 
 def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
@@ -56,28 +61,35 @@ def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "del
             checks.above(f"{key}.{name}", value, rule.above, rule.unit)
         if rule.low is not None:
             checks.in_range(f"{key}.{name}", value, rule.low, rule.high, rule.unit)
-    return law.sampler(dt, loss, key)
+    sampler = law.sampler(dt, loss, key)
+    problem = f"loses no message, but loss={loss}: its sampler has to lose that share"
+    checks.require(sampler.loses or loss == 0, key, type(law).__name__, problem)
+    return sampler
 
 
-def in_steps(key: str, delay: Delay, dt: float) -> int:
+_NO_STEPS = "is neither a number of steps >= 0 (3) nor a time (3s, 2min)"
+_NO_DELAY = (
+    "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a distribution "
+    "({law: uniform, low: 1, high: 7}; in Python Uniform(1, 7)) or a function"
+)
+
+
+def in_steps(key: str, delay: Delay, dt: float, problem: str = _NO_STEPS) -> int:
     """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up."""
     if isinstance(delay, str):
-        steps = math.ceil(_seconds(key, delay) / dt - 1e-9)
+        steps = math.ceil(_seconds(key, delay, problem) / dt - 1e-9)
     else:
-        is_steps = isinstance(delay, Integral) and not isinstance(delay, bool) and delay >= 0
-        checks.require(is_steps, key, delay, _NO_DELAY)
+        is_steps = isinstance(delay, Real) and not isinstance(delay, bool) and delay >= 0 and delay % 1 == 0
+        checks.require(is_steps, key, delay, problem)
         steps = int(delay)
     checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
     return steps
 
 
-def _seconds(key: str, delay: str) -> float:
+def _seconds(key: str, delay: str, problem: str = _NO_STEPS) -> float:
     """Convert a time with its unit to seconds; it may be zero (``0s``)."""
-    checks.require(delay[-1:] in ("s", "m", "h"), key, delay, _NO_DELAY)
+    checks.require(delay.endswith(tuple(checks.UNITS_OF_TIME)), key, delay, problem)
     return checks.seconds(key, delay, zero=True)
-
-
-_NO_DELAY = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
 
 
 LAWS = Registry[type[Law]](
@@ -101,7 +113,7 @@ class Constant(Law):
     """Delay: steps, or a time."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return Sampler([[0.0] * in_steps(key, self.delay, dt) + [1.0]], loss=loss)
+        return TableSampler([[0.0] * in_steps(key, self.delay, dt, _NO_DELAY) + [1.0]], loss=loss)
 
 
 @LAWS.register("uniform")
@@ -135,7 +147,7 @@ class Uniform(Law):
         else:
             chances = [float(low <= k) / (high - low + 1) for k in range(int(high) + 1)]
         weighted = [self.probability * chance for chance in chances]
-        return Sampler([[weighted[0] + 1 - self.probability, *weighted[1:]]], loss=loss)
+        return TableSampler([[weighted[0] + 1 - self.probability, *weighted[1:]]], loss=loss)
 
 
 @LAWS.register("geometric")
@@ -158,7 +170,7 @@ class Geometric(Law):
         checks.in_range(f"{key}.mean", mean, 0.0, unit="steps")
         failure = mean / (1 + mean)
         chances = [(1 - failure) * failure**k for k in range(longest)]
-        return Sampler([[*chances, failure**longest]], loss=loss)
+        return TableSampler([[*chances, failure**longest]], loss=loss)
 
 
 @LAWS.register("burst")
@@ -190,7 +202,7 @@ class Burst(Law):
         good = _memoryless(self.good, dt, self.good_loss, f"{key}.good")
         bad = _memoryless(self.bad, dt, self.bad_loss, f"{key}.bad")
         transitions = [[1 - self.enter, self.enter], [self.leave, 1 - self.leave]]
-        return Sampler([good, bad], transitions, loss)
+        return TableSampler([good, bad], transitions, loss)
 
 
 @LAWS.register("trace")

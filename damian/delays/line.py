@@ -46,7 +46,7 @@ class DelayLine:
       holds m1, of age 3. m4 is written into the slot of t = 6.
 
     The memory, [M] if nothing else is said: ``clock``, the number of steps so far; ``place`` of the current
-    slot (slot times M, plus the sender's number); random ``streams``; state of the ``channel``, [M, ...];
+    slot (slot times M, plus the sender's number); random ``streams``; the sampler's ``state``, [M, ...];
     clock of the latest reset, ``reset_at``, and of the held message, ``generated_at``; numbers of
     the ``senders``; ``stamps``, the clock of the message in each of K slots, and in one for messages that
     never arrive, [K + 1, M]; values in these, ``slots_i`` [K + 1, M, ...], and held, ``held_i`` [M, ...].
@@ -55,9 +55,7 @@ class DelayLine:
     def __init__(self, sampler: Sampler, order: str) -> None:
         self.sampler = sampler
         self._hold_last_generated = order == "generation"
-        certainly_arrives = bool((sampler.chances[:, -1] < 1e-10).all())  # draws have 32 bits
         self._always_longest = sampler.constant_delay == sampler.longest
-        self._may_lose = not (certainly_arrives and type(sampler).forward is Sampler.forward)
 
     def init_memory(self, values: list[Tensor], streams: Tensor) -> Memory:
         """Create the memory for messages like ``values`` [M, ...] and senders with random ``streams`` [M]."""
@@ -66,7 +64,7 @@ class DelayLine:
             "clock": zero,
             "place": torch.arange(len(streams), device=streams.device),
             "streams": streams,
-            "channel": self.sampler.initial_state(streams),
+            "state": self.sampler.initial_state(streams),
             "reset_at": zero.clone(),
             "generated_at": zero.clone(),
             "senders": torch.arange(len(streams), device=streams.device),
@@ -86,7 +84,7 @@ class DelayLine:
         clock = memory["clock"]
         # What is in transit stays in its slots, and is no longer newer than what is held.
         memory = memory | {n: torch.where(mask, clock, memory[n]) for n in ("reset_at", "generated_at")}
-        memory["channel"] = self.sampler.begin_episode(memory["channel"], mask)
+        memory["state"] = self.sampler.begin_episode(memory["state"], mask)
         for i, new in enumerate(values):
             memory[f"held_{i}"] = torch.where(expand_mask(mask, new), new, memory[f"held_{i}"])
         zero = torch.zeros_like(memory["generated_at"])
@@ -104,14 +102,14 @@ class DelayLine:
         n_slots, n_senders = self.sampler.lost, len(generated_at)
         n_places = n_slots * n_senders
         row_now = advance_slot(memory["place"], n_senders, n_places)
-        delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
+        delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
         if self._always_longest:  # K - 1 steps ahead in a ring of K slots is the slot of the step before
             row_sent = memory["place"]
         else:
             row_sent = advance_slot(row_now, delay * n_senders, n_places)
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
-        if sent is not None or self._may_lose:
+        if sent is not None or not self._always_longest:
             row_sent = torch.where(delay < n_slots, row_sent, n_places + memory["senders"])
         stamps = memory["stamps"].view(-1)
         stamp = stamps.index_copy_(0, row_sent, clock).index_select(0, row_now)
@@ -121,7 +119,7 @@ class DelayLine:
             generated_after = torch.maximum(memory["reset_at"], clock - n_slots)
         fresh = stamp > generated_after
         generated_at = torch.where(fresh, stamp, generated_at)
-        memory = memory | {"clock": clock, "place": row_now, "channel": channel, "generated_at": generated_at}
+        memory = memory | {"clock": clock, "place": row_now, "state": state, "generated_at": generated_at}
         held = []
         for i, value in enumerate(values):
             flat, old = memory[f"slots_{i}"].flatten(0, 1), memory[f"held_{i}"]

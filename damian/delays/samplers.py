@@ -1,5 +1,6 @@
 """Samplers draw one delay per message: pure functions of random streams, clocks and contexts."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -31,18 +32,16 @@ class MessageContext(NamedTuple):
     """The entries that the law reads, by name, [M, ...] each; ``position`` is east and north [m], [M, 2]."""
 
 
-class Sampler(nn.Module):
-    """Draws delays from a table of probabilities.
+class Sampler(nn.Module, ABC):
+    """Draws a delay for each message; derive from it to draw by a rule, or with a state, of your own.
 
-    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` a message sent at t = 0 arrives at t = 0 or, as
-    likely, at t = 3, whatever the delays of the others.
+    A sender has a state, by default an unused number, which is carried from message to message and on into
+    the next episode. Draws come from the streams: those of other worlds, and of other agents, are different.
 
     Args:
-        states: for each of S channel states, the probabilities of the delays 0, 1, ... [steps]; if they sum
-            to less than 1, the rest is the probability that the message is lost.
-        transitions: probabilities of the transitions between the channel states per step, [S, S]; None for
-            one state.
-        loss: probability that a message is lost, whatever its delay.
+        longest: longest delay [steps].
+        loses: whether ``forward`` loses messages by a rule of its own; rewards may not be lost.
+        loss: probability that a message is lost, whatever its delay, as ``lose`` draws it.
     """
 
     sees_context: bool = False
@@ -53,143 +52,192 @@ class Sampler(nn.Module):
     """Names of the entries that the context contains where the transform has a key for them."""
     same_draws_for_all_agents: bool = False
     """Whether all agents of a world draw the same numbers."""
+    memoryless: bool = False
+    """Whether all delays are drawn independently by the same probabilities, ``chances``."""
     chances: Tensor
+    """Probabilities of the delays 0, 1, ... and, last, of a loss, [S, longest + 2]; not of every sampler."""
+    constant_delay: int | None = None
+    """The delay [steps] if it is always the same and no message is lost, else None."""
+
+    def __init__(self, longest: int, loses: bool = True, loss: float = 0.0) -> None:
+        super().__init__()
+        checks.in_range("loss", loss, 0.0, 1.0)
+        self.longest, self.loss = longest, loss
+        self.lost = longest + 1
+        """Delay value that marks a message that never arrives."""
+        self.loses = loses or loss > 0
+        """Whether messages can be lost."""
+
+    def initial_state(self, streams: Tensor) -> Tensor:
+        """The state of each sender before its first message [M, ...], from its random stream [M]."""
+        return torch.zeros_like(streams)
+
+    def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
+        """The states [M, ...] after a reset of the senders of the mask [M]."""
+        return state
+
+    @abstractmethod
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Draw the delays of the messages sent at ``clock``, and the next states; pure.
+
+        Returns:
+            the delays [M] long, from 0 to ``longest``, or ``lost``; and the states [M, ...].
+        """
+
+    def lose(self, delay: Tensor, streams: Tensor, clock: Tensor) -> Tensor:
+        """The delays [M], of which a share ``loss`` is lost, by a draw of its own."""
+        if not self.loss:
+            return delay
+        draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
+        return torch.where(draw < self.loss, self.lost, delay)
+
+
+class TableSampler(Sampler):
+    """Draws delays from a table of probabilities.
+
+    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` a message sent at t = 0 arrives at t = 0 or, as
+    likely, at t = 3, whatever the delays of the others.
+
+    Args:
+        states: for each of S states of a sender, the probabilities of the delays 0, 1, ... [steps]; if they
+            sum to less than 1, the rest is the probability that the message is lost.
+        transitions: probabilities of the transitions between the states per step, [S, S]; None for one state.
+        loss: probability that a message is lost, whatever its delay.
+    """
+
     _boundaries: Tensor
+
+    def __init_subclass__(cls) -> None:
+        if "forward" in cls.__dict__:
+            raise TypeError(f"{cls.__name__}: a sampler that draws by a rule of its own derives from Sampler")
 
     def __init__(
         self, states: list[list[float]], transitions: list[list[float]] | None = None, loss: float = 0.0
     ) -> None:
-        super().__init__()
-        checks.in_range("loss", loss, 0.0, 1.0)
-        self.longest = max(map(len, states)) - 1
-        self.lost = self.longest + 1
-        """Delay value that marks a message that never arrives."""
-        arrive = torch.zeros(len(states), self.longest + 1, dtype=torch.float64)
+        longest = max(map(len, states)) - 1
+        super().__init__(longest, loses=False, loss=loss)
+        arrive = torch.zeros(len(states), longest + 1, dtype=torch.float64)
         for row, chances in zip(arrive, states, strict=True):
             row[: len(chances)] = torch.tensor(chances, dtype=torch.float64) * (1 - loss)
-        chances = torch.cat([arrive, (1 - arrive.sum(-1, keepdim=True)).clamp(min=0)], -1)
+        rest = 1 - arrive.sum(-1, keepdim=True)
+        chances = torch.cat([arrive, rest.where(rest > _ROUNDING, 0.0)], -1)
         self.register_buffer("chances", chances, persistent=False)
-        self.loses = bool((chances[:, -1] > 1e-9).any())
-        """Whether messages can be lost."""
+        self.loses = bool((chances[:, -1] > 0).any())
+        self.memoryless = len(states) == 1
+        likeliest = int(chances[0, :-1].argmax())
+        if bool((chances[:, likeliest] == 1).all()):
+            self.constant_delay = likeliest
         change = torch.tensor(transitions or [[1.0]], dtype=torch.float64)
         # The next state and the delay are one outcome, so that a message takes a single draw.
         joint = (change.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)
         boundaries = (joint.cumsum(-1)[:, :-1] * 2**32).round().long()
         self.register_buffer("_boundaries", boundaries, persistent=False)
         self._bad_share = (change[0, 1] / (change[0, 1] + change[1, 0])).item() if transitions else 0.0
-        likeliest = int(chances[0].argmax())
-        self.constant_delay = likeliest if bool((chances[:, likeliest] == 1).all()) else None
-        """The delay [steps] if it is always the same, else None."""
-
-    @property
-    def memoryless(self) -> bool:
-        """Whether all delays are drawn independently from the same table, by this class's ``forward``."""
-        return len(self.chances) == 1 and type(self).forward is Sampler.forward
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        """Draw the initial state of each sender's channel [M, ...] from its random stream [M]."""
         return (counter_rng.uniform(streams) < self._bad_share).long()
 
-    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
-        """The channels' states [M, ...], where the mask [M] is true before an episode's first message."""
-        return memory
-
     def forward(
-        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M, ...]."""
         if self.constant_delay is not None:
-            return torch.full_like(streams, self.constant_delay), memory
+            return torch.full_like(streams, self.constant_delay), state
         draw = counter_rng.bits(streams, clock)
         if len(self.chances) == 1:
-            return torch.bucketize(draw, self._boundaries[0], right=True), memory
-        outcome = (draw.unsqueeze(-1) >= self._boundaries[memory]).sum(-1)
+            return torch.bucketize(draw, self._boundaries[0], right=True), state
+        outcome = (draw.unsqueeze(-1) >= self._boundaries[state]).sum(-1)
         n = self.longest + 2
         return outcome % n, outcome // n
 
 
+_ROUNDING = 1e-10
+"""Probability below which a loss is a rounding error: draws have 32 bits."""
+
+
 class Recorded(Sampler):
-    """Plays back recorded delays [steps], -1 if lost; each sender starts at a random one, its state."""
+    """Plays back recorded delays [steps], -1 if lost; a sender starts at a random one. Its state is the next.
+
+    A worked timeline of the delays 3 and 0: a sender that starts at the second sends at t = 0 what arrives at
+    once, and at t = 1 what arrives at t = 4.
+    """
 
     _delays: Tensor
 
-    def __init__(self, delays: list[int], loss: float) -> None:
-        longest = max(*delays, 0)
-        codes = torch.tensor([longest + 1 if delay < 0 else delay for delay in delays])
-        counts = torch.bincount(codes, minlength=longest + 2)
-        frequencies = counts[:-1].double() / len(delays)
-        super().__init__([frequencies.tolist()], loss=loss)
-        self._loss = loss
+    def __init__(self, delays: list[int], loss: float = 0.0) -> None:
+        super().__init__(max(*delays, 0), loses=min(delays) < 0, loss=loss)
+        if not self.loses and min(delays) == self.longest:
+            self.constant_delay = self.longest
+        codes = torch.tensor([self.lost if delay < 0 else delay for delay in delays])
         self.register_buffer("_delays", codes, persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return counter_rng.bits(streams) % len(self._delays)
 
     def forward(
-        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
-        delay = self._delays[memory]
-        if self._loss:
-            delay = torch.where(counter_rng.uniform(streams, clock) < self._loss, self.lost, delay)
-        return delay, (memory + 1) % len(self._delays)
+        delay = self._delays[state]
+        if self.loss:
+            delay = torch.where(counter_rng.uniform(streams, clock) < self.loss, self.lost, delay)
+        return delay, (state + 1) % len(self._delays)
 
 
 class HeldSampler(Sampler):
     """Gives every message the longest delay of another sampler; the same messages are lost."""
 
     def __init__(self, drawn: Sampler) -> None:
-        arrival_chances = (1 - drawn.chances[:, -1]).tolist()
-        super().__init__([[0.0] * drawn.longest + [chance] for chance in arrival_chances])
-        self.drawn = drawn
-        self.sees_context = drawn.sees_context
+        super().__init__(drawn.longest, drawn.loses)
+        self.drawn, self.memoryless = drawn, drawn.memoryless
+        self.sees_context, self.reads = drawn.sees_context, drawn.reads
+        self.optional_reads = drawn.optional_reads
         self.same_draws_for_all_agents = drawn.same_draws_for_all_agents
-        self.reads, self.optional_reads = drawn.reads, drawn.optional_reads
         self.constant_delay = None if self.loses else self.longest
-
-    @property
-    def memoryless(self) -> bool:
-        return self.drawn.memoryless
+        if self.memoryless:
+            lost = drawn.chances[:, -1]
+            self.chances = torch.stack([torch.zeros_like(lost)] * self.longest + [1 - lost, lost], -1)
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return self.drawn.initial_state(streams)
 
-    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
-        return self.drawn.begin_episode(memory, mask)
+    def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
+        return self.drawn.begin_episode(state, mask)
 
     def forward(
-        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
-        delay, memory = self.drawn(streams, clock, memory, context)
-        return torch.where(delay < self.lost, self.longest, self.lost), memory
+        delay, state = self.drawn(streams, clock, state, context)
+        return torch.where(delay < self.lost, self.longest, self.lost), state
 
 
 class LagSampler(Sampler):
     """Draws a delay (a lag) from a table, and holds it for a period (None: an episode); losses are not held.
 
-    The state of a channel is [M, 2] long: the lag, -1 before the first message of an episode, and the number
-    of steps that it is still held.
+    The state is [M, 2] long: the lag, -1 before the first message of an episode, and the number of steps that
+    it is still held.
     """
 
     def __init__(self, law: Any, chances: list[float], loss: float, period: int | None) -> None:
-        super().__init__([chances], loss=loss)
-        arrives = sum(chances)
-        self._lags = Sampler([[chance / arrives for chance in chances]] if arrives else [[1.0]])
-        self._loss = self.chances[0, -1].item() if self.loses else 0.0
+        table, arrives = TableSampler([chances], loss=loss), sum(chances)
+        super().__init__(table.longest, loses=False, loss=table.chances[0, -1].item())
+        self.constant_delay = table.constant_delay
+        self._lags = TableSampler([[chance / arrives for chance in chances]] if arrives else [[1.0]])
         self._period, self._hold_probability = period or _NEVER, law.hold_probability
         self.same_draws_for_all_agents, self._stagger = law.shared, law.stagger
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return torch.stack([torch.full_like(streams, -1), torch.zeros_like(streams)], -1)
 
-    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
-        return torch.where(mask.unsqueeze(-1), self.initial_state(memory[:, 0]), memory)
+    def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
+        return torch.where(mask.unsqueeze(-1), self.initial_state(state[:, 0]), state)
 
     def forward(
-        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
         if self.constant_delay is not None:
-            return torch.full_like(streams, self.constant_delay), memory
-        lag, wait = memory.unbind(-1)
+            return torch.full_like(streams, self.constant_delay), state
+        lag, wait = state.unbind(-1)
         first, due = lag < 0, wait == 0
         renewed, interval = due, torch.full_like(streams, self._period)
         if self._hold_probability:
@@ -198,13 +246,10 @@ class LagSampler(Sampler):
         if self._stagger:
             phase = counter_rng.bits(streams, clock, torch.full_like(clock, _PHASE_DRAW)) % self._period
             interval = torch.where(first, 1 + phase, interval)
-        drawn, _ = self._lags(streams, clock, memory)
+        drawn, _ = self._lags(streams, clock, lag)
         lag = torch.where(renewed, drawn, lag)
-        memory = torch.stack([lag, torch.where(due, interval, wait) - 1], -1)
-        if not self._loss:
-            return lag, memory
-        lost = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW)) < self._loss
-        return torch.where(lost, self.lost, lag), memory
+        state = torch.stack([lag, torch.where(due, interval, wait) - 1], -1)
+        return self.lose(lag, streams, clock), state
 
 
 _NEVER = 2**40
@@ -241,15 +286,12 @@ class ContextSampler(Sampler):
         reads: Sequence[str] = (),
         optional_reads: Sequence[str] = (),
     ) -> None:
-        # The table holds the worst case, because the true chances depend on the contexts: it serves only to
-        # tell the longest delay, and whether messages can be lost.
-        super().__init__([[0.0] * longest + [float(not loses)]], loss=loss)
-        self.constant_delay = None
+        super().__init__(longest, loses, loss)
         self.sees_context, self.reads, self.optional_reads = True, tuple(reads), tuple(optional_reads)
-        self._delay_fn, self._loss, self._loses = delay_fn, loss, loses
+        self._delay_fn, self._lost_if_negative = delay_fn, loses
 
     def forward(
-        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
         delay = self._delay_fn(cast(MessageContext, context)).view_as(streams)
         arrives = delay >= 0  # false for nan too
@@ -257,12 +299,9 @@ class ContextSampler(Sampler):
         if steps.dtype.is_floating_point:  # 21.000002 steps are 21
             steps = steps - 1e-5 * steps.clamp(1, self.longest)
         steps = steps.ceil().clamp(max=self.longest).long()
-        if self._loses:
+        if self._lost_if_negative:
             steps = torch.where(arrives, steps, self.lost)
-        if self._loss:  # by a draw that is independent of ``context.uniform``
-            draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
-            steps = torch.where(draw < self._loss, self.lost, steps)
-        return steps, memory
+        return self.lose(steps, streams, clock), state
 
 
 class LinkSampler(Sampler):
@@ -280,54 +319,58 @@ class LinkSampler(Sampler):
     _loss: Tensor
 
     def __init__(self, samplers: Sequence[Sampler], law_index: Tensor, loss: Tensor) -> None:
-        longest = max(sampler.longest for sampler in samplers)
-        super().__init__([[0.0] * (longest + 1)])  # the worst case: every message may be lost
-        self.constant_delay = None
+        loses = any(sampler.loses for sampler in samplers) or bool((loss > 0).any())
+        super().__init__(max(sampler.longest for sampler in samplers), loses)
         self.samplers = nn.ModuleList(samplers)
         self.sees_context = any(sampler.sees_context for sampler in samplers)
         self.reads = tuple(dict.fromkeys(name for sampler in samplers for name in sampler.reads))
-        self._loses = bool((loss > 0).any())
+        self._loses_on_links = bool((loss > 0).any())
         example = torch.zeros(1, dtype=torch.long)
-        self._state_shapes = [sampler.initial_state(example).shape[1:] for sampler in samplers]
+        states = [sampler.initial_state(example)[0] for sampler in samplers]
+        self._state_forms = [(state.numel(), state.shape, state.dtype) for state in states]
         self.register_buffer("_law_index", law_index, persistent=False)
         self.register_buffer("_loss", loss, persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        return _side_by_side([sampler.initial_state(streams) for sampler in self._samplers])
+        return _packed([sampler.initial_state(streams) for sampler in self._samplers])
 
-    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
-        pairs = zip(self._samplers, self._states(memory), strict=True)
-        return _side_by_side([sampler.begin_episode(state, mask) for sampler, state in pairs])
+    def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
+        pairs = zip(self._samplers, self._split(state), strict=True)
+        return _packed([sampler.begin_episode(part, mask) for sampler, part in pairs])
 
     def forward(
-        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
         n_links = len(self._law_index)
         n_worlds, delay, states = len(streams) // n_links, torch.zeros_like(streams), []
         index = self._law_index.repeat(n_worlds)
-        for k, (sampler, state) in enumerate(zip(self._samplers, self._states(memory), strict=True)):
-            drawn, new_state = sampler(streams_for(sampler, streams, n_links), clock, state, context)
+        for k, (sampler, part) in enumerate(zip(self._samplers, self._split(state), strict=True)):
+            drawn, new_state = sampler(streams_for(sampler, streams, n_links), clock, part, context)
             drawn = torch.where(drawn < sampler.lost, drawn, self.lost)
             delay = torch.where(index == k, drawn, delay)
             states.append(new_state)
-        if self._loses:
+        if self._loses_on_links:
             draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LINK_LOSS_DRAW))
             delay = torch.where(draw < self._loss.repeat(n_worlds), self.lost, delay)
-        return delay, _side_by_side(states)
+        return delay, _packed(states)
 
     @property
     def _samplers(self) -> list[Any]:
         return list(self.samplers)
 
-    def _states(self, memory: Tensor) -> list[Tensor]:
+    def _split(self, state: Tensor) -> list[Tensor]:
         """The state of each sampler, [M, ...]."""
-        parts = memory.split([shape.numel() for shape in self._state_shapes], -1)
-        pairs = zip(parts, self._state_shapes, strict=True)
-        return [part.reshape(len(part), *shape) for part, shape in pairs]
+        parts, states = state.split([size for size, _, _ in self._state_forms], -1), []
+        for part, (_, shape, dtype) in zip(parts, self._state_forms, strict=True):
+            number = part.view(torch.double) if dtype.is_floating_point else part
+            states.append(number.to(dtype).reshape(len(part), *shape))
+        return states
 
 
-def _side_by_side(states: list[Tensor]) -> Tensor:
-    return torch.cat([state.reshape(len(state), -1) for state in states], -1)
+def _packed(states: list[Tensor]) -> Tensor:
+    """States [M, ...] side by side, [M, S] long; those that are floats keep their bits."""
+    flat = [state.reshape(len(state), -1) for state in states]
+    return torch.cat([s.double().view(torch.long) if s.is_floating_point() else s.long() for s in flat], -1)
 
 
 def streams_for(sampler: Sampler, streams: Tensor, n_rows: int) -> Tensor:

@@ -65,6 +65,9 @@ class DelayedEnv(TransformedEnv):
         others = OrderedDict((k, value) for k, value in state_dict.items() if not k.startswith(_BASE))
         if base:
             self.base_env.load_state_dict(base, **kwargs)
+            for module in self.transform.modules():
+                if isinstance(module, StatefulTransform):
+                    module.leave_episode()
         super().load_state_dict(others, **kwargs)
 
     def compile(self, **options: Any) -> "DelayedEnv":

@@ -6,7 +6,7 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 
 from damian.common import counter_rng
 from damian.common.errors import InputError
@@ -29,6 +29,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
             (``Uniform(3, 7)``), or a function, as ``damian.Function`` says.
         loss: probability that an observation never arrives.
         default: the action that is executed until the first one arrives; if not given, that nearest to 0.
+            It is not needed if no action is late.
         dt: length of a step [s], for delays given as times.
 
     Examples:
@@ -50,7 +51,9 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         super().__init__(env)
         self._observations = _Link("observation", observation, loss, dt)
         self._actions = _Link("action", action, 0.0, dt, before_step=True)
-        self._default = _nearest_to_zero(env.action_space) if default is None else default
+        if default is None and self._actions.late:
+            default = _nearest_to_zero(env.action_space)
+        self._default = default
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
@@ -71,6 +74,7 @@ class _Link:
     def __init__(self, name: str, delay: Any, loss: float, dt: float, before_step: bool = False) -> None:
         law = law_of(delay, name)
         sampler = sampler_of(law, dt, loss, name)
+        self.late = sampler.constant_delay != 0
         self._line, self._name = DelayLine(sampler, "generation"), name
         self._contexts = ContextReader(law, sampler, None, dt, name, before_step)
         self._memory: Memory | None = None
@@ -114,4 +118,8 @@ def _nearest_to_zero(space: Space[Any]) -> Any:
         )
     if isinstance(space, MultiBinary):
         return np.zeros(space.shape, space.dtype)
+    if isinstance(space, Dict):
+        return {name: _nearest_to_zero(inner) for name, inner in space.items()}
+    if isinstance(space, Tuple):
+        return tuple(map(_nearest_to_zero, space))
     raise InputError(f"default: is missing, and {space} has no action nearest to 0")

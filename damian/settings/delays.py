@@ -102,7 +102,7 @@ def is_matrix(written: Any) -> bool:
 
 @dataclass
 class ClockConfig(Settings):
-    """Periods of the clocks, such as ``1s``, ``0.5m`` or ``1h``, each a multiple of the faster ones."""
+    """Periods of the clocks, such as ``1s``, ``200ms`` or ``2min``, each a multiple of the faster ones."""
 
     section: ClassVar[str] = "clock"
 

@@ -9,6 +9,7 @@ import functools
 import math
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import UnionType
 from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
@@ -64,12 +65,16 @@ class Settings:
     """Key of these settings in those of a run, such as ``region``; empty at the top."""
 
     def __post_init__(self) -> None:
-        hints = _hints(type(self))
-        for name, rule in rules(type(self)).items():
-            value = _converted(self.key(name), getattr(self, name), hints[name])
-            setattr(self, name, value)
-            if value is not None:
-                _check_value(self.key(name), value, rule, _base(hints[name]))
+        for name in rules(type(self)):
+            setattr(self, name, self.checked(name, getattr(self, name)))
+
+    def checked(self, name: str, value: Any) -> Any:
+        """A value of a field in its declared type, if it is within the bounds of the field."""
+        hint = _hints(type(self))[name]
+        value = _converted(self.key(name), value, hint)
+        if value is not None:
+            _check_value(self.key(name), value, rules(type(self))[name], _base(hint))
+        return value
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings alone, because what other modules have read from them may not be copied."""
@@ -142,6 +147,12 @@ def filled(default: Any, values: Mapping[str, Any], path: str = "") -> Any:
 _hints = functools.cache(get_type_hints)
 
 
+def is_whole(kind: type, name: str) -> bool:
+    """Is a setting of a dataclass a whole number, or a list of them?"""
+    declared = _base(_hints(kind)[name])
+    return declared is int or get_args(declared) == (int,)
+
+
 def _base(hint: Any) -> Any:
     """A type without ``| None``."""
     if get_origin(hint) in (UnionType, Union):
@@ -162,6 +173,9 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
         return value
     if origin is str and checks.is_number(value):
         return str(value)  # a time such as 2
+    if origin is int and (isinstance(value, str) or (isinstance(value, float) and value.is_integer())):
+        with suppress(ValueError):
+            return int(value)  # 1e6, or the text of an environment variable
     good = isinstance(value, origin) and not (isinstance(value, bool) and origin is not bool)
     checks.require(good, key, value, f"is not {_KINDS.get(origin, f'a {origin.__name__}')}")
     if isinstance(value, list) and inner:

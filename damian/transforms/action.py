@@ -21,6 +21,7 @@ from damian.transforms.base import (
     as_rows,
     existing,
     from_rows,
+    path_of,
     sibling_key,
     spec_rows,
 )
@@ -84,12 +85,18 @@ def _default_action(space: tuple[Tensor, Tensor], default: Any) -> Tensor:
 
 
 class ActionTransform(StatefulTransform):
-    """Base class of transforms that remember actions; ``keys`` are arguments of ``StatefulTransform``."""
+    """Base class of transforms that remember actions; ``keys`` are arguments of ``StatefulTransform``.
+
+    ``default`` is that of one action; of several, a list with one for each, or None.
+    """
 
     def __init__(self, action_key: NestedKey | Sequence[NestedKey], default: Any, **keys: Any) -> None:
         super().__init__(in_keys_inv=action_key, **keys)
         self.action_key: NestedKey = self.in_keys_inv[0]
-        self.default = default
+        n = len(self.in_keys_inv)
+        self.defaults = [None] * n if default is None else [default] if n == 1 else default
+        listed = isinstance(self.defaults, list | tuple) and len(self.defaults) == n
+        checks.require(listed, "default", default, f"is not a list of {n} defaults, one for each entry")
 
     @property
     def row_key(self) -> NestedKey:
@@ -100,11 +107,17 @@ class ActionTransform(StatefulTransform):
         return self.as_rows_of_spec(value, self.env.full_action_spec, self.action_key)
 
     @property
-    def actions(self) -> ActionSpecs:
-        """Shape, range and default of the actions, read from the environment's specs once."""
+    def all_actions(self) -> list[ActionSpecs]:
+        """Shape, range and default of each of the actions, read from the environment's specs once."""
         if "_actions" not in self.__dict__:
-            self.__dict__["_actions"] = read_action_specs(self.env, self.action_key, self.default)
+            pairs = zip(self.in_keys_inv, self.defaults, strict=True)
+            self.__dict__["_actions"] = [read_action_specs(self.env, key, each) for key, each in pairs]
         return self.__dict__["_actions"]
+
+    @property
+    def actions(self) -> ActionSpecs:
+        """Shape, range and default of the first of the actions."""
+        return self.all_actions[0]
 
     def empty_cache(self) -> None:
         super().empty_cache()
@@ -118,9 +131,10 @@ class ActionTransform(StatefulTransform):
 class ActionDelay(ActionTransform):
     """Delays actions: the environment executes the action that the policy chose some steps ago.
 
-    Until the first action of an episode arrives, the environment executes a default action. In a step in
-    which no newer action arrives, it executes the same action again. The TensorDict keeps the chosen action.
-    With delay 0 the rollout is the same, bit for bit, as without the transform.
+    In each step, the entries ``in_keys_inv`` of a world (or agent) travel together as one message. Until the
+    first action of an episode arrives, the environment executes a default action. In a step in which no newer
+    action arrives, it executes the same action again. The TensorDict keeps the chosen action. With delay 0
+    the rollout is the same, bit for bit, as without the transform.
 
     A worked timeline, with a delay of 3 steps: the action a0, chosen at t = 0, is executed in the step that
     begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
@@ -128,11 +142,12 @@ class ActionDelay(ActionTransform):
     Args:
         delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
             (``Function``). A delay is drawn for each world, each agent (under a nested key) and each step.
-        in_keys_inv: key of the action that the environment executes. A bare name for another key means an
-            entry beside it.
-        out_keys_inv: key under which the policy writes what it chooses; if not given, ``in_keys_inv``.
+        in_keys_inv: keys of the entries of an action that the environment executes, all of them beside each
+            other, or one key. A bare name for another key means an entry beside the first one.
+        out_keys_inv: keys under which the policy writes what it chooses; if not given, ``in_keys_inv``.
         default: action that is executed until the first one arrives: a number, or values in the shape of an
-            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
+            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0. Of
+            several entries, a list with one for each, which may be None.
         loss: probability that an action never arrives.
         dt: length of a step [s], for delays given as times.
         sent_key: key of a flag in the policy's input, [...] bool: which actions are sent; if not given, all.
@@ -163,17 +178,16 @@ class ActionDelay(ActionTransform):
         seed: int | None = None,
     ) -> None:
         super().__init__(in_keys_inv, default, out_keys_inv=out_keys_inv or in_keys_inv, seed=seed)
-        should = "is not one key each: delay a second action by another transform"
-        checks.require(
-            len(self.in_keys_inv) == len(self.out_keys_inv) == 1, "in_keys_inv", in_keys_inv, should
-        )
-        self.chosen_key: NestedKey = self.out_keys_inv[0]
+        same, paths = len(self.in_keys_inv) == len(self.out_keys_inv), set(map(path_of, self.in_keys_inv))
+        checks.require(same, "out_keys_inv", out_keys_inv, "does not have one key for each of in_keys_inv")
+        problem = "are not beside each other: delay actions of several groups by a transform for each"
+        checks.require(len(paths) == 1, "in_keys_inv", in_keys_inv, problem)
         law = law_of(delay)
         self.draw_from(sampler_of(law, dt, loss))
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
-        self.action_keys = existing([self.chosen_key, self.sent_key, *self.contexts.keys.values()])
+        self.action_keys = existing([*self.out_keys_inv, self.sent_key, *self.contexts.keys.values()])
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -181,32 +195,41 @@ class ActionDelay(ActionTransform):
 
     @property
     def row_dims(self) -> dict[str, int]:
-        return self.line.row_dims(1)
+        return self.line.row_dims(len(self.in_keys_inv))
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        initial = self.action_rows(self.actions.initial)
-        streams = self.streams(tensordict.batch_size, initial.device)
-        memory = self.line.init_memory([initial], streams) | {"initial": initial}
+        initial = [self.action_rows(actions.initial) for actions in self.all_actions]
+        streams = self.streams(tensordict.batch_size, initial[0].device)
+        memory = self.line.init_memory(initial, streams)
+        memory |= {f"initial_{i}": each for i, each in enumerate(initial)}
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory, _ = self.line.reset(memory, [memory["initial"]], mask)
+        initial = [memory[f"initial_{i}"] for i in range(len(self.in_keys_inv))]
+        memory, _ = self.line.reset(memory, initial, mask)
         return memory, {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         # A distribution may draw one-hot actions as floats, where the specs have integers.
-        chosen = as_rows(entries[self.chosen_key], self.rows).to(memory["initial"].dtype)
+        chosen = [
+            as_rows(entries[key], self.rows).to(memory[f"initial_{i}"].dtype)
+            for i, key in enumerate(self.out_keys_inv)
+        ]
         sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
-        memory, delivery = self.line.step(memory, [chosen], sent, context)
-        executed: Entries = {self.action_key: from_rows(delivery.held[0], self.rows).clone()}
+        memory, delivery = self.line.step(memory, chosen, sent, context)
+        executed: Entries = {
+            key: from_rows(held, self.rows).clone()
+            for key, held in zip(self.in_keys_inv, delivery.held, strict=True)
+        }
         if self.valid_key:
             default = memory["generated_at"] == memory["reset_at"]
             executed[self.valid_key] = (delivery.fresh | default).view(self.rows)
         return memory, executed
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:  # type: ignore[override]
-        if self.chosen_key != self.action_key:
-            action_spec[self.chosen_key] = action_spec[self.action_key].clone()
-            del action_spec[self.action_key]
+        for key, chosen in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
+            if chosen != key:
+                action_spec[chosen] = action_spec[key].clone()
+                del action_spec[key]
         return action_spec

@@ -2,6 +2,7 @@
 
 import itertools
 import multiprocessing
+import warnings
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, NamedTuple, NoReturn, cast
 
@@ -102,6 +103,8 @@ class StatefulTransform(Transform):
     _world_seeds: Tensor | None = None
     _first: TensorDictBase | None = None
     """Outputs of a reset of all worlds, as long as no step follows it."""
+    _in_episode: bool = False
+    """Whether a reset of the environment has begun the episodes that its worlds are in."""
 
     def __init__(
         self,
@@ -249,7 +252,7 @@ class StatefulTransform(Transform):
         outputs = tensordict_reset.detach() if mask is None else None
         # TorchRL restores the entries of the worlds without a reset.
         written = self._write(tensordict_reset, self._begin(tensordict_reset, mask))
-        self._first = outputs
+        self._first, self._in_episode = outputs, True
         return written
 
     def _init(self, outputs: TensorDictBase) -> None:
@@ -380,7 +383,16 @@ class StatefulTransform(Transform):
         copied = super().clone()
         copied.clear_memory()
         copied._first = None
+        copied.leave_episode()
         return copied
+
+    def reset_parent(self) -> None:
+        super().reset_parent()
+        self.leave_episode()
+
+    def leave_episode(self) -> None:
+        """Let ``load_state_dict`` replace the whole memory, because the worlds are replaced, too."""
+        self._in_episode = False
 
     def get_extra_state(self) -> Tensor | None:
         """The shape of the rows, for ``state_dict``."""
@@ -393,13 +405,27 @@ class StatefulTransform(Transform):
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        """Load the memory. A state without entries of this transform makes the next reset the first."""
+        """Load the memory. A state without entries of this transform makes the next reset the first.
+
+        A state does not tell where the environment's worlds are, so an episode that the environment is in
+        goes on with its own messages, as TorchRL's collectors need it: right after a reset, the random
+        streams are loaded; later, nothing.
+        """
+        first, errors = self._first if self._in_episode else None, args[-1]
+        if self._in_episode and first is None:
+            text = "in the middle of an episode no state is loaded: load it before a reset or right after one"
+            warnings.warn(f"{type(self).__name__}: {text}", stacklevel=2)
+            return
         inner = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
         saved: Memory = {k: v.detach() for k, v in inner.items() if "." not in k and k != "_extra_state"}
         own = self.memory
         self.clear_memory()
         self.set_memory({k: own.get(k, v).clone() for k, v in saved.items()})
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        if first is not None and not errors:
+            if self.has_memory:
+                self.set_memory(self._begin(first, None)[0])
+            self._first = first
 
     # Random streams.
 

@@ -16,7 +16,7 @@ from damian.transforms.base import Entries, Memory, as_rows, sibling_key
 class ContextReader:
     """Builds the context of the messages that a transform delays; does nothing if their law sees none.
 
-    The transform's memory must hold ``streams``, ``channel``, ``clock`` and ``reset_at``, as in
+    The transform's memory must hold ``streams``, ``state``, ``clock`` and ``reset_at``, as in
     ``DelayLine``. ``context_keys`` are those of the entries that the law may read, by name; a bare name means
     an entry beside ``beside``. ``before_step``: the messages are sent before the environment steps, as
     actions are.

@@ -147,16 +147,16 @@ class RewardDelay(RewardTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)
         streams = self.streams(tensordict.batch_size, memory["past"].device)
-        channel = self.sampler.initial_state(streams)
+        state = self.sampler.initial_state(streams)
         zero = torch.zeros_like(streams)
-        memory |= {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
+        memory |= {"clock": zero, "slot": zero.clone(), "streams": streams, "state": state}
         memory |= {"time": zero.clone(), "due": zero.repeat(self.n_slots, 1)}
         if not self.sampler.sees_context:
             return memory
         return self.contexts.init_memory(memory | {"reset_at": zero.clone()}, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory = memory | {"channel": self.sampler.begin_episode(memory["channel"], mask)}
+        memory = memory | {"state": self.sampler.begin_episode(memory["state"], mask)}
         if self.sampler.sees_context:
             memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
         memory["time"] = memory["time"] + self.n_slots * mask
@@ -166,9 +166,9 @@ class RewardDelay(RewardTransform):
         clock = memory["clock"] + 1
         reward = as_rows(entries[self.reward_key], self.rows)
         context = self.contexts.read(memory, entries, None, self.rows)
-        delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
+        delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
         slot = advance_slot(memory["slot"], 1, self.n_slots)
-        memory = memory | {"clock": clock, "slot": slot, "channel": channel, "time": memory["time"] + 1}
+        memory = memory | {"clock": clock, "slot": slot, "state": state, "time": memory["time"] + 1}
         memory["past"] = self._send(memory, reward, delay, self.sending_rows(entries))
         row = slot_rows(slot)
         here, due = (memory[name].flatten(0, 1).index_select(0, row) for name in ("past", "due"))

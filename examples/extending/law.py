@@ -1,11 +1,13 @@
-"""Your own distributions of delays: a satellite link with more hops at times, and a radio link to antennas.
+"""Your own distributions of delays: a satellite link, a radio link to antennas, and a route that drifts.
 
     cd examples/extending
     damian train "delay.obs={law: law:Satellite, hop: 2s, extra: 0.2}" aware=both
     damian train "delay.obs={law: law:Distance, antenna: [0, 0], speed: 40, reach: 300}" aware=both
+    damian train "delay.obs={law: law:Route, longest: 6s, change: 0.3}" aware=both
 
 A law is a frozen dataclass derived from ``damian.Law``. ``sampler`` returns the probability of each delay in
-steps (``Satellite``), or a function of the circumstances under which messages are sent (``Distance``).
+steps (``Satellite``), a function of the circumstances under which messages are sent (``Distance``), or a
+sampler of your own, whose senders have a state (``Route``).
 """
 
 from collections.abc import Sequence
@@ -14,10 +16,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from damian import ContextSampler, Law, MessageContext
-from damian.common import checks
+from damian import ContextSampler, Law, MessageContext, Sampler, TableSampler
+from damian.common import checks, counter_rng
 from damian.delays.laws import Delay, in_steps
-from damian.delays.samplers import Sampler
 from damian.settings.fields import setting
 
 
@@ -35,7 +36,7 @@ class Satellite(Law):
         chances = [0.0] * (2 * hop + 1)
         chances[hop] += 1 - self.extra
         chances[2 * hop] += self.extra
-        return Sampler([chances], loss=loss)
+        return TableSampler([chances], loss=loss)
 
 
 @dataclass(frozen=True)
@@ -66,3 +67,38 @@ class Distance(Law):
         steps = distance / (self.speed * context.dt) + context.n_sending // self.capacity
         lost = (distance > self.reach) & (context.uniform < 0.5)
         return torch.where(lost, -1.0, steps)
+
+
+@dataclass(frozen=True)
+class Route(Law):
+    """The delay of a sender is a random walk: from one message to the next it changes by one step at most."""
+
+    longest: Delay = 6
+    """Longest delay: steps, or a time such as ``6s``."""
+    change: float = setting(0.3, low=0, high=1)
+    """Probability that the delay grows or shrinks by a step, each as likely, between 0 and ``longest``."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        return Walk(in_steps(f"{key}.longest", self.longest, dt), self.change, loss)
+
+
+class Walk(Sampler):
+    """Draws the delays of ``Route``; the state of a sender is the delay of its latest message [steps], [M].
+
+    It goes on from one episode to the next; ``begin_episode`` could change that.
+    """
+
+    def __init__(self, longest: int, change: float, loss: float) -> None:
+        super().__init__(longest, loses=False, loss=loss)
+        self.change = change
+
+    def initial_state(self, streams: Tensor) -> Tensor:
+        return counter_rng.bits(streams) % (self.longest + 1)
+
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        draw = counter_rng.uniform(streams, clock)
+        move = (draw < self.change / 2).long() - (draw >= 1 - self.change / 2).long()
+        delay = (state + move).clamp(0, self.longest)
+        return self.lose(delay, streams, clock), delay

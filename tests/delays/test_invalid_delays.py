@@ -1,6 +1,7 @@
 """One line for each kind of mistake in a delay law, a trace, or a setting of delays."""
 
 import math
+from dataclasses import dataclass
 
 import pytest
 from context_law import Crowd
@@ -8,12 +9,16 @@ from transform_cases import ACTION, delayed, trace
 
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig, check_laws
-from damian.delays.laws import LONGEST, Burst, Held, Lag, Uniform
+from damian.delays.laws import LONGEST, Burst, Held, Lag, Law, Uniform
+from damian.delays.samplers import TableSampler
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 INVALID_LAWS = [
+    (-1, ": -1 is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a distribution"),
+    ("3x", ": 3x is not a delay"),
     ("3h", f": 3h is more than {LONGEST} steps"),
     ({"law": "gauss"}, ".law: gauss is not one of constant, uniform, geometric, burst, trace"),
+    ({"law": "uniform", "high": 2.5}, ".high: 2.5 is neither a number of steps >= 0 (3) nor a time (3s"),
     ({"law": "uniform", "low": 4, "high": 2}, ".low: 4 and high=2 are not two steps or two times"),
     ({"law": "burst", "bad": {"law": "burst"}}, ".bad: {'law': 'burst'} is not a memoryless law"),
     ({"law": "distance", "speed": math.nan}, ".speed: nan m/s is not above 0 m/s"),
@@ -71,6 +76,20 @@ def test_losses_are_refused_where_a_reward_would_be_lost():
     for make in (lambda: check_laws(DelayConfig(rew={"law": "burst"}), 1.0), lambda: RewardDelay(Burst())):
         with pytest.raises(InputError, match="no reward may be lost"):
             make()
+
+
+@dataclass(frozen=True)
+class Lossless(Law):
+    """A law that forgets the argument ``loss``."""
+
+    def sampler(self, dt=1.0, loss=0.0, key="delay"):
+        return TableSampler([[0.0, 1.0]])
+
+
+def test_a_law_that_forgets_the_loss_is_refused():
+    ObservationDelay(Lossless())
+    with pytest.raises(InputError, match="delay: Lossless loses no message"):
+        ObservationDelay(Lossless(), loss=0.1)
 
 
 def test_a_law_that_reads_what_there_is_not_is_refused():

@@ -142,6 +142,8 @@ def test_a_law_is_given_as_steps_a_time_or_a_mapping(setting, law):
         ("3.01s", 1.0, 4),
         ("0s", 1.0, 0),
         ("0.5m", 1.0, 30),
+        ("133ms", 0.05, 3),
+        (3.0, 1.0, 3),  # 3e0 on the command line
         ("0.3s", 0.1, 3),
     ],
 )

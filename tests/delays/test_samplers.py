@@ -8,9 +8,16 @@ from delay_twin import drawn
 from torch import Tensor
 
 from damian.common import counter_rng
-from damian.delays.laws import Distance, Lag, Uniform
+from damian.delays.laws import Burst, Constant, Distance, Held, Lag, Law, Uniform
 from damian.delays.line import BroadcastLine, DelayLine
-from damian.delays.samplers import ContextSampler, MessageContext, Recorded
+from damian.delays.samplers import (
+    ContextSampler,
+    LinkSampler,
+    MessageContext,
+    Recorded,
+    Sampler,
+    TableSampler,
+)
 
 LAW, SENDERS = Uniform(1, 5), 20_000
 
@@ -27,7 +34,7 @@ def require_share(found: Tensor, expected: float) -> None:
 @pytest.mark.parametrize(("order", "ages"), [("generation", [1, 2, 0, 1]), ("arrival", [1, 2, 0, 3])])
 def test_the_timeline_of_a_delay_line(order, ages):
     line, zero = DelayLine(Recorded([3, 1, 0, 2], 0.0), order), torch.zeros(1, dtype=torch.long)
-    memory = line.init_memory([torch.zeros(1)], zero) | {"channel": zero}
+    memory = line.init_memory([torch.zeros(1)], zero) | {"state": zero}
     for t, age in enumerate(ages, 1):
         memory, delivery = line.step(memory, [torch.tensor([float(t)])], None)
         assert delivery.age.item() == age
@@ -36,11 +43,11 @@ def test_the_timeline_of_a_delay_line(order, ages):
 
 def test_the_timeline_of_a_broadcast_line():
     line, zero = BroadcastLine(Recorded([1, 3], 0.0)), torch.zeros(2, dtype=torch.long)
-    memory = line.init_memory([torch.zeros(1)], zero, zero) | {"channel": torch.tensor([0, 1])}
+    memory = line.init_memory([torch.zeros(1)], zero, zero) | {"state": torch.tensor([0, 1])}
     sent, nothing, held = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool), []
     for t in range(4):
         line.write(memory, [torch.tensor([10.0 + t])])
-        memory = line.step(memory, nothing if t else sent)
+        memory, _ = line.step(memory, nothing if t else sent)
         held.append(line.held(memory)[0].tolist())
     assert held == [[0.0, 0.0], [10.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
 
@@ -61,6 +68,67 @@ def test_an_update_keeps_the_lag_with_the_hold_probability(probability):
     require_share(kept[1::2], probability + (1 - probability) / 1000)
 
 
+# States.
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        Burst(0.1, 0.2, good=1, bad=4),
+        Burst(0.1, 0.2, good=Uniform(0, 3), bad=2, good_loss=1.0, bad_loss=0.0),
+        Lag(Uniform(0, 3), "episode"),
+        Constant(2),
+    ],
+    ids=str,
+)
+def test_held_messages_are_as_late_as_the_longest_and_the_same_are_lost_from_the_first_draw_on(law: Law):
+    """From the state of the first draw, and after a reset in half of the rows, too."""
+    for loss in (0.0, 0.3):
+        free, held = law.sampler(loss=loss), Held(law).sampler(loss=loss)
+        assert (held.longest, held.loses) == (free.longest, free.loses)
+        assert held.constant_delay == (None if free.loses else free.longest)
+        streams, found = counter_rng.world_seeds(5, 500), []
+        for sampler in (free, held):
+            state = sampler.initial_state(streams)
+            for clock in range(1, 11):
+                if clock == 6:
+                    state = sampler.begin_episode(state, streams % 2 == 0)
+                delay, state = sampler(streams, torch.tensor(clock), state)
+                found.append((delay, state))
+        for (one, state), (other, held_state) in zip(found[:10], found[10:], strict=True):
+            assert other.equal(torch.where(one == free.lost, held.lost, held.longest))
+            assert held_state.equal(state)
+
+
+class Doubling(Sampler):
+    """The state is a float, which doubles with every message: 0.4, 0.8, 1.6, ... steps, rounded down."""
+
+    def __init__(self) -> None:
+        super().__init__(3, loses=False)
+
+    def initial_state(self, streams):
+        return torch.full(streams.shape, 0.4)
+
+    def forward(self, streams, clock, state, context=None):
+        return state.clamp(max=3).long(), 2 * state
+
+
+def test_links_keep_the_states_of_all_samplers_floats_or_not():
+    samplers = [Doubling(), Recorded([3, 1, 0, 2]), Lag(Uniform(0, 3), "episode").sampler()]
+    index, streams = torch.tensor([0, 1, 2, 0]), counter_rng.world_seeds(5, 4 * 30)
+    found = drawn(LinkSampler(samplers, index, torch.zeros(4)), streams, 9)
+    for k, sampler in enumerate(samplers):
+        link = index.repeat(30) == k
+        assert found[:, link].equal(drawn(sampler, streams, 9)[:, link])
+
+
+def test_a_sampler_must_draw_and_a_table_cannot_be_drawn_from_otherwise():
+    with pytest.raises(TypeError, match="abstract"):
+        Sampler(3)  # type: ignore[abstract]
+    with pytest.raises(TypeError, match="Faked: a sampler that draws by a rule"):
+        type("Faked", (TableSampler,), {"forward": Doubling.forward})
+
+
 # Contexts.
 
 
@@ -77,6 +145,7 @@ def test_delays_are_rounded_up_and_cut_and_negative_ones_are_lost(loses, expecte
     delay, _ = sampler(torch.arange(6), torch.tensor(1), torch.zeros(6), context_of(torch.rand(6)))
     assert delay.tolist() == expected
     assert (sampler.longest, sampler.lost, sampler.constant_delay, sampler.loses) == (5, 6, None, loses)
+    assert ContextSampler(lambda _: values, 5, loss=0.1, loses=loses).loses
 
 
 def test_the_rounding_errors_of_a_float_cost_no_step():

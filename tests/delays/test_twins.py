@@ -1,6 +1,8 @@
 """Late messages, actions and rewards beside senders in plain Python, whose episodes end at random steps."""
 
 import math
+import runpy
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,6 +32,7 @@ from damian.delays.laws import Lag, Law, Uniform
 from damian.envs.pipeline import make_env
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
+Route: Any = runpy.run_path(str(Path(__file__).parents[2] / "examples/extending/law.py"))["Route"]
 DT = 2.0
 LAWS: dict[str, Law] = {
     "each message": Lag(Uniform(1, 5)),
@@ -38,6 +41,7 @@ LAWS: dict[str, Law] = {
     "hold": Lag(Uniform(1, 5), 2, hold_probability=0.5),
     "all": Lag(Uniform(1, 5), 3, hold_probability=0.4, shared=True, stagger=True),
     "context": Crowd("seen", column=4),
+    "state of one's own": Route(4, change=0.6),
 }
 every_law = pytest.mark.parametrize("name", LAWS)
 
@@ -89,12 +93,30 @@ class CrowdSender(LagSender):
         return None if self.share(now, 0) < self.loss else delay
 
 
+class RouteSender(LagSender):
+    """Delays of one sender's messages by the law ``Route`` of docs/extending.md."""
+
+    def __init__(self, law: Any, stream: int, loss: float) -> None:
+        self.law, self.stream, self.loss = law, torch.tensor(stream), loss
+        self.delay = self.bits() % (law.longest + 1)
+
+    def begin(self) -> None:
+        """The walk goes on."""
+
+    def send(self, now: int, value: float, n_sending: int) -> int | None:
+        draw, half = self.share(now), self.law.change / 2
+        self.delay = min(max(self.delay + (draw < half) - (draw >= 1 - half), 0), self.law.longest)
+        return None if self.share(now, 0) < self.loss else self.delay
+
+
 def senders(transform: Any, law: Law, loss: float = 0.0, first: int = 1) -> list[LagSender]:
     """A sender for each row, with the random stream of the transform."""
-    streams = zip(transform.memory["streams"].tolist(), ROWS, strict=True)
+    streams = transform.memory["streams"].tolist()
+    assert len(set(streams)) >= len(WORLDS), "worlds draw apart"
+    own = {Lag: LagSender, Route: RouteSender}.get(type(law))
     return [
-        LagSender(law, stream, loss) if isinstance(law, Lag) else CrowdSender(n, stream, loss, first)
-        for stream, (_, n) in streams
+        own(law, stream, loss) if own else CrowdSender(n, stream, loss, first)
+        for stream, (_, n) in zip(streams, ROWS, strict=True)
     ]
 
 

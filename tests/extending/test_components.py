@@ -20,6 +20,7 @@ from damian.world.regions.config import RegionConfig
 
 LAW = ["delay.obs={law: law:Satellite, hop: 2s, extra: 0.3}"]
 LAW += ["delay.act={law: law:Distance, antenna: [0, 20], speed: 40, reach: 90}"]
+LAW += ["delay.rew={law: law:Route, longest: 3s, change: 0.5}"]
 FEATURES = [
     "observation.local_features=[spotted,features:heading,sensor:wind_felt]",
     "observation.global_features=[features:spread]",

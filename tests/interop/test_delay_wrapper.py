@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
 from gymnasium.utils.env_checker import check_env
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 
@@ -113,11 +113,26 @@ def test_any_space_is_delayed_and_the_default_is_the_legal_action_nearest_to_zer
     assert all(np.array_equal(a, b) for a, b in zip(inner.executed[1:], actions[:3], strict=True))
 
 
-def test_a_space_without_zero_asks_for_a_default():
-    space = Dict({"gas": Box(0, 1)})
-    with pytest.raises(InputError, match="default"):
-        DelayWrapper(Anything(space))
-    DelayWrapper(Anything(space), default={"gas": np.zeros(1, np.float32)})
+def test_a_space_without_zero_asks_for_a_default_only_where_an_action_is_late():
+    inner = Anything(Text(5))
+    for late in (1, Uniform(0, 2)):
+        with pytest.raises(InputError, match="default: is missing"):
+            DelayWrapper(inner, action=late)
+    for options, executed in (({"observation": 2}, "go"), ({"action": 1, "default": "stay"}, "stay")):
+        env = DelayWrapper(inner, **options)
+        env.reset()
+        env.step("go")
+        assert inner.executed == [executed]
+
+
+def test_the_default_of_a_dict_or_tuple_has_one_of_each_of_its_spaces():
+    space = Dict({"gas": Box(0.5, 1, dtype=np.float64), "gear": Tuple([Discrete(3), Discrete(2, start=1)])})
+    inner = Anything(space)
+    env = DelayWrapper(inner, action=1)
+    env.reset()
+    env.step(space.sample())
+    assert inner.executed[0] in space
+    assert inner.executed[0] == {"gas": 0.5, "gear": (0, 1)}
 
 
 @pytest.mark.filterwarnings("ignore:.*WARN")  # of the wrapped environments themselves

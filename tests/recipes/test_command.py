@@ -9,6 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import damian
+from damian.delays.config import delay_sampler
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
@@ -56,7 +57,8 @@ def test_settings_help_and_wrong_words_need_no_torch(code):
         (["train", "-m", "delay=none,papr"], "delay: papr is not one of"),
         (["train", "delay=-1"], "Config group override must be a string"),
         (["train", "seed=0,1"], "Ambiguous value for argument 'seed=0,1' 1. To use it as a list"),
-        (["train", "agents=two"], "agents: Value 'two' of type 'str' could not be converted to Integer"),
+        (["train", "agents=two"], "agents: two is not a whole number"),
+        (["train", "frames=1.5e0"], "frames: 1.5 is not a whole number"),
         (["train", "agents=0"], "agents: 0 is not between 1 and 1000"),
         (["train", "clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
         (["train", "region=geojson"], "region.path: it is missing: region.kind=geojson needs it"),
@@ -84,6 +86,27 @@ def test_what_only_a_program_can_tell_is_one_line_too_and_leaves_no_folder(
     monkeypatch.chdir(tmp_path)
     assert message in refusal(capsys, "train", *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, monkeypatch):
+    """On the command line, in a file, in a variable of a cluster, and in Python."""
+    monkeypatch.setenv("TASK", "7")
+    words = (
+        "frames=1e6",
+        "seed=${oc.env:TASK}",
+        "model.hidden=[1e2,64]",
+        "delay.obs=133ms",
+        "clock.simulation=50ms",
+    )
+    file = tmp_path / "scenario" / "mine.yaml"
+    file.parent.mkdir()
+    file.write_text("# @package _global_\nworlds: 2e1\nepisode: {max_steps: 3.0e+1}\n", encoding="utf-8")
+    config = cli.settings("scenario=mine", *words, own_folder=str(tmp_path))
+    found = [config.frames, config.seed, *config.model.hidden, config.worlds, config.episode.max_steps]
+    assert found == [1_000_000, 7, 100, 64, 20, 30]
+    assert {type(number) for number in found} == {int}
+    assert delay_sampler(config.delay, "obs", config.clock.dt).longest == 3
+    assert damian.ClockConfig(simulation="50ms").steps("agents") == 1
 
 
 def test_a_refused_run_removes_only_the_folders_that_it_has_made(capsys, tmp_path):
@@ -161,8 +184,9 @@ def test_help_explains_a_program_a_section_and_a_setting(capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["train", "-m", "seed=a,b"], "seed: Value 'a' of type 'str' could not be converted to Integer"),
-        (["train", "-m", "seed=0,b"], "seed: Value 'b' of type 'str' could not be converted to Integer"),
+        (["train", "-m", "seed=a,b"], "seed: a is not a whole number"),
+        (["train", "-m", "seed=0,b"], "seed: b is not a whole number"),
+        (["train", "-m", "agents=3,0", "delay=none,paper"], "agents: 0 is not between 1 and 1000"),
         (["train", "-m", "delay.obs={law: trace, path: no.csv}", "seed=0,1"], "no.csv: no such file"),
         (["train", "logger=wandb"], "logger: wandb is not installed; pip install wandb"),
     ],

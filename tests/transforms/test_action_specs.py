@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from contract import Servos
 from plain_env import GROUP, Plain
 from torchrl.data import (
     Binary,
@@ -14,6 +15,8 @@ from torchrl.data import (
 from torchrl.envs import TransformedEnv
 from transform_cases import ACTION
 
+from damian.common.errors import InputError
+from damian.delays.laws import Uniform
 from damian.transforms import ActionDelay, ActionHistory
 
 HISTORY = ("agents", "action_history")
@@ -55,6 +58,44 @@ def test_every_number_of_every_agent_is_scaled_by_its_own_bounds(spec, low, high
             a, lowest, highest = (float(values[tuple(at)]) for values in (action, low, high))
             expected = (a - lowest) / (highest - lowest) if highest > lowest else 0.0
             assert found[tuple(at)].item() == pytest.approx(expected, abs=1e-6)
+
+
+# Several entries.
+
+
+@pytest.mark.parametrize(("default", "first"), [(None, ([0.0, 0.0], 0)), ([0.5, 3], ([0.5, 0.5], 3))])
+def test_the_entries_of_an_action_travel_as_one_message(default, first):
+    """Each gear is executed with the place that was chosen with it, whatever the delay and the loss."""
+    keys = {"in_keys_inv": ["place", "gear"], "out_keys_inv": ["wish", "gear"]}
+    delay = ActionDelay(Uniform(0, 3), **keys, default=default, loss=0.2, seed=0)
+    env, chosen, ages = TransformedEnv(Servos(), delay), {}, []
+    assert env.action_keys == ["gear", "wish"]
+    now, worlds = env.reset(), torch.arange(3)
+    for t in range(40):
+        now["gear"], now["wish"] = (worlds + t) % 5, (worlds / 5 + t / 40 - 0.7).unsqueeze(-1).repeat(1, 2)
+        wishes, executed = now["wish"].tolist(), delay.inv(now.clone())
+        chosen |= {(w, *wishes[w]): (t, now["gear"][w].item()) for w in range(3)}
+        places, gears = executed["place"].tolist(), executed["gear"].tolist()
+        known = [chosen.get((w, *places[w])) for w in range(3)]
+        for place, gear, found in zip(places, gears, known, strict=True):
+            assert gear == found[1] if found else (place, gear) == first
+        ages.append([t - found[0] if found else None for found in known])
+    assert {None, 0, 1, 2, 3} <= {age for step in ages for age in step}
+    assert len(set(zip(*ages, strict=True))) == 3, "worlds draw apart"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        ({"in_keys_inv": ["place", ("agents", "gear")]}, "in_keys_inv: .* are not beside each other"),
+        ({"in_keys_inv": ["place", "gear"], "default": 0}, "default: 0 is not a list of 2 defaults"),
+        ({"in_keys_inv": ["place", "gear"], "out_keys_inv": "wish"}, "out_keys_inv: wish does not have one"),
+    ],
+    ids=str,
+)
+def test_entries_that_cannot_travel_together_are_refused_in_one_line(wrong, error):
+    with pytest.raises(InputError, match=error):
+        ActionDelay(2, **wrong)
 
 
 # Defaults.

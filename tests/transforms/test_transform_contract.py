@@ -147,6 +147,36 @@ def test_a_loaded_checkpoint_continues_bit_for_bit(case, whole, n_steps, used):
     assert all_same(onward(env, td.clone()), onward(twin, td.clone()))
 
 
+@pytest.mark.sample(4)
+@every_case
+def test_a_state_that_is_loaded_after_a_reset_shows_no_message_of_its_own_episode(case):
+    """Only random streams are loaded, so that it is all one whether the state or the reset comes first."""
+    other, made = case.build(), []
+    begun(other)
+    state = saved_and_loaded(other.transform.state_dict())
+    for state_first in (True, False):
+        env = case.build()
+        set_seed(env, 0)
+        torch.manual_seed(0)
+        if state_first:
+            env.load_state_dict(state)
+        td = env.reset()
+        if not state_first:
+            env.load_state_dict(state)
+        made.append(onward(env, td))
+    assert all_same(*made)
+
+
+@pytest.mark.sample(4)
+@every_case
+def test_in_the_middle_of_an_episode_no_other_state_is_loaded(case):
+    env, twin, other = case.build(), case.build(), case.build()
+    td, _, _ = begun(env, 3), begun(twin, 3), begun(other, 5, seed=9)
+    with pytest.warns(UserWarning, match="in the middle of an episode no state is loaded"):
+        env.load_state_dict(saved_and_loaded(other.state_dict()))
+    assert all_same(onward(env, td.clone()), onward(twin, td.clone()))
+
+
 def saved_and_loaded(state):
     """A state after it was saved to a file and loaded from it."""
     file = io.BytesIO()
