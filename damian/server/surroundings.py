@@ -81,7 +81,7 @@ def _others(v: FeatureCache) -> Tensor:
     """
     messages = v.messages
     places = torch.stack([messages.position, messages.target], -2)
-    ways = _ways_to_nearest(v, places, torch.ones_like(places[..., :1]))
+    ways = _ways_to_nearest(v, F.pad(places, (0, 1), value=1.0))
     return _four(torch.cat([ways[..., 0, :2], ways[..., 1, :]], -1))
 
 
@@ -103,15 +103,15 @@ def _timeline(v: FeatureCache) -> Tensor:
     that step. Behind the slots stands the same of the destination of a UAV in flight. Ways begin where the
     observer is bound for.
     """
-    messages, context = v.messages, v.context
-    since = (context.now[..., None, None] - messages.landed) / context.dt
-    since = torch.where(messages.landed < 0, -1, since.round().long())  # [*, N, S]
-    slot = torch.arange(context.slots, device=since.device)
-    fills = (since.unsqueeze(-2) == slot.unsqueeze(-1)).float()  # [*, N, slots, S], at most one stop each
-    places = fills @ gather_rows(context.points, messages.trail)
-    places = torch.cat([places, messages.target.unsqueeze(-2)], -2)
-    known = torch.cat([fills.sum(-1), messages.in_flight.float().unsqueeze(-1)], -1)
-    return _four(_ways_to_nearest(v, places, known.unsqueeze(-1)).flatten(-2))
+    messages, context, slots = v.messages, v.context, v.context.slots
+    since = ((context.now[..., None, None] - messages.landed) / context.dt).round().long()  # [*, N, S]
+    slot = torch.where((messages.landed < 0) | (since > slots), slots, since)  # the last one is left out
+    stops = F.pad(gather_rows(context.points, messages.trail), (0, 1), value=1.0)  # [*, N, S, 3]
+    table = stops.new_zeros(*slot.shape[:-1], slots + 1, 3)
+    table = table.scatter(-2, slot.unsqueeze(-1).expand_as(stops), stops)[..., :slots, :]
+    flies = messages.in_flight.to(stops.dtype).unsqueeze(-1)
+    table = torch.cat([table, torch.cat([messages.target, flies], -1).unsqueeze(-2)], -2)
+    return _four(_ways_to_nearest(v, table).flatten(-2))
 
 
 def _nearest(v: FeatureCache) -> Tensor:
@@ -132,14 +132,13 @@ def _of_nearest(v: FeatureCache, table: Tensor) -> Tensor:
     return rows.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, table.shape[-1]))
 
 
-def _ways_to_nearest(v: FeatureCache, places: Tensor, known: Tensor) -> Tensor:
-    """Ways to places [*, N, P, 2] of the nearest other UAVs, and 1, [*, N, 4, P, 3].
+def _ways_to_nearest(v: FeatureCache, places: Tensor) -> Tensor:
+    """Ways to places of the nearest other UAVs, and 1; zeros where a place is not known, [*, N, 4, P, 3].
 
-    Zeros where a place is not ``known`` [*, N, P, 1].
+    ``places`` [*, N, P, 3]: east, north, and 1 if it is known, else 0.
     """
     half, own = v.context.scale / 2, v.wanted(v.messages.target).unsqueeze(-2)
-    found = _of_nearest(v, torch.cat([places, known], -1).flatten(-2)).unflatten(-1, (-1, 3))
-    places, known = found.split([2, 1], -1)
+    places, known = _of_nearest(v, places.flatten(-2)).unflatten(-1, (-1, 3)).split([2, 1], -1)
     ways = ((places - own.unsqueeze(-2)) / half[..., None, None, None, None]).clamp(-1, 1)
     return torch.cat([ways * known, known], -1)
 
