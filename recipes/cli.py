@@ -360,11 +360,13 @@ def _first_run(program: str, given: Namespace) -> DictConfig:
 
     The first is checked, and each whole number of the others by itself; Hydra checks the rest of the types.
     """
-    parsed = OverridesParser.create().parse_overrides(given.overrides)
-    swept = [each for each in parsed if each.is_discrete_sweep() and not isinstance(each.value(), Glob)]
+    overrides = OverridesParser.create().parse_overrides(given.overrides)
+    swept = [each for each in overrides if each.is_discrete_sweep() and not isinstance(each.value(), Glob)]
     words = [
-        f"{each.get_key_element()}={next(each.sweep_string_iterator())}" if each in swept else each.input_line
-        for each in parsed
+        f"{each.get_key_element()}={next(each.sweep_string_iterator())}"
+        if each in swept
+        else str(each.input_line)
+        for each in overrides
     ]
     found = composed(program, words, given.config_dir)
     if {"checkpoint", "resume"} & set(map(key_of, words)):
