@@ -42,7 +42,8 @@ ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", 
 _METHODS = (
     f"undelayed {TRAINED},deployed backupdate+rewards {SCRIPT},naive naive+tuned finetuned {RANDOM},"
     "naive+history naive+history+tuned imitation,naive+late_own naive+timeline,"
-    "naive+gru naive+gru+tuned naive+gru+hold,predictive backupdate+critic backupdate+ages backupdate+late_own,backupdate backupdate+tuned,"
+    "naive+gru naive+gru+tuned naive+gru+hold,"
+    "predictive backupdate+critic backupdate+ages backupdate+late_own,backupdate backupdate+tuned,"
     "backupdate+history both backupdate+gru+hold,deployed+late_own backupdate+gru,"
     "belief timeline+gru qmix,untrained privileged timeline"
 ).split(",")
