@@ -35,7 +35,8 @@ KINEMATICS = (keys.AGENTS, "kinematics")
 """Velocity and position of each agent, [B, N, 4]: what it knows of itself, at once."""
 SEEN = ("seen", "message")
 """Places of the landmarks and of the other agents relative to each agent, [B, N (2 N - 1), 2]: the N + N - 1
-blocks that agent 0 sees, then those that agent 1 sees. Each block is a message, with a delay of its own."""
+blocks that agent 0 sees, then those that agent 1 sees. Each block is a message, with a delay of its own. If
+they are registered, an agent has added where it was itself: they are places in the plane."""
 HELD, AGES, DELAYS, PAST = (("seen", name) for name in ("received", "age", "delay", "timeline"))
 """Of each block: the message that the agent holds, its age and the delay of the latest one [steps], and the
 messages of the latest steps that have arrived (``ObservationTimeline``)."""
@@ -45,22 +46,25 @@ class SimpleSpread(EnvBase):
     """``simple_spread_v3`` for B worlds at a time, with discrete actions.
 
     It writes PettingZoo's observation ``("agents", "observation")`` [B, N, 6 N] (kinematics, landmarks, other
-    agents, and zeros for what they might say) and its parts, ``KINEMATICS`` and ``SEEN``. Episodes are
-    truncated after ``HORIZON`` steps.
+    agents, and zeros for what they might say), its parts, ``KINEMATICS`` and ``SEEN``, and where each agent
+    is, ``keys.POSITION`` [B, N, 2]. Episodes are truncated after ``HORIZON`` steps.
 
     Args:
         worlds: number of worlds, B.
         agents: number of agents and of landmarks, N.
         local_ratio: weight of an agent's own reward; the common one has the rest.
+        registered: whether the places in ``SEEN`` are registered.
 
     Examples:
         >>> env = SimpleSpread(64)
         >>> env.rollout(25)["next", "agents", "reward"].sum((1, 2, 3)).mean()  # about -79
     """
 
-    def __init__(self, worlds: int, agents: int = 3, local_ratio: float = 0.5) -> None:
+    def __init__(
+        self, worlds: int, agents: int = 3, local_ratio: float = 0.5, registered: bool = False
+    ) -> None:
         super().__init__(batch_size=torch.Size([worlds]))
-        self.n_agents, self.local_ratio = agents, local_ratio
+        self.n_agents, self.local_ratio, self.registered = agents, local_ratio, registered
         self.directions = torch.tensor(DIRECTIONS)
         places = torch.arange(agents)
         self.others = places.expand(agents, -1)[places != places.unsqueeze(-1)].view(agents, -1)
@@ -81,7 +85,9 @@ class SimpleSpread(EnvBase):
             return Unbounded(torch.Size((*rows, width)))
 
         seen = torch.Size([worlds, n * (2 * n - 1)])
-        outputs = composite({"observation": numbers(6 * n), "kinematics": numbers(4)}, group)
+        outputs = composite(
+            {"observation": numbers(6 * n), "kinematics": numbers(4), "position": numbers(2)}, group
+        )
         messages = composite({"message": numbers(2, seen)}, seen)
         self.observation_spec = composite({"agents": outputs, "seen": messages})
         action = composite({"action": Categorical(len(DIRECTIONS), shape=group)}, group)
@@ -126,10 +132,10 @@ class SimpleSpread(EnvBase):
         kinematics = torch.cat([self.velocity, self.position], -1)
         silence = kinematics.new_zeros(worlds, n, 2 * (n - 1))
         observation = torch.cat([kinematics, seen.flatten(2), silence], -1)
-        agents = {"observation": observation, "kinematics": kinematics}
+        agents = {"observation": observation, "kinematics": kinematics, "position": self.position.clone()}
         over = self.steps >= HORIZON
         ends = {keys.DONE: over, keys.TERMINATED: torch.zeros_like(over), keys.TRUNCATED: over.clone()}
-        messages = seen.flatten(1, 2)
+        messages = (seen + own if self.registered else seen).flatten(1, 2)
         groups = {
             "agents": TensorDict(agents, [worlds, n]),
             "seen": TensorDict({"message": messages}, messages.shape[:2]),
@@ -146,21 +152,22 @@ def contact_forces(position: Tensor) -> Tensor:
 
 
 class Receiver(Transform):
-    """Writes what agents and critics observe of their kinematics and of the blocks that they hold.
+    """Writes what agents and critics observe of their kinematics and of what they see.
 
-    Critics observe ``observed(...)``, and actors too, with ``ages`` followed by the age of each block. For
-    learners it also writes that every agent may choose in every step, the longest delay of the blocks that
-    were sent in this step, that nothing is back-updated yet, and, if there is one, the history of each
-    agent's blocks.
+    Critics observe ``observed(...)`` of the blocks that are held or, if there is one, of their timeline; and
+    actors too, with ``ages`` followed by the age of each block. For learners it also writes that every agent
+    may choose in every step, the longest delay of the blocks that were sent in this step, and that nothing is
+    back-updated yet.
 
     Args:
         longest: steps that are an age of 1.
         ages: whether actors observe the ages.
+        registered: whether the blocks are.
     """
 
-    def __init__(self, longest: int, ages: bool) -> None:
+    def __init__(self, longest: int, ages: bool, registered: bool) -> None:
         super().__init__()
-        self.longest, self.ages = longest, ages
+        self.longest, self.ages, self.registered = longest, ages, registered
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.update(self._written(next_tensordict))
@@ -171,18 +178,15 @@ class Receiver(Transform):
     def _written(self, outputs: TensorDictBase) -> dict[Any, Tensor]:
         kinematics = outputs[KINEMATICS]
         rows = kinematics.shape[:-1]
-        known = observed(kinematics, outputs[HELD])
+        known = observed(kinematics, outputs.get(PAST, outputs[HELD]), self.registered)
         ages = outputs[AGES].view(*rows, -1) / self.longest
-        written = {
+        return {
             keys.OBSERVATION: torch.cat([known, ages], -1) if self.ages else known.clone(),
             keys.GLOBAL_OBSERVATION: known,
             keys.READY: torch.ones(rows, dtype=torch.bool, device=known.device),
             keys.BACKUPDATED: torch.zeros(*rows, 1, dtype=torch.bool, device=known.device),
             keys.DELAY: outputs[DELAYS].view(*rows, -1).amax(-1, keepdim=True),
         }
-        if PAST in outputs.keys(True):
-            written[keys.TIMELINE] = histories(outputs[PAST], rows[-1])
-        return written
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key, value in self._written(observation_spec.zero()).items():  # type: ignore[arg-type]
@@ -191,26 +195,29 @@ class Receiver(Transform):
         return observation_spec
 
 
-def observed(kinematics: Tensor, blocks: Tensor) -> Tensor:
-    """Kinematics [*, N, 4], blocks [*, N (2 N - 1), 2], and which agent it is, [*, N, 5 N + 2]."""
-    n = kinematics.shape[-2]
-    which = torch.eye(n, device=kinematics.device).expand(*kinematics.shape[:-1], n)
-    return torch.cat([kinematics, blocks.unflatten(-2, (n, -1)).flatten(-2), which], -1)
+def observed(kinematics: Tensor, seen: Tensor, registered: bool = False) -> Tensor:
+    """What agents make of their kinematics [*, N, 4] and of what they see, [*, N, 4 + C + N].
 
-
-def histories(past: Tensor, n_agents: int) -> Tensor:
-    """Timelines of all blocks, [B, N M, K, 2 + 1], by agent, [B, N, M, K, 2 + M + 1].
-
-    A row of the result has the place, which of the M blocks it is, and whether it is known.
+    That is, the kinematics, the C numbers, and which agent it is. What it sees are blocks
+    [*, N (2 N - 1), 2], which are moved into the agent's present frame if they are ``registered``, or their
+    timelines [*, N (2 N - 1), K, 3].
     """
-    rows = past.unflatten(1, (n_agents, -1))  # [B, N, M, K, C]
-    m = rows.shape[2]
-    block = torch.eye(m, device=past.device).view(m, 1, m).expand(*rows.shape[:-1], m)
-    return torch.cat([rows[..., :2], block, rows[..., 2:]], -1)
+    *rows, n, _ = kinematics.shape
+    seen = seen.unflatten(len(rows), (n, -1))
+    if registered:
+        seen = seen - kinematics[..., 2:].unsqueeze(-2)
+    which = torch.eye(n, device=kinematics.device).expand(*rows, n, n)
+    return torch.cat([kinematics, seen.flatten(len(rows) + 1), which], -1)
 
 
 def late_spread(
-    worlds: int, delay: int | Law, longest: int, *, aware: bool = False, messages: int = 0
+    worlds: int,
+    delay: int | Law,
+    longest: int,
+    *,
+    aware: bool = False,
+    registered: bool = False,
+    slots: int = 0,
 ) -> TransformedEnv:
     """``SimpleSpread`` for B worlds whose agents see each landmark and each other agent late.
 
@@ -221,14 +228,16 @@ def late_spread(
         delay: of each block [steps], or its law.
         longest: number of latest actions that an aware actor observes.
         aware: whether actors observe ages, and their own latest actions by how far these move them.
-        messages: number of latest steps whose messages ``("agents", "timeline")`` has; 0: there is none.
+        registered: whether the blocks that agents hold are moved into their present frame.
+        slots: number of latest steps that agents observe as the timelines of the blocks, in their present
+            frame, instead of the blocks that they hold; 0: there are none.
     """
     parts: list[Transform] = [ObservationDelay(delay, [SEEN], [HELD], age_key="age", delay_key="delay")]
-    if messages:
-        parts.append(ObservationTimeline(messages, SEEN, delay_key="delay"))
-    parts.append(Receiver(longest, ages=aware))
+    if slots:
+        parts.append(ObservationTimeline(slots, SEEN, delay_key="delay", position_key=keys.POSITION))
+    parts.append(Receiver(longest, aware, registered))
     if aware:
         codes = torch.tensor(DIRECTIONS) * REACH
         parts.append(ActionHistory(longest, keys.ACTION, append_to=keys.OBSERVATION, codes=codes))
     parts.append(StepCounter())
-    return TransformedEnv(SimpleSpread(worlds), Compose(parts))
+    return TransformedEnv(SimpleSpread(worlds, registered=registered), Compose(parts))

@@ -1,10 +1,12 @@
-"""The study ``spread``: what late agents observe, what their critics learn from, and the command line."""
+"""The study ``spread``: what late agents observe, and what their critics learn from."""
+
+from itertools import product
 
 import pytest
 import spread
 import torch
 from simple_spread import AGES, DELAYS, HELD, HORIZON, KINEMATICS, SEEN
-from spread import ARMS, LATE, make_env, make_learner
+from spread import ARMS, SLOTS, make_env, make_learner
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -12,15 +14,20 @@ from damian import keys, set_seed
 from damian.learners.networks import ModelConfig
 
 WORLDS = 3
+LATE = (3, 9)
+
+
+def flown(arm: str) -> TensorDictBase:
+    """Two episodes of an arm whose agents act at random, [T, B]."""
+    torch.manual_seed(0)
+    env = make_env(ARMS[arm], WORLDS, LATE, 9)
+    set_seed(env, 0)
+    return env.rollout(2 * HORIZON, break_when_any_done=False).transpose(0, 1)
 
 
 @pytest.fixture(scope="module")
 def steps() -> TensorDictBase:
-    """Two episodes of the arm ``learnt``, whose agents act at random, [T, B]."""
-    torch.manual_seed(0)
-    env = make_env(ARMS["learnt"], WORLDS, LATE)
-    set_seed(env, 0)
-    return env.rollout(2 * HORIZON, break_when_any_done=False).transpose(0, 1)
+    return flown("history+backupdate")
 
 
 def sent(steps: TensorDictBase, t: int) -> tuple[Tensor, Tensor]:
@@ -55,25 +62,67 @@ def test_each_block_is_late_by_itself_and_agents_begin_with_what_they_see_at_the
     assert steps["next", *keys.DELAY].squeeze(-1).equal(delays.view(-1, WORLDS, 3, 5).amax(-1))
 
 
+def way(steps: TensorDictBase, t: int, then: int, world: int, agent: int, other: int) -> Tensor:
+    """The way from where an agent is at the ``t``-th observation to where another one was ``then``, [2]."""
+    return at(steps, then, KINEMATICS)[world, other, 2:] - at(steps, t, KINEMATICS)[world, agent, 2:]
+
+
+def test_what_is_registered_stands_where_it_was_as_seen_from_where_the_agent_is_now():
+    held, timeline = flown("registered"), flown("timeline")
+    others, known = ([1, 2], [0, 2], [0, 1]), []
+    for t, world, agent, i in product(range(HORIZON + 1), range(WORLDS), range(3), range(2)):
+        block, agents = 5 * agent + 3 + i, (world, agent, others[agent][i])
+        found = at(held, t, keys.OBSERVATION)[world, agent, 4:14].view(5, 2)[3 + i]
+        torch.testing.assert_close(found, way(held, t, newest(held, t, world, block), *agents))
+        slots = at(timeline, t, keys.OBSERVATION)[world, agent, 4 : 4 + 15 * SLOTS].view(5, SLOTS, 3)[3 + i]
+        for k in range(min(SLOTS, t + 1)):
+            known.append(k >= int(sent(timeline, t - k)[1][world, block]))
+            assert slots[k, 2] == known[-1]
+            expected = way(timeline, t, t - k, *agents) if known[-1] else torch.zeros(2)
+            torch.testing.assert_close(slots[k, :2], expected)
+        assert not slots[t + 1 :].any()
+    assert {*known} == {True, False}
+
+
 @pytest.fixture
 def small(monkeypatch) -> None:
     """Few worlds and small networks."""
     monkeypatch.setattr(spread, "WORLDS", 4)
     monkeypatch.setattr(spread, "MODEL", ModelConfig(hidden=[8]))
-    monkeypatch.setattr(spread, "BELIEF", {"prediction_steps": 1, "prediction_batch": 8})
 
 
-@pytest.mark.parametrize("arm", ["backupdate", "learnt"])
-def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm):
-    env = make_env(ARMS[arm], 4, LATE)
+def corrected(arm: str) -> list[TensorDictBase]:
+    """What the learner of an arm learns from, [B, T] each, and [B, T, N, 4 + C + N] for its critic."""
+    env = make_env(ARMS[arm], 4, LATE, 9)
     set_seed(env, 0)
-    learner = make_learner(env, ARMS[arm], 1)
+    learner = make_learner(env, ARMS[arm], 1, 9)
     with torch.no_grad():
         batches = env.rollout(3 * HORIZON, learner.actor, break_when_any_done=False).split(HORIZON, 1)
-    learner.backupdated_batch(batches[0])
-    for batch in batches[1:]:
-        late = learner.backupdated_batch(batch)
-        seen = late["next", *SEEN].view(4, HORIZON, 3, 10)
-        undelayed = torch.cat([late["next", *KINEMATICS], seen, torch.eye(3).expand(4, HORIZON, 3, 3)], -1)
-        assert late["next", *keys.GLOBAL_OBSERVATION].equal(undelayed)
+    return [learner.backupdated_batch(batch) for batch in batches][1:]
+
+
+@pytest.mark.parametrize("arm", ["backupdate", "registered+backupdate", "timeline+backupdate"])
+def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm):
+    for late in corrected(arm):
+        kinematics, critic = late["next", *KINEMATICS], late["next", *keys.GLOBAL_OBSERVATION]
+        seen = late["next", *SEEN].unflatten(2, (3, 5))
+        if "registered" in arm:
+            seen = seen - kinematics[..., 2:].unsqueeze(-2)
+        if "timeline" in arm:
+            slots = critic[..., 4:-3].unflatten(-1, (5, SLOTS, 3))
+            known = torch.arange(SLOTS) <= late["next", "step_count"]
+            assert slots[..., 2].bool().equal(known[:, :, None, None].expand(slots.shape[:-1]))
+            landmarks = slots[..., :3, :, :2]  # they rest, in whichever step they were seen
+            expected = landmarks[..., :1, :] * known[:, :, None, None, :, None]
+            torch.testing.assert_close(landmarks, expected)
+            critic = torch.cat([critic[..., :4], slots[..., 0, :2].flatten(-2), critic[..., -3:]], -1)
+        undelayed = torch.cat([kinematics, seen.flatten(-2), torch.eye(3).expand(4, HORIZON, 3, 3)], -1)
+        assert critic.equal(undelayed)
         assert not late["next", *keys.OBSERVATION][..., :17].equal(undelayed)
+
+
+def test_a_jitter_buffer_holds_each_message_until_it_is_as_old_as_the_longest_delay_in_training():
+    arm = ARMS["buffer"]
+    for delay, longest in (((3, 9), 9), ((0, 0), 9), ((12, 12), 12)):
+        steps = make_env(arm, WORLDS, delay, 9).rollout(HORIZON - 1)
+        assert steps["next", *DELAYS].unique().tolist() == [longest]
