@@ -1,16 +1,20 @@
 """Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed late.
 
-    python examples/studies/control.py --jobs 2                  (Pendulum-v1; half an hour, two free cores)
-    python examples/studies/control.py --arms history bpql       (these arms only)
+    python examples/studies/control.py --jobs 2                  (Pendulum-v1; an hour, two free cores)
+    python examples/studies/control.py --arms history history+bpql         (these arms only)
+    python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out runs/control_random
     python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 --hidden 256 \\
         --lr 3e-4 --episodes 10 --out runs/cheetah               (pip install "gymnasium[mujoco]"; 50 minutes)
     ... --shortest 1 --out runs/cheetah_random                   (delays are drawn from 1 to 9 steps)
 
-Four arms are trained for each seed: undelayed; naive, whose observations are late; history, which also
-observes the agent's latest actions, and the age of the observation if that varies; and bpql, whose actor is
-that of history, but whose critics read only the state, once it has arrived (``BackupdateStorage``). The
-undelayed policy is also evaluated under the delay. The folder gets the mean returns as results.md and
-results.csv, and a JSON file for each arm and seed, with the learning curve.
+These arms are trained for each seed: undelayed; naive, whose observations are late; and three that also
+observe the agent's latest actions: history, with the age of the observation if that varies (an augmented
+state); buffer, which holds each observation until it is as old as the longest delay (a jitter buffer); and
+timeline, with all that has arrived of the latest steps, by when it was true (``ObservationTimeline``), in
+place of the newest observation. With bpql the actor is the same, but the critics read only the state, or the
+timeline, as it is known once it has arrived (``BackupdateStorage``). The undelayed policy is also evaluated
+under the delay. The folder gets the mean returns as results.md and results.csv, and a JSON file for each arm
+and seed, with the learning curve.
 """
 
 import csv
@@ -30,6 +34,7 @@ from torchrl.envs import (
     Compose,
     DoubleToFloat,
     EnvBase,
+    FlattenObservation,
     GymEnv,
     RenameTransform,
     RewardSum,
@@ -43,24 +48,27 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common.tables import markdown_table
-from damian.delays.laws import Uniform
+from damian.delays.laws import Held, Uniform
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
-from damian.replay.backupdate import BackupdateStorage
+from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.time_storage import TimeStorage
 from damian.settings import BpqlConfig
-from damian.transforms import ActionHistory, ObservationDelay, set_seed
+from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline, set_seed
+from damian.transforms.base import Correction, Entries
 
-ARMS = ("undelayed", "naive", "history", "bpql")
+AWARE = ("history", "buffer", "timeline")  # arms that observe their latest actions
+ARMS = ("undelayed", "naive", *AWARE, *(f"{arm}+bpql" for arm in AWARE))
 RANDOM_STEPS = 1000  # steps with random actions before the first update
 CURVE = 10  # points of a learning curve
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 BATCH, GAMMA, TAU = 256, 0.99, 0.005
 OBSERVED = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION)  # of the actor, and the state for critics
-OUTPUTS = (*OBSERVED, "observation", "received", "age", "delay", "step_count", keys.REWARD)
-STORED = [*OBSERVED, "step_count", keys.ACTION, *map(next_key, (*OUTPUTS, *keys.ENDS))]
+SENT = ("observation", "delay")  # in each step, and how late
+OUTPUTS = (*OBSERVED, *SENT, "received", "age", "timeline", "step_count", keys.REWARD)
+STORED = [*OBSERVED, *SENT, "step_count", keys.ACTION, *map(next_key, (*OUTPUTS, *keys.ENDS))]
 
 
 class Task(NamedTuple):
@@ -73,6 +81,10 @@ class Task(NamedTuple):
     """Longest delay [steps]."""
     history: int = 0
     """Number of latest actions that are appended to the actor's observation."""
+    slots: int = 0
+    """Number of latest steps that are observed as a timeline; 0: only the newest observation is."""
+    buffer: bool = False
+    """Is each observation held until it is as old as the longest delay?"""
 
     @property
     def horizon(self) -> int:
@@ -80,11 +92,11 @@ class Task(NamedTuple):
         return gymnasium.spec(self.name).max_episode_steps or 0
 
 
-def make_env(task: Task, worlds: int | None = None) -> EnvBase:
+def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
     """A control task with delayed observations and an action history.
 
     Args:
-        task: the environment, its delays and the number of past actions.
+        task: the environment, its delays, and what is observed.
         worlds: batch size of a ``SerialEnv``; a single environment without a batch size if not given.
 
     Returns:
@@ -96,15 +108,20 @@ def make_env(task: Task, worlds: int | None = None) -> EnvBase:
         return TransformedEnv(GymEnv(task.name), DoubleToFloat())
 
     varies = task.shortest < task.longest
-    late = Uniform(task.shortest, task.longest) if varies else task.longest
-    seen = ["received", "age"] if varies and task.history else ["received"]
+    law = Uniform(task.shortest, task.longest) if varies else task.longest
+    law = Held(law) if task.buffer else law
     transforms: list[Transform] = [
         RewardSum(),
         StepCounter(),
-        ObservationDelay(late, ["observation"], ["received"], delay_key="delay"),
-        CatTensors(["received"], "state", del_keys=False),
-        CatTensors(seen, "observed", del_keys=False),
+        ObservationDelay(law, ["observation"], ["received"], delay_key="delay"),
     ]
+    seen, ages = "received", ["age"] * (varies and task.history > 0 and not task.buffer)
+    if task.slots:
+        transforms.append(ObservationTimeline(task.slots, delay_key="delay"))
+        transforms.append(FlattenObservation(-2, -1, ["timeline"], ["slots"]))
+        seen, ages = "slots", []
+    transforms.append(CatTensors([seen], "state", del_keys=False))
+    transforms.append(CatTensors([seen, *ages], "observed", del_keys=False))
     if task.history:
         transforms.append(ActionHistory(task.history, append_to="observed"))
     # The learner expects these keys; a single agent needs no agent dimension.
@@ -118,16 +135,25 @@ def arrived_states(steps: TensorDictBase, observations: Tensor) -> dict[NestedKe
     return {next_key(keys.GLOBAL_OBSERVATION): observations}
 
 
-def make_learner(env: EnvBase, arm: str, steps: int, delay: int, hidden: int, lr: float = 1e-3) -> Sac:
+def arrived_timelines(entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
+    """The same for critics of timelines, which ``ObservationTimeline`` has corrected, [T, B, K (D + 1)]."""
+    return entries | {next_key(keys.GLOBAL_OBSERVATION): entries[next_key("timeline")].flatten(-2)}
+
+
+def make_learner(
+    env: TransformedEnv, bpql: bool, steps: int, delay: int, hidden: int, lr: float = 1e-3
+) -> Sac:
     """The learner that also trains UAVs: SAC, or BPQL with a storage that learns of states as they arrive."""
-    kind = BpqlConfig if arm == "bpql" else SacConfig
+    kind = BpqlConfig if bpql else SacConfig
     config = kind(lr=lr, alpha_lr=lr, gamma=GAMMA, tau=TAU, alpha_init=1.0)
     model = ModelConfig(hidden=[hidden, hidden], activation="relu")
     setup = LearningSetup(model, 1, 1, 1, critic_key=keys.OBSERVATION)
-    if arm != "bpql":
+    if not bpql:
         return config.make(env, setup, ReplayBuffer(storage=TimeStorage(steps)))
     names = {"message_key": "observation", "received_key": "received", "delay_key": "delay", "age_key": "age"}
-    storage = BackupdateStorage(steps, arrived_states, longest=delay, **names)
+    corrections = corrections_of(env.transform, ["timeline"])
+    corrections += [Correction(arrived_timelines)] * len(corrections)
+    storage = BackupdateStorage(steps, arrived_states, longest=delay, corrections=corrections, **names)
     setup = setup._replace(longest_delay=delay, critic_key=keys.GLOBAL_OBSERVATION)
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
@@ -142,7 +168,7 @@ def train(
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             td = env.rand_action(td) if step < RANDOM_STEPS else learner.actor(td)
             transition, td = env.step_and_maybe_reset(td)
-        learner.buffer.extend(transition.select(*STORED).view(1, 1))  # one world, one step
+        learner.buffer.extend(transition.select(*STORED, strict=False).view(1, 1))  # one world, one step
         if step >= RANDOM_STEPS:
             learner.update(draw(learner))
         bar.update()
@@ -177,11 +203,13 @@ def run_arm(arm: str, seed: int, args: Namespace) -> dict[str, float]:
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     shortest = args.delay if args.shortest is None else args.shortest
-    late = Task(args.env, shortest, args.delay, args.delay if arm in ("history", "bpql") else 0)
+    seen = arm.removesuffix("+bpql")
+    history, slots = args.delay * (seen in AWARE), (args.delay + 1) * (seen == "timeline")
+    late = Task(args.env, shortest, args.delay, history, slots, seen == "buffer")
     task = Task(args.env) if arm == "undelayed" else late
     env = make_env(task)
     set_seed(env, seed)
-    learner = make_learner(env, arm, args.steps, args.delay, args.hidden, args.lr)
+    learner = make_learner(env, arm != seen, args.steps, args.delay, args.hidden, args.lr)
     found = {}
 
     def watch(step: int) -> None:
@@ -191,7 +219,8 @@ def run_arm(arm: str, seed: int, args: Namespace) -> dict[str, float]:
 
     with tqdm(total=args.steps, desc=f"seed {seed} {arm}") as bar:
         train(env, learner, args.steps, bar, watch)
-    flown = {"0": task, str(args.delay): late} if arm == "undelayed" else {str(args.delay): late}
+    name = f"{shortest} to {args.delay}" if shortest < args.delay else str(args.delay)
+    flown = {"0": task, name: late} if arm == "undelayed" else {name: late}
     return found | {name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()}
 
 

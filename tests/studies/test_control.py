@@ -10,12 +10,12 @@ from damian import keys, set_seed
 from damian.learners.sac import Sac
 
 
-def learn(delay: int, history: int, steps: int, arm: str = "history") -> nn.Module:
+def learn(delay: int, history: int, steps: int, bpql: bool = False) -> nn.Module:
     """The policy that is trained with one seed."""
     torch.manual_seed(0)
     env = make_env(Task(shortest=delay, longest=delay, history=history))
     set_seed(env, 0)
-    learner = make_learner(env, arm, steps, delay, 128)
+    learner = make_learner(env, bpql, steps, delay, 128)
     train(env, learner, steps, tqdm(disable=True))
     return learner.actor
 
@@ -26,24 +26,47 @@ DELAY = 3
 LATE = Task(shortest=DELAY, longest=DELAY, history=DELAY)
 
 
-def collected(arm: str, steps: int) -> Sac:
+def collected(task: Task, bpql: bool, steps: int) -> Sac:
     """The learner of an arm after random actions."""
     torch.manual_seed(0)
-    env = make_env(LATE)
+    env = make_env(task)
     set_seed(env, 0)
-    learner = make_learner(env, arm, 1000, DELAY, 8)
+    learner = make_learner(env, bpql, 1000, DELAY, 8)
     train(env, learner, steps, tqdm(disable=True))
     return learner
 
 
-@pytest.mark.parametrize(("arm", "waits"), [("history", 0), ("bpql", DELAY)])
-def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(arm, waits):
-    learner = collected(arm, 20)
+@pytest.mark.parametrize(("bpql", "waits"), [(False, 0), (True, DELAY)])
+def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(bpql, waits):
+    learner = collected(LATE, bpql, 20)
     learner.buffer.storage.steps["next", *keys.REWARD][:20] = torch.arange(20.0).view(20, 1, 1)
     drawn = draw(learner)["next", *keys.REWARD].unique()
     assert drawn.tolist() == [*range(20 - waits)]
-    read = {"history": keys.OBSERVATION, "bpql": keys.GLOBAL_OBSERVATION}[arm]
+    read = keys.GLOBAL_OBSERVATION if bpql else keys.OBSERVATION
     assert learner.loss.qvalue_network.in_keys == [read, keys.ACTION]
+
+
+def test_critics_of_timelines_read_what_was_true_when_and_actors_what_had_arrived_of_it():
+    slots = DELAY + 1
+    learner = collected(Task(shortest=1, longest=DELAY, history=DELAY, slots=slots), True, 20)
+    steps = learner.buffer.storage.steps[: 20 - DELAY, 0]
+    sent = torch.cat([steps["observation"][:1], steps["next", "observation"]])
+    critic, actor = (
+        torch.cat([steps[key][:1], steps["next", *key]])[:, : 4 * slots].view(-1, slots, 4)
+        for key in (keys.GLOBAL_OBSERVATION, keys.OBSERVATION)
+    )
+    for t in range(1, len(sent)):
+        for k in range(slots):
+            known = torch.cat([sent[t - k], torch.ones(1)]) if k <= t else torch.zeros(4)
+            assert critic[t, k].equal(known)
+            assert actor[t, k].equal(known) or not actor[t, k].any()
+        assert not actor[t, 0].any()
+        assert actor[t, DELAY].equal(critic[t, DELAY])
+
+
+def test_a_jitter_buffer_shows_observations_as_old_as_the_longest_delay():
+    steps = make_env(Task(shortest=1, longest=DELAY, buffer=True)).rollout(8)["next"]
+    assert steps["age"].flatten().tolist() == [1, 2, 3, 3, 3, 3, 3, 3]
 
 
 @pytest.mark.slow
@@ -53,6 +76,6 @@ def test_delay_lowers_the_return_and_the_action_history_restores_it():
     assert returns[0] > -300
     assert returns[6] < returns[0] - 300
     naive = evaluate_under(Task(shortest=6, longest=6), learn(delay=6, history=0, steps=12_000), 20)
-    for arm, steps in (("history", 12_000), ("bpql", 8_000)):
-        aware = evaluate_under(Task(shortest=6, longest=6, history=6), learn(6, 6, steps, arm), 20)
-        assert aware > naive + 300, arm
+    for bpql, steps in ((False, 12_000), (True, 8_000)):
+        aware = evaluate_under(Task(shortest=6, longest=6, history=6), learn(6, 6, steps, bpql), 20)
+        assert aware > naive + 300, bpql
