@@ -22,7 +22,7 @@ from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
 
 GRU = ModelConfig(hidden=[16, 8], rnn="gru")
-ROUNDING = 1e-5
+ROUNDING = 3e-5
 """Largest difference between numbers that are computed step by step and in one batch."""
 OBSERVATION, ACTION = (("agents", name) for name in ("observation", "action"))
 

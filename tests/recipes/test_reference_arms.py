@@ -29,6 +29,7 @@ from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.settings import ClockConfig, ScenarioConfig, TrainConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
@@ -80,9 +81,9 @@ def test_delays_and_losses_do_not_change_the_privileged_observation(motion, orde
         "delay": DelayConfig(obs=BURST, loss=0.3, order=order, history=2, rew=1),
         "clock": ClockConfig(server="2s"),
     }
+    same = {"episode": KEEPS_GOING, "observation": ObservationConfig(list(LOCAL), list(GLOBAL))}
     undelayed, delayed = (
-        rollout_of(everything(motion, episode=KEEPS_GOING, **sections), ("privileged",))
-        for sections in ({}, late)
+        rollout_of(everything(motion, **same, **sections), ("privileged",)) for sections in ({}, late)
     )
     held = ("agents", "global_observation")
     assert not all(one[held].equal(other[held]) for one, other in zip(undelayed, delayed, strict=True))

@@ -195,7 +195,7 @@ def test_actions_that_lead_nowhere_are_refused_unless_there_is_one_landing_point
     def build(distance, kept=None):
         region = RegionConfig("vertices", vertices=SQUARE, n_landing_points=kept, initial_conditions=1)
         actions = ActionConfig(kind, distances=[0.0, distance], headings=[90.0])
-        return Simulation(WorldConfig(agents=1, region=region, actions=actions), 1.0, trail=1, seed=0)
+        return Simulation(WorldConfig(agents=1, region=region, actions=actions), 1.0, stops=1, seed=0)
 
     with pytest.raises(InputError, match=r"actions.distances: .* lead from no landing point"):
         build(10.0)

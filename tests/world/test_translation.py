@@ -41,7 +41,7 @@ def simulation(vertices, offset, kind):
             actions=ActionConfig(kind=kind),
         ),
         dt=1.0,
-        trail=2,
+        stops=2,
         seed=0,
     )
 
