@@ -8,6 +8,7 @@ import reprlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,12 @@ MAX_COLUMNS = 1000
 """Most columns of a table."""
 MAX_LINE = 1000
 """Characters of an error; the middle of a longer one is left out."""
+
+
+def data_file(path: str) -> str:
+    """The file of a path; one that begins with ``damian:`` is among the package's own."""
+    shipped = path.removeprefix("damian:")
+    return path if shipped == path else str(files("damian") / "data" / shipped)
 
 
 def read_text(file: Path) -> str:

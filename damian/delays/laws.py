@@ -15,7 +15,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.registry import Registry
-from damian.common.text_files import named, parse_table, read_text
+from damian.common.text_files import data_file, named, parse_table, read_text
 from damian.delays.samplers import (
     ContextSampler,
     HeldSampler,
@@ -215,12 +215,13 @@ class Trace(Law):
     """
 
     path: str = ""
-    """CSV table with a column ``delay``: steps, times with their unit, or ``lost``."""
+    """CSV table with a column ``delay``: steps, times with their unit, or ``lost``. That of the package is
+    ``damian:queue_trace.csv``."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
         with named(str(self.path)):
-            rows = parse_table(read_text(Path(str(self.path))), ["delay"])
+            rows = parse_table(read_text(Path(data_file(str(self.path)))), ["delay"])
             checks.require(bool(rows), "delay", "the column", "is empty")
             written = {f"line {row.line}: delay": row.cells["delay"] for row in rows}
             delays = [-1 if d == LOST else in_steps(at, _number(d), dt) for at, d in written.items()]

@@ -1,13 +1,16 @@
 """Delay laws: frequencies of delays and losses, playback of traces, and how a setting becomes a law."""
 
 import math
+from importlib.resources import files
 
 import pytest
 import torch
 from delay_twin import drawn
 from torch import Tensor
 
+from damian import compose_scenario
 from damian.common import counter_rng
+from damian.delays.config import delay_sampler
 from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform, in_steps, law_of
 from damian.delays.samplers import Sampler
 
@@ -110,6 +113,17 @@ def test_a_trace_is_played_in_order_from_a_random_start_and_wraps_around(tmp_pat
     rotations = [recorded[k:] + recorded[:k] for k in range(7)]
     assert sorted(first_rounds) == sorted(map(tuple, rotations))
     assert all(row == (row[:7] * 3)[:20] for row in delays)
+
+
+def test_the_measured_trace_of_the_package_is_played_back():
+    rows = (files("damian") / "data" / "queue_trace.csv").read_text(encoding="utf-8").split()[1:]
+    arrive = [float(row.removesuffix("s")) for row in rows if row != "lost"]
+    measured = delay_sampler(compose_scenario("delay=measured").delay, "obs", 1.0)
+    assert 1000 <= len(rows) <= 3000
+    assert measured.longest == math.ceil(max(arrive)) == 8
+    played = sample(measured, 2, len(rows)).T.tolist()
+    expected = sorted([*map(math.ceil, arrive), *[measured.lost] * (len(rows) - len(arrive))])
+    assert all(sorted(row) == expected for row in played)
 
 
 def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):

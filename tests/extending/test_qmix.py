@@ -3,10 +3,10 @@
 import csv
 import importlib
 import sys
+from pathlib import Path
 
 import pytest
 import torch
-from conftest import EXAMPLES
 from extensions import TINY
 from helpers import everything, learning
 from tensordict import TensorDict
@@ -17,6 +17,8 @@ from damian.envs.uav_env import UavEnv
 from damian.replay.time_storage import TimeStorage
 from damian.settings import ModelConfig
 from damian.world.landing import ActionConfig
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
 
 
 @pytest.fixture

@@ -2,12 +2,12 @@
 
 import inspect
 from collections.abc import Callable
-from importlib.resources import files
 
 import numpy as np
 
 from damian.common import checks
 from damian.common.registry import Registry
+from damian.common.text_files import data_file
 from damian.settings.world import RegionConfig
 from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
@@ -37,12 +37,12 @@ def _region_of_vertices(config: RegionConfig, rng: np.random.Generator) -> list[
 
 @REGION_SOURCES.register("fir")
 def _region_of_fir_table(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    return [read_fir(_file(config.path), config.id)]
+    return [read_fir(data_file(config.path), config.id)]
 
 
 @REGION_SOURCES.register("geojson")
 def _region_of_map(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    return [read_area(_file(config.path), config.index, config.where)]
+    return [read_area(data_file(config.path), config.index, config.where)]
 
 
 def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
@@ -52,9 +52,3 @@ def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     most, problem = config.initial_conditions, "regions: each needs at least one initial condition"
     checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
     return found
-
-
-def _file(path: str) -> str:
-    """The file of a path; one that begins with ``damian:`` is among the package's own."""
-    shipped = path.removeprefix("damian:")
-    return path if shipped == path else str(files("damian") / "data" / shipped)
