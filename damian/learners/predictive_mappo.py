@@ -109,7 +109,7 @@ class PredictiveMappo(Mappo):
 # The actor.
 
 FLAGS = 3
-"""Columns that follow those of a message: whether it has arrived, its age, and whether it is one's own."""
+"""Columns that follow those of a message: whether it has arrived, its age, and whether the receiver sent it."""
 CODE_SIZE = 8
 """Size of the learnt code of a discrete action."""
 PREFERENCE_UNIT = 30.0

@@ -75,7 +75,7 @@ class ObservationTimeline(StatefulTransform):
         own: bool = False,
     ) -> None:
         checks.whole("slots", slots, 1)
-        should = "goes with messages of one's own only: leave out group"
+        should = "goes with messages of the observer alone: leave out group"
         checks.require(position_key is None or not group, "position_key", position_key, should)
         super().__init__(message_key)
         self.slots, self.encode, self.group, self.own = slots, encode, group, own
