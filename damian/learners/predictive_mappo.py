@@ -109,7 +109,7 @@ class PredictiveMappo(Mappo):
 # The actor.
 
 FLAGS = 3
-"""Columns that follow those of a message: whether it has arrived, its age, and whether the receiver sent it."""
+"""Columns that follow those of a message: has it arrived, its age, and did the receiver send it."""
 CODE_SIZE = 8
 """Size of the learnt code of a discrete action."""
 PREFERENCE_UNIT = 30.0
