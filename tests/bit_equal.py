@@ -5,7 +5,7 @@
     python tests/bit_equal.py record after.json flights    # only cases whose name has this word
     python tests/bit_equal.py compare before.json after.json
 
-A record holds a digest of every entry of 51 rollouts with random actions, and the numbers that 11 trainings
+A record holds a digest of every entry of 54 rollouts with random actions, and the numbers that 13 trainings
 wrote. It is good on one machine only: another processor rounds in another way.
 """
 
@@ -41,6 +41,9 @@ OTHERS = [
     ["scenario=tracking", "links=matrix", "delay=paper"],
     ["scenario=tracking", "links=updown", "delay=paper"],
     ["scenario=spotting", "clock.agents=4", "clock.server=2", "delay=paper"],
+    ["scenario=delaybench/crowded", "aware=timeline", "delay.obs={law: uniform, low: 1, high: 7}"],
+    ["scenario=delaybench/flights", "aware=timeline", "delay=lag", "delay.act=2"],
+    ["scenario=tracking", "aware=timeline", "links=matrix", "delay=paper"],
 ]
 TRAININGS = [
     ["scenario=spotting", "aware=belief", "delay=paper"],
@@ -54,6 +57,13 @@ TRAININGS = [
     ["scenario=tracking", "learner=bpql", "delay.obs=2", "aware=both"],
     ["scenario=tracking", "learner=predictive_mappo", "delay=paper", "delay.messages=4", "aware=backupdate"],
     ["scenario=paper/usecase2", "delay=paper", "aware=both", "corrected=[reward,critic,actor]"],
+    ["scenario=delaybench/crowded", "delay=burst", "aware=timeline"],
+    [
+        "scenario=delaybench/flights",
+        "delay.obs={law: uniform, low: 1, high: 7}",
+        "aware=timeline",
+        "model=gru",
+    ],
 ]
 TRAINED = ("loss", "kl", "entropy", "return", "success", "steps", "age")
 """Beginnings and endings of the columns of metrics.csv and result.csv that count."""
