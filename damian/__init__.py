@@ -8,17 +8,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from damian.delays.config import DelayConfig
     from damian.delays.laws import Burst, Constant, Distance, Function, Geometric, Lag, Law, Trace, Uniform
     from damian.delays.samplers import ContextSampler, MessageContext, Sampler, TableSampler
+    from damian.envs.config import ClockConfig, ScenarioConfig
     from damian.envs.pipeline import make_env
     from damian.envs.uav_env import UavEnv
+    from damian.learners.config import LearnerConfig, LearningSetup
     from damian.recipes.evaluate import load  # type: ignore[import-not-found]
     from damian.recipes.results import results  # type: ignore[import-not-found]
     from damian.recipes.shared.environments import compose_scenario  # type: ignore[import-not-found]
     from damian.replay.backupdate import BackupdateStorage
     from damian.server.features import feature
     from damian.server.rewards import reward_term
-    from damian.settings import ClockConfig, DelayConfig, LearnerConfig, LearningSetup, ScenarioConfig
     from damian.transforms import (
         ActionDelay,
         ActionHistory,
@@ -51,7 +53,10 @@ _MODULES = {
         "Uniform",
     ],
     "damian.delays.samplers": ["ContextSampler", "MessageContext", "Sampler", "TableSampler"],
+    "damian.delays.config": ["DelayConfig"],
+    "damian.envs.config": ["ClockConfig", "ScenarioConfig"],
     "damian.envs.pipeline": ["make_env"],
+    "damian.learners.config": ["LearnerConfig", "LearningSetup"],
     "damian.envs.uav_env": ["UavEnv"],
     "damian.recipes.evaluate": ["load"],
     "damian.recipes.results": ["results"],
@@ -59,7 +64,6 @@ _MODULES = {
     "damian.replay.backupdate": ["BackupdateStorage"],
     "damian.server.features": ["feature"],
     "damian.server.rewards": ["reward_term"],
-    "damian.settings": ["ClockConfig", "DelayConfig", "LearnerConfig", "LearningSetup", "ScenarioConfig"],
     "damian.transforms": [
         "ActionDelay",
         "ActionHistory",

@@ -40,10 +40,10 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.delays.law_fit import fit_laws
-from damian.settings.programs import AdviseConfig, check_token
 from damian.world.vehicles import MOTION_MODELS
 
 from . import cli
+from .config import AdviseConfig, check_token
 from .evaluate import stored_actor
 from .known import key_of
 from .shared.runs import run_folder, save_config, stored_values

@@ -34,14 +34,14 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import YAMLError
 
 from damian.common.errors import RUN_ERROR, InputError, RunError
+from damian.common.fields import Settings, is_whole, rules
 from damian.common.registry import stored_settings
 from damian.common.text_files import one_line, show
+from damian.learners.config import LEARNERS
 from damian.runs.interrupt import end_interrupted, number_of
 from damian.runs.run_lock import locked
-from damian.settings import LEARNERS, TrainConfig
-from damian.settings.fields import Settings, is_whole, rules
-from damian.settings.programs import SEARCHES
 
+from .config import SEARCHES, TrainConfig
 from .known import (
     CHOSEN,
     CONF,

@@ -21,11 +21,11 @@ from damian.compare.comparison import (
     Comparison,
     Row,
 )
+from damian.compare.config import SEEDS, CompareConfig, HeldOut
 from damian.compare.figures import plot_curves, plot_matrix, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.interrupt import end_interrupted, number_of
-from damian.settings.programs import SEEDS, CompareConfig, HeldOut
 
 from . import cli
 from .evaluate import fly, fly_untrained

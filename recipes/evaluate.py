@@ -21,9 +21,9 @@ from damian.learners.recurrent import add_recurrent_state
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, save_results
 from damian.runs.training_state import load_networks
-from damian.settings import TrainConfig
 
 from . import cli
+from .config import TrainConfig
 from .shared.runs import save_config, with_policy_of
 from .shared.settings import check_components
 

@@ -30,10 +30,11 @@ from damian import keys
 from damian.common import checks
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError, naming_errors
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.runs.run_folder import RESULTS
 from damian.server.features import feature_of
-from damian.settings import ActionConfig, ScenarioConfig
+from damian.world.config import ActionConfig
 from damian.world.landing import action_table
 
 from . import cli

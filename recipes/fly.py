@@ -19,11 +19,10 @@ from tqdm import tqdm
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
+from damian.common.field_rules import FieldRules
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
-from damian.settings import TrainConfig
-from damian.settings.programs import FILMS, AdviseConfig, FieldRules, FlyConfig
 from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
 from damian.show.film import save_film
@@ -31,6 +30,7 @@ from damian.show.geojson import origin_of, save_geojson
 from damian.show.replay_page import save_page
 
 from . import cli
+from .config import FILMS, AdviseConfig, FlyConfig, TrainConfig
 from .evaluate import stored_actor
 from .known import key_of
 from .shared.runs import save_config, without

@@ -16,10 +16,12 @@ from typing import Any, NoReturn
 import yaml
 
 from damian.common.errors import InputError
+from damian.common.fields import default_of, rules
 from damian.common.text_files import read_text, show
-from damian.settings import LEARNERS, TrainConfig
-from damian.settings.fields import default_of, rules
-from damian.settings.programs import AdviseConfig, CompareConfig, FlyConfig, TuneConfig
+from damian.compare.config import CompareConfig
+from damian.learners.config import LEARNERS
+
+from .config import AdviseConfig, FlyConfig, TrainConfig, TuneConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 """Folder of the configuration files."""

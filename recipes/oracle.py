@@ -22,9 +22,9 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import save_results
 from damian.server.belief import SourceGrid
-from damian.settings import TrainConfig
 
 from . import cli
+from .config import TrainConfig
 from .shared.runs import save_config
 
 KNOWN_ON_TIME = ("what has arrived", "its own messages", "all messages", "the source's place")

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from damian import keys
 from damian.common import checks
 from damian.common.errors import RunError
+from damian.common.fields import leaves
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay
 from damian.keys import next_key
@@ -34,10 +35,9 @@ from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
 from damian.runs.training_state import RandomState, TrainingState, load_networks
 from damian.server.trial import not_finite
-from damian.settings import TrainConfig
-from damian.settings.fields import leaves
 
 from . import cli
+from .config import TrainConfig
 from .evaluate import make_eval_env, own_code, report
 from .shared.collectors import learning_env, make_collector, read_by, ticks
 from .shared.runs import names_own_code, run_folder, save_config, stored_values

@@ -21,11 +21,10 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.tables import csv_table, markdown_table
 from damian.runs.interrupt import end_interrupted, number_of
-from damian.settings import TrainConfig
-from damian.settings.programs import TuneConfig
 
 from . import cli
 from .compare import POLICIES
+from .config import TrainConfig, TuneConfig
 from .known import key_of, known_settings, no_such_key
 from .shared.many_runs import Run, perform_each
 from .shared.settings import check_learning

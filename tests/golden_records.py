@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import torch
 from helpers import GOLDEN, nearest
 
+from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ServerContext
 from damian.server.rewards import Counters
-from damian.settings import ScenarioConfig
 from damian.world.battery import BatteryConfig
 from damian.world.messages import Messages
 

@@ -13,18 +13,18 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from twin import Uav
 
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig, ServerContext
 from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig, ScenarioConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.state import State
 

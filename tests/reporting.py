@@ -14,9 +14,9 @@ from damian.advice.fleet import Fleet
 from damian.advice.known import Ground
 from damian.advice.node import Node
 from damian.advice.rows import Report, Rows, reports_of, rows_of_json
+from damian.common.field_rules import FieldRules
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.settings import ScenarioConfig
-from damian.settings.programs import FieldRules
 
 START = 1.7e9
 """When the simulated flights begin [s since 1970]."""

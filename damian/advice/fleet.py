@@ -30,9 +30,9 @@ from damian.advice.orders import (
 from damian.advice.rows import Acknowledgement, Advice, FleetStatus, Report, UavStatus, written
 from damian.common.checks import SECONDS
 from damian.common.errors import InputError
+from damian.common.field_rules import FieldRules
 from damian.common.text_files import listed, show
 from damian.learners.recurrent import AgentGRU
-from damian.settings.programs import FieldRules
 from damian.world.battery import flight_drain
 from damian.world.messages import Messages
 from damian.world.state import State

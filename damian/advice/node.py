@@ -16,11 +16,11 @@ from damian import keys
 from damian.advice.known import Ground
 from damian.common import checks
 from damian.common.tensors import tree_map
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import observation_transforms, remembering_transforms, uplink_transform
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Features
-from damian.settings import ScenarioConfig
 from damian.transforms import ObservationTimeline, StatefulTransform
 from damian.transforms.base import act, begin, observe
 from damian.transforms.server_node import Belief, ServerNode

@@ -44,9 +44,9 @@ from damian.advice.rows import (
 )
 from damian.common.atomic_files import UNFINISHED, writing
 from damian.common.errors import InputError, RunError, described
+from damian.common.field_rules import FieldRules
 from damian.common.text_files import named, show
 from damian.runs.run_lock import locked
-from damian.settings.programs import FieldRules
 
 MAY_DIFFER = {
     *("reports", "port", "host", "token", "uavs", "journal"),

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from damian.compare.config import LESS_IS_BETTER, Arm
 from damian.compare.statistics import (
     LEAST_GAP,
     Floats,
@@ -18,7 +19,6 @@ from damian.compare.statistics import (
     recovery,
 )
 from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED
-from damian.settings.programs import LESS_IS_BETTER, Arm
 
 TRAINED_DETERMINISTIC, UNTRAINED_DETERMINISTIC = TRAINED + DETERMINISTIC, UNTRAINED + DETERMINISTIC
 SCRIPTED = (RANDOM, SCRIPT)

@@ -1,47 +1,99 @@
-"""The delay laws of a scenario and of its links, as the settings say."""
+"""Settings of what is late, and when: delays, links and clocks."""
 
-from damian import keys
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
 from damian.common import checks
-from damian.delays.laws import LOSES, Held, Law, law_of, sampler_of
-from damian.delays.samplers import Sampler
-from damian.settings.delays import DelayConfig, LinkConfig, is_matrix
+from damian.common.fields import Settings, setting
 
-CONTEXT_KEYS = {"position": keys.POSITION}
-"""TensorDict keys of the entries that a delay law of a scenario may read, by the name in ``reads``."""
-DELAYED = ("obs", "act", "rew")
-"""What a scenario delays: messages, actions, rewards."""
+LONGEST = 10_000
+"""Longest delay allowed [steps], because every message in transit takes memory."""
+LAWS = "{law: uniform, low: 3s, high: 7s}"
 
 
-def delay_law(delay: DelayConfig, name: str) -> Law:
-    """The law of ``act``, of ``rew``, or of ``obs`` with ``hold`` applied."""
-    law = law_of(getattr(delay, name), f"delay.{name}")
-    return Held(law) if name == "obs" and delay.hold == "max" else law
+@dataclass
+class DelayConfig(Settings):
+    """Delays and how they are handled (paper, sections 3.3 to 3.5).
+
+    A delay is written as steps such as 3, as a time such as 3s, or as a distribution such as
+    {law: uniform, low: 3s, high: 7s}: constant, uniform, geometric, burst, trace, lag, distance
+    (docs/concepts.md), or one of your own (docs/extending.md).
+    """
+
+    section: ClassVar[str] = "delay"
+
+    obs: Any = setting(0, f"Delay of messages to the server: 3 (steps), 3s, or {LAWS}.")
+    act: Any = setting(0, "Delay of actions, written as ``obs``; a UAV holds until the first one arrives.")
+    rew: Any = setting(0, "Delay of rewards, written as ``obs``; none may be lost.")
+    loss: float = setting(0.0, "Probability that a message to the server node is lost.", low=0, high=1)
+    hold: str = setting(
+        "none",
+        "``max``: the server holds messages back until the longest delay of ``obs`` has passed.",
+        choices=("none", "max"),
+    )
+    order: str = setting(
+        "generation",
+        "Which message the server holds: that generated last (generation), or arrived last (arrival).",
+        choices=("generation", "arrival"),
+    )
+    history: int = setting(0, "Number of its latest actions that a UAV observes.", low=0, high=1000)
+    messages: int = setting(0, "Latest steps whose messages predictive_mappo gets.", low=0, high=1000)
+    reward_window: int = setting(
+        1, "Steps over which rewards are summed (eq. 4) [steps].", low=1, high=LONGEST
+    )
+    reward_discount: float = setting(0.9, "Discount factor of that sum (eq. 4).", above=0, high=1)
 
 
-def delay_sampler(delay: DelayConfig, name: str, dt: float) -> Sampler:
-    """The sampler of this law for steps of ``dt`` seconds, without the losses of ``loss``."""
-    return sampler_of(delay_law(delay, name), dt, key=f"delay.{name}")
+@dataclass
+class LinkConfig(Settings):
+    """How observations reach the UAVs. Rewards and the critic always follow from what the server holds."""
+
+    section: ClassVar[str] = "links"
+
+    kind: str = setting(
+        "server",
+        "Observations come from the server at once (server), with a delay (updown), or from UAVs (matrix).",
+        choices=("server", "updown", "matrix"),
+    )
+    delay: Any = setting(
+        0, "Delay of a link, as delay.obs; for matrix also a list per receiver.", kinds=("updown", "matrix")
+    )
+    loss: Any = setting(0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix"))
+    range: float | None = setting(
+        None, "A UAV hears only UAVs within this distance when they send [m].", above=0, kinds=("matrix",)
+    )
+    hears: Any = setting(None, "Whom UAVs hear: per receiver a list of true and false.", kinds=("matrix",))
+    limit: int | None = setting(
+        None, "At most so many UAVs of a world, drawn, send in a step.", low=1, high=1000, kinds=("matrix",)
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.refuse_unread()
+        if self.kind == "updown" or not is_matrix(self.loss):
+            checks.in_range("links.loss", self.loss, 0.0, 1.0)
+        both = self.range is not None and self.hears is not None
+        self.refuse(both, "range", "does not go with links.hears: leave out one of them")
+
+    def check(self, n_agents: int) -> None:
+        """Check what is given for each pair of UAVs."""
+        self.refuse(self.hears is not None and not is_matrix(self.hears), "hears", "is not a list")
+        for name in ("delay", "loss", "hears"):
+            rows = getattr(self, name)
+            if not is_matrix(rows):
+                continue
+            square = len(rows) == n_agents and all(is_matrix(row) and len(row) == n_agents for row in rows)
+            problem = f"is not {n_agents} lists (receivers) of {n_agents} entries (senders)"
+            self.refuse(not square, name, problem)
+            for entry in itertools.chain(*rows):
+                wrong = name == "hears" and not isinstance(entry, bool)
+                self.refuse(wrong, name, "has an entry that is neither true nor false")
+                if name == "loss":
+                    checks.in_range("links.loss", entry, 0.0, 1.0)
 
 
-def delay_reads(delay: DelayConfig, dt: float) -> set[str]:
-    """Names of the entries that the laws read in the contexts of messages."""
-    return {read for name in DELAYED for read in delay_sampler(delay, name, dt).reads}
-
-
-def check_laws(delay: DelayConfig, dt: float) -> None:
-    """Check that every law is valid for steps of ``dt`` seconds."""
-    for name in DELAYED:
-        for read in delay_sampler(delay, name, dt).reads:
-            problem = f"reads {read}, but a law can read only {', '.join(CONTEXT_KEYS)}"
-            checks.require(read in CONTEXT_KEYS, f"delay.{name}", getattr(delay, name), problem)
-    checks.require(not delay_sampler(delay, "rew", dt).loses, "delay.rew", delay.rew, LOSES)
-
-
-def link_reads(links: LinkConfig, dt: float) -> set[str]:
-    """Names of the entries that the links read: what their laws do, and positions for a range."""
-    written = {"links.delay": links.delay}
-    if is_matrix(links.delay):
-        rows = [enumerate(row) for row in links.delay]
-        written = {f"links.delay[{i}][{j}]": law for i, row in enumerate(rows) for j, law in row}
-    read = {name for key, law in written.items() for name in sampler_of(law, dt, key=key).reads}
-    return read | ({"position"} if links.range is not None else set())
+def is_matrix(written: Any) -> bool:
+    """Is a setting of the links given for each pair of UAVs, as a list or a tensor?"""
+    return getattr(written, "ndim", 0) > 0 or (isinstance(written, Sequence) and not isinstance(written, str))

@@ -14,8 +14,10 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.common.fields import rules, setting
 from damian.common.registry import Registry
 from damian.common.text_files import data_file, named, parse_table, read_text
+from damian.delays.config import LONGEST, is_matrix
 from damian.delays.samplers import (
     ContextSampler,
     HeldSampler,
@@ -26,8 +28,6 @@ from damian.delays.samplers import (
     Sampler,
     TableSampler,
 )
-from damian.settings.delays import LONGEST, is_matrix
-from damian.settings.fields import rules, setting
 
 Delay = int | str
 """Whole steps (``3``), or a time with its unit (``"3s"``)."""

@@ -21,12 +21,12 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
-from damian.delays.config import CONTEXT_KEYS, check_laws, delay_law, delay_reads, delay_sampler, link_reads
 from damian.delays.laws import law_of, sampler_of
+from damian.delays.scenario import CONTEXT_KEYS, check_laws, delay_law, delay_reads, delay_sampler, link_reads
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.uav_env import ALL_EXTRAS, UavEnv, make_simulation
+from damian.envs.uav_env import ALL_EXTRAS, UavEnv, make_server, make_simulation
 from damian.server.server import Server
-from damian.settings import ScenarioConfig
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
@@ -67,7 +67,7 @@ def make_env(
     needed |= {"position"} if delay_reads(scenario.delay, dt) | link_reads(scenario.links, dt) else set()
     check_laws(scenario.delay, scenario.clock.dt)
     simulation = make_simulation(scenario, seed)
-    server = Server(scenario, simulation)
+    server = make_server(scenario, simulation)
     env = UavEnv(
         scenario,
         num_worlds,

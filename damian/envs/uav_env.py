@@ -14,10 +14,10 @@ from torchrl.envs import EnvBase
 from damian import keys
 from damian.common import checks, counter_rng, devices
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
+from damian.envs.config import ScenarioConfig
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
 from damian.server.trial import try_own_components
-from damian.settings import ScenarioConfig
 from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State
@@ -33,6 +33,12 @@ EXTRAS = ("message", "state", "reward_terms")
 
 ALL_EXTRAS = (*EXTRAS, "position", "privileged")
 """All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments only."""
+
+
+def make_server(scenario: ScenarioConfig, simulation: Simulation) -> Server:
+    """The server of a scenario, which computes observations and rewards from messages."""
+    of = scenario
+    return Server(simulation, of.observation, of.reward, of.episode, of.time_scale)
 
 
 class UavEnv(EnvBase):
@@ -87,7 +93,7 @@ class UavEnv(EnvBase):
         checks.device("device", str(device))
         self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         self.simulation = simulation or make_simulation(self.scenario, seed)
-        self.server = server or Server(self.scenario, self.simulation)
+        self.server = server or make_server(self.scenario, self.simulation)
         try_own_components(self.server, self.simulation)
         problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
         known = messages_only or self.server.grid is None

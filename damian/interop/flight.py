@@ -14,9 +14,9 @@ from torchrl.envs.utils import step_mdp
 from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.settings import ScenarioConfig
 from damian.show.film import LiveFilm
 
 RENDER_MODES = ("rgb_array",)

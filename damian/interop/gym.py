@@ -8,8 +8,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from damian.common import checks
+from damian.envs.config import ScenarioConfig
 from damian.interop.flight import METADATA, Array, Flight, actions_in, row
-from damian.settings import ScenarioConfig
 
 
 class UavGymEnv(gymnasium.Env[Array, Any]):

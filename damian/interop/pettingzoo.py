@@ -6,8 +6,8 @@ import numpy as np
 from gymnasium.spaces import Space
 
 from damian.common.errors import InputError
+from damian.envs.config import ScenarioConfig
 from damian.interop.flight import METADATA, Array, Flight, actions_in, row
-from damian.settings import ScenarioConfig
 
 try:
     from pettingzoo import ParallelEnv

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
-from damian.settings.learners import LEARNERS, LearnerConfig, LearningSetup  # noqa: F401
+from damian.learners.config import LEARNERS, LearnerConfig, LearningSetup  # noqa: F401
 
 
 class Learner(Protocol):

@@ -16,12 +16,12 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from damian import keys
 from damian.common.compiling import compiled
 from damian.learners.base import LearningSetup
+from damian.learners.config import MappoConfig
 from damian.learners.networks import COMPILE_OPTIONS, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
 from damian.learners.reward_scale import update_value_scale, value_scale
 from damian.learners.schedule import LinearSchedule
 from damian.replay.backupdate import BackupdateStorage
-from damian.settings.learners import MappoConfig
 
 LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
 """Names of the terms of the loss (``mappo_losses``)."""

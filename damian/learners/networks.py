@@ -16,9 +16,9 @@ from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
 from damian.common import checks
+from damian.learners.config import ModelConfig
 from damian.learners.recurrent import AgentGRU
 from damian.learners.reward_scale import NormalizedValue
-from damian.settings.learners import ModelConfig
 
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding

@@ -20,11 +20,11 @@ from damian.common import checks
 from damian.common.tensors import expand_mask, gather_rows, next_true
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
+from damian.learners.config import PredictiveMappoConfig
 from damian.learners.mappo import LOSS_KEYS, Mappo
 from damian.learners.networks import POLICY_GAIN, ModelConfig, hidden_layers, make_mlp, with_distribution
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
-from damian.settings.learners import PredictiveMappoConfig
 
 
 class PredictiveMappo(Mappo):

@@ -15,11 +15,11 @@ from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 from damian import keys
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
+from damian.learners.config import SacConfig
 from damian.learners.networks import ModelConfig, make_mlp
 from damian.learners.reward_scale import ReturnScale
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
-from damian.settings.learners import SacConfig
 
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 """Terms of the loss, by their names in TorchRL's losses."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.settings.delays import ClockConfig
+from damian.envs.config import ClockConfig
 
 
 class SystemClock:

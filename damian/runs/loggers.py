@@ -11,7 +11,7 @@ from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry, check_parameters
-from damian.settings import LoggerConfig
+from damian.runs.config import LoggerConfig
 
 
 class Logger(Protocol):

@@ -20,7 +20,7 @@ from damian.server.belief import (
     first_belief,
     report_rows,
 )
-from damian.settings.server import GLOBAL_FEATURES, LOCAL_FEATURES, ObservationConfig
+from damian.server.config import GLOBAL_FEATURES, LOCAL_FEATURES, ObservationConfig
 from damian.world.battery import BatteryConfig, observed
 from damian.world.coverage import (
     FootprintTables,

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.registry import Registry, check_parameters, name_of
+from damian.server.config import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.features import FEATURES
 from damian.server.termination import Status
-from damian.settings.server import INDIVIDUAL, SYSTEM, RewardConfig
 
 
 class Counters(NamedTuple):

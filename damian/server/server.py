@@ -13,6 +13,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import (
     ServerContext,
     check_features,
@@ -24,7 +25,6 @@ from damian.server.features import (
 from damian.server.rewards import Counters, features_read, final_reward, reward
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
-from damian.settings.scenario import ScenarioConfig
 from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.simulation import Simulation
@@ -55,18 +55,26 @@ class Server:
     In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of the episode
     [*], ``source_over`` tells whether the source has finished its walk [*], ``coverage`` is that of an
     earlier step of the same worlds, which saves time, and ``belief`` the probability that the source is in
-    each cell of ``grid`` [*, K]; without it, these are the first messages of the episode.
+    each cell of ``grid`` [*, K]; without it, these are the first messages of the episode. ``time_scale`` is
+    what time features are divided by [s].
     """
 
-    def __init__(self, scenario: ScenarioConfig, simulation: Simulation) -> None:
-        airspace, observation = simulation.airspace, scenario.observation
+    def __init__(
+        self,
+        simulation: Simulation,
+        observation: ObservationConfig,
+        reward: RewardConfig,
+        episode: EpisodeConfig,
+        time_scale: float,
+    ) -> None:
+        airspace, battery = simulation.airspace, simulation.config.battery
         n_points = airspace.points.shape[:2].numel()
         should = "are more landing points than a message can number: take a larger step"
         checks.require(n_points < MAX_EXACT_INTEGER, "region.lattice_step", n_points, should)
         check_features(observation)
-        self.observation, self.reward, self.episode = observation, scenario.reward, scenario.episode
-        self.battery, self.dt, self._scale = scenario.battery, simulation.dt, airspace.scale
-        self._names = sorted({*observation.actor, *observation.critic, *features_read(scenario.reward)})
+        self.observation, self.reward, self.episode = observation, reward, episode
+        self.battery, self.dt, self._scale = battery, simulation.dt, airspace.scale
+        self._names = sorted({*observation.actor, *observation.critic, *features_read(reward)})
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._n_readings = sum(widths.values())
@@ -77,11 +85,11 @@ class Server:
         grid: SourceGrid | None = None
         if observation.belief:
             cell = observation.belief_cell
-            grid = build_source_grid(airspace, scenario.source, simulation.radius, self.dt, cell)
+            grid = build_source_grid(airspace, simulation.config.source, simulation.radius, self.dt, cell)
         gains = "belief_gain" in observation.belief
         self._constants: dict[str, Any] = {
-            "time_scale": scenario.time_scale,
-            "battery": scenario.battery,
+            "time_scale": time_scale,
+            "battery": battery,
             "footprints": footprints,
             "points": airspace.points.flatten(0, 1),
             "age_scale": observation.age_scale,

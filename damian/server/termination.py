@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.settings.server import EpisodeConfig
+from damian.server.config import EpisodeConfig
 from damian.world.messages import Messages
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.tensors import gather_rows, tree_map
-from damian.settings.world import RegionConfig
+from damian.world.config import RegionConfig
 from damian.world.regions.polygon import RESOLUTION, Floats, landing_lattice, largest_vertex_distance
 from damian.world.regions.region import Region
 

@@ -7,7 +7,7 @@ proportional to its length, whatever the time step and the speed profile.
 import torch
 from torch import Tensor
 
-from damian.settings.world import BatteryConfig
+from damian.world.config import BatteryConfig
 
 _VERTICAL_FACTOR = 0.9
 """In takeoff and landing, the drain at full engine power is divided by this factor."""

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from damian.common import devices
 from damian.common.tensors import gather_rows
-from damian.settings.world import ActionConfig
 from damian.world.airspace import Airspace, Cells, inside, nearest_points
+from damian.world.config import ActionConfig
 
 BOOKING_CHUNK = 2**22
 """Landing points of all worlds in which UAVs book together, which bounds the memory: 32 MB."""

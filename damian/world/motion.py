@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.settings.world import MotionConfig
+from damian.world.config import MotionConfig
 
 _TINY = 1e-9
 

@@ -13,7 +13,7 @@ import shapely
 import torch
 from torch import Tensor
 
-from damian.settings.world import SourceConfig
+from damian.world.config import SourceConfig
 from damian.world.regions.polygon import sample_interior
 
 _Polygon = shapely.Polygon | shapely.MultiPolygon

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
-from damian.settings.world import WorldConfig
 from damian.world.airspace import Airspace, build_airspace, nearest_points
 from damian.world.battery import observed
+from damian.world.config import WorldConfig
 from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
-from damian.world.regions.config import regions_of
 from damian.world.regions.places import local_places
 from damian.world.regions.region import Region
+from damian.world.regions.sources import regions_of
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout

@@ -9,9 +9,9 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.registry import Registry
 from damian.common.tensors import expand_mask, gather_rows, tree_where
-from damian.settings.world import WorldConfig
 from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
+from damian.world.config import WorldConfig
 from damian.world.messages import Messages
 from damian.world.motion import flight_levels, fly, minimum_time
 from damian.world.regions.places import local_places

@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from damian.common.tables import markdown_table
 from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS, UavEnv
@@ -37,7 +38,6 @@ from damian.recipes.cli import settings as composed_config
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig, ScenarioConfig
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from damian import ContextSampler, Law, MessageContext, Sampler, TableSampler
 from damian.common import checks, counter_rng
+from damian.common.fields import setting
 from damian.delays.laws import Delay, in_steps
-from damian.settings.fields import setting
 
 
 @dataclass(frozen=True)

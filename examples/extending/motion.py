@@ -14,8 +14,8 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.tensors import gather_rows
-from damian.settings.world import WorldConfig
 from damian.world.airspace import Airspace
+from damian.world.config import WorldConfig
 from damian.world.state import State
 from damian.world.vehicles import PolynomialFlight
 

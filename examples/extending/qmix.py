@@ -25,10 +25,10 @@ from torchrl.objectives.multiagent import QMixerLoss
 
 from damian import LearnerConfig, LearningSetup, keys
 from damian.common import checks
+from damian.common.fields import setting
 from damian.keys import next_key
 from damian.learners.networks import make_mlp, with_distribution
 from damian.learners.schedule import LinearSchedule
-from damian.settings.fields import setting
 
 VALUES, CHOSEN, JOINT = (keys.AGENTS, "action_value"), (keys.AGENTS, "chosen_action_value"), "joint"
 

@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 
 from damian.common import checks
-from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region
+from damian.world.regions.sources import RegionConfig
 
 
 def yard(config: RegionConfig, rng: np.random.Generator) -> list[Region]:

@@ -21,9 +21,9 @@ from torchrl.envs import EnvBase
 from damian import feature, keys
 from damian.common import checks
 from damian.common.tensors import gather_rows
+from damian.learners.config import MappoConfig, ModelConfig
 from damian.learners.networks import POLICY_GAIN, hidden_layers, make_mlp, with_distribution
 from damian.server.features import FeatureCache, feature_of, of_others
-from damian.settings.learners import MappoConfig, ModelConfig
 
 HEARD = "talking:heard"
 

@@ -51,11 +51,11 @@ from damian.common.tables import markdown_table
 from damian.delays.laws import Held, Uniform
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
+from damian.learners.config import BpqlConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.time_storage import TimeStorage
-from damian.settings import BpqlConfig
 from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline, set_seed
 from damian.transforms.base import Correction, Entries
 

@@ -25,14 +25,15 @@ from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.common.tables import markdown_table
 from damian.compare.comparison import mean_over_seeds
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.keys import next_key
 from damian.recipes.shared.environments import compose_scenario
 from damian.runs.metrics import evaluation
 from damian.server import server
 from damian.server.belief import SourceGrid, build_source_grid
-from damian.settings import ScenarioConfig, SourceConfig
 from damian.world.airspace import Airspace
+from damian.world.config import SourceConfig
 from damian.world.signal_source import draw_walks, locate
 
 TASKS, LATE = ("tracking", "intermittent", "flights"), (0, 4)

@@ -18,9 +18,9 @@ from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
 from damian.server.server import Server
-from damian.settings import TrainConfig
 from damian.transforms.reward import EpisodeTotals
 
+from ..config import TrainConfig
 from .settings import backupdates, measures_hindsight
 
 

@@ -6,8 +6,8 @@ env = damian.make_env(damian.compose_scenario("scenario=tracking", "delay=paper"
 from collections.abc import Sequence
 from typing import Any
 
+from damian.envs.config import ScenarioConfig
 from damian.interop.gym import UavGymEnv, UavVectorEnv
-from damian.settings import ScenarioConfig
 
 from ..cli import settings
 

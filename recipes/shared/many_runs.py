@@ -27,15 +27,15 @@ import torch
 from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
+from damian.common.fields import leaves
 from damian.runs.checkpoint import digest
 from damian.runs.interrupt import interrupt
 from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.runs.run_lock import locked
 from damian.runs.run_record import read_record
-from damian.settings import TrainConfig
-from damian.settings.fields import leaves
 
 from ..cli import Work
+from ..config import TrainConfig
 from .runs import POLICY, perform, stored_values
 
 WORDS = ("task", "delay", "arm", "regime", "policy")

@@ -12,16 +12,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from damian.common.atomic_files import remove_unfinished, write_atomically
 from damian.common.errors import InputError
+from damian.common.fields import filled, leaves
 from damian.common.registry import IMPORTED, stored_settings
 from damian.common.text_files import show
+from damian.envs.config import ScenarioConfig
+from damian.learners.config import LEARNERS, PredictiveMappoConfig
 from damian.runs.checkpoint import digest
 from damian.runs.run_folder import CONFIG
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
-from damian.settings import LEARNERS, PredictiveMappoConfig, ScenarioConfig, TrainConfig
-from damian.settings.fields import filled, leaves
 
 from ..cli import Work, checked, command, composed, reason, shown, stored_words, texts
+from ..config import TrainConfig
 from ..known import SCHEMAS, check_words, key_of
 from .settings import check_components
 

@@ -2,16 +2,18 @@
 
 from damian import keys
 from damian.common import checks
-from damian.delays.config import check_laws, delay_sampler, link_reads
+from damian.delays.scenario import check_laws, delay_sampler, link_reads
 from damian.envs.pipeline import has_delay, has_message_delay
+from damian.learners.config import LearningSetup, PredictiveMappoConfig
 from damian.learners.schedule import SystemClock
 from damian.runs.loggers import check_loggers
 from damian.server.features import check_features
 from damian.server.rewards import own_terms
-from damian.settings import LearningSetup, PredictiveMappoConfig, TrainConfig
-from damian.world.regions.config import REGION_SOURCES
+from damian.world.regions.sources import REGION_SOURCES
 from damian.world.sensors import sensors_of
 from damian.world.vehicles import MOTION_MODELS
+
+from ..config import TrainConfig
 
 
 def late(config: TrainConfig) -> list[str]:

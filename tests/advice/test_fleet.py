@@ -14,12 +14,12 @@ from damian.advice.rows import Report
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig, ScenarioConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 LLANBEDR = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)

@@ -20,7 +20,7 @@ from damian.advice.rows import Acknowledgement, validated
 from damian.advice.session import SNAPSHOT, AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
-from damian.settings.programs import FieldRules
+from damian.common.field_rules import FieldRules
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig

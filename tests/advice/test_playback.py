@@ -17,11 +17,11 @@ from damian.advice.session import AdviceSession
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 from damian.show.episode import Episode, record
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig

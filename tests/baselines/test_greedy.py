@@ -14,14 +14,14 @@ from damian import keys
 from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Coverer, Greedy, greedy_policy
 from damian.baselines.random import random_policy
 from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 from damian.world.landing import ActionConfig, action_table, displacement
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 FIELD = [[0.0, 0.0], [400.0, 0.0], [400.0, 400.0], [0.0, 400.0]]

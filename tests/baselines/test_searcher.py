@@ -13,7 +13,7 @@ from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.world.landing import ActionConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 
 
 def believing(reach: float = 300.0, own: bool = False, **changed) -> DelayedEnv:

@@ -8,9 +8,10 @@ from context_law import Crowd
 from transform_cases import ACTION, delayed, trace
 
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig, LinkConfig, check_laws
+from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.laws import LONGEST, Burst, Held, Lag, Law, Uniform
 from damian.delays.samplers import TableSampler
+from damian.delays.scenario import check_laws
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 INVALID_LAWS = [

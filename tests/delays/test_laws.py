@@ -10,9 +10,9 @@ from torch import Tensor
 
 from damian import compose_scenario
 from damian.common import counter_rng
-from damian.delays.config import delay_sampler
 from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform, in_steps, law_of
 from damian.delays.samplers import Sampler
+from damian.delays.scenario import delay_sampler
 
 STREAMS, STEPS = 1000, 100
 """Size of a sample: 10^5 messages."""

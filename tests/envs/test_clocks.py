@@ -11,11 +11,12 @@ from torchrl.collectors import Collector
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig
 from damian.learners.schedule import SystemClock
+from damian.recipes.config import TrainConfig
 from damian.recipes.shared.collectors import spotting, ticks
 from damian.recipes.train import learning_env
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig, TrainConfig
 from damian.world.messages import Messages
 
 SPOTTED, NOT_SPOTTED = torch.tensor([[False, True]]), torch.tensor([[False, False]])

@@ -18,6 +18,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays.config import DelayConfig, LinkConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
 from damian.envs.uav_env import EXTRAS, UavEnv
@@ -32,7 +33,6 @@ from damian.keys import (
     RECEIVED,
     REWARD,
 )
-from damian.settings import ScenarioConfig
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
 from damian.transforms.reward import EpisodeTotals
 from damian.world.landing import ActionConfig

@@ -15,9 +15,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from damian.common import devices
 from damian.common.tensors import tree_map
 from damian.delays.config import DelayConfig, LinkConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import Outputs
-from damian.settings import ScenarioConfig
 from damian.transforms.base import Entries, Memory, StatefulTransform
 from damian.world.state import PackedState
 

@@ -9,10 +9,10 @@ from delayed_envs import DELAYS, PAPER, choices, delayed, every_delay
 from helpers import FLYING, KEEPS_GOING, all_same, both_motions, everything, play, square
 
 from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.pipeline import action_codes
 from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, AGE, OBSERVATION, READY, RECEIVED
-from damian.settings import ClockConfig, ScenarioConfig
 from damian.world.landing import action_table
 from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig

@@ -8,11 +8,11 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig, ScenarioConfig
 
 
 def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioConfig:

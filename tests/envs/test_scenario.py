@@ -8,9 +8,9 @@ from helpers import square
 
 from damian.common.errors import InputError
 from damian.delays.config import LinkConfig
+from damian.envs.config import ClockConfig
 from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
-from damian.settings import ClockConfig
 from damian.world.motion import MotionConfig
 
 OWN = ObservationConfig(own=True)

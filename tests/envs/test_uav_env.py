@@ -17,11 +17,11 @@ from helpers import (
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION
 from damian.server.rewards import INDIVIDUAL, SYSTEM
-from damian.settings import ScenarioConfig
 from damian.world.landing import ActionConfig
 
 # Specs and TorchRL's rules.

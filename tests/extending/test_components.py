@@ -11,12 +11,11 @@ from torchrl.envs.utils import check_env_specs
 
 from damian import UavEnv, make_env
 from damian.common.errors import InputError
-from damian.envs.uav_env import make_simulation
+from damian.envs.uav_env import make_server, make_simulation
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
-from damian.server.server import Server
 from damian.server.trial import try_own_components
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 
 LAW = ["delay.obs={law: law:Satellite, hop: 2s, extra: 0.3}"]
 LAW += ["delay.act={law: law:Distance, antenna: [0, 20], speed: 40, reach: 90}"]
@@ -187,7 +186,10 @@ def test_a_component_that_draws_leaves_the_random_numbers_of_a_training_as_they_
     (folder / "drawn.py").write_text("import torch\n" + text.replace('("local")', '("global")'))
     scenario = everything(observation=ObservationConfig([], ["drawn:flag"]))
     simulation, before = make_simulation(scenario, 0), torch.get_rng_state()
-    try_own_components(Server(scenario, simulation), simulation)
+    try_own_components(
+        make_server(scenario, simulation),
+        simulation,
+    )
     assert torch.get_rng_state().equal(before)
 
 

@@ -14,8 +14,8 @@ from torchrl.data import ReplayBuffer
 
 from damian import keys
 from damian.envs.uav_env import UavEnv
+from damian.learners.config import ModelConfig
 from damian.replay.time_storage import TimeStorage
-from damian.settings import ModelConfig
 from damian.world.landing import ActionConfig
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"

@@ -10,7 +10,10 @@ from extensions import TINY
 from tensordict import TensorDict
 
 from damian import keys, make_env
-from damian.settings import LinkConfig, ModelConfig, ObservationConfig, ScenarioConfig
+from damian.delays.config import LinkConfig
+from damian.envs.config import ScenarioConfig
+from damian.learners.config import ModelConfig
+from damian.server.config import ObservationConfig
 from damian.transforms.server_node import OnboardNode
 
 WINDOW = 2

@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
@@ -21,11 +22,10 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import server_recompute
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 from damian.world.landing import ActionConfig
 from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 
 SMALL = ModelConfig(hidden=[16])
 REWARD = ("next", "agents", "reward")

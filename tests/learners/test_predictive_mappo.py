@@ -19,10 +19,11 @@ from damian.learners.predictive_mappo import (
     PredictiveMappo,
     PredictiveMappoConfig,
 )
+from damian.recipes.config import TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
+from damian.runs.config import LoggerConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import LoggerConfig, TrainConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 

@@ -9,7 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import damian
-from damian.delays.config import delay_sampler
+from damian.delays.scenario import delay_sampler
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
@@ -30,7 +30,7 @@ def refusal(capsys, *words: str) -> str:
 @pytest.mark.parametrize(
     "code",
     [
-        "import damian.settings",
+        "import damian.learners.config",
         "from damian.recipes.command import main; main(['train', '--help', 'delay'])",
         "from damian.recipes.command import main; main(['train', 'agents=0'])",
     ],

@@ -13,6 +13,7 @@ from helpers import check_refused
 from hydra import initialize_config_dir
 
 from damian.compare.comparison import TRAINED, Arm
+from damian.compare.config import CompareConfig, Experiment, HeldOut
 from damian.recipes.compare import includes, plan
 from damian.recipes.compare import run as main
 from damian.recipes.known import CONF
@@ -21,7 +22,6 @@ from damian.recipes.shared.runs import POLICY
 from damian.runs.checkpoint import digest
 from damian.runs.run_lock import locked
 from damian.runs.run_record import read_record
-from damian.settings.programs import CompareConfig, Experiment, HeldOut
 
 ROOT = Path(__file__).parents[2]
 SMALL = [

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from damian import keys
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.recipes import oracle
 from damian.server.features import ObservationConfig
-from damian.settings import ScenarioConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 WORDS = ["scenario=delaybench/tracking", "observation.belief_cell=60", "eval_episodes=300"]

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
@@ -28,9 +29,9 @@ from damian.keys import PRIVILEGED_OBSERVATION
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
+from damian.recipes.config import TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
-from damian.settings import ClockConfig, ScenarioConfig, TrainConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 

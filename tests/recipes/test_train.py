@@ -21,7 +21,7 @@ from damian.recipes.cli import settings as composed_config
 from damian.recipes.shared.runs import seed_generators, stored_config
 from damian.runs.metrics import Evaluation
 from damian.runs.training_state import load_networks
-from damian.settings import SourceConfig
+from damian.world.config import SourceConfig
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate

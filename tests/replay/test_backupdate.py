@@ -10,13 +10,13 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
 from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import CORRECTED, server_recompute
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 
 LONGEST = 5
 RANDOM_DELAY = {"law": "uniform", "low": 0, "high": LONGEST}

@@ -12,6 +12,7 @@ from torchrl.envs import StepCounter
 
 from damian import keys
 from damian.delays.config import DelayConfig, LinkConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.keys import next_key
@@ -19,7 +20,6 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import CORRECTED, server_recompute
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig, ScenarioConfig
 
 STEPS, WORLDS, LONGEST = 40, 4, 5
 LATE = {"law": "uniform", "low": 0, "high": LONGEST}

@@ -11,10 +11,11 @@ from damian.delays.config import DelayConfig
 from damian.keys import next_key
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
+from damian.recipes.config import TrainConfig
 from damian.recipes.train import learning_env, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
+from damian.runs.config import LoggerConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import LoggerConfig, TrainConfig
 from damian.world.motion import MotionConfig
 
 LONGEST = 3

@@ -19,6 +19,7 @@ from damian import keys
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
@@ -31,7 +32,6 @@ from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 from damian.transforms.reward import EpisodeTotals
 from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig

@@ -7,12 +7,11 @@ import torch
 from belief_twin import chance_at
 from helpers import everything, square, walking
 
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.envs.uav_env import make_simulation
+from damian.envs.uav_env import make_server, make_simulation
 from damian.server.belief import predict
 from damian.server.features import RINGS, SECTORS, ObservationConfig, feature
-from damian.server.server import Server
-from damian.settings import ScenarioConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
 
@@ -27,7 +26,7 @@ def flown():
     """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K] of worlds in several regions."""
     scenario = believing()
     simulation = make_simulation(scenario, 0)
-    server = Server(scenario, simulation)
+    server = make_server(scenario, simulation)
     messages, steps = simulation.initial.sent, simulation.initial.steps
     torch.manual_seed(0)
     weight = torch.rand(len(steps), server.grid.prior.shape[-1]).square() * (

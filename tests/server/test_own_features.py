@@ -6,11 +6,11 @@ from helpers import SQUARE, everything
 from torch import Tensor
 
 from damian.common.tensors import tree_map
-from damian.envs.uav_env import make_simulation
+from damian.envs.uav_env import make_server, make_simulation
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 
 B = 3
 
@@ -38,7 +38,11 @@ def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
         detected_time=draw(-10, 20).round().clamp(min=-1),
         detected_position=draw(-100, 100, 2),
     )
-    return Server(scenario, simulation), known, torch.tensor([20, 30, 40])
+    return (
+        make_server(scenario, simulation),
+        known,
+        torch.tensor([20, 30, 40]),
+    )
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 5])

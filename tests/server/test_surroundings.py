@@ -7,8 +7,11 @@ import shapely
 import torch
 
 from damian import keys, make_env
+from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
+from damian.server.config import ObservationConfig
 from damian.server.surroundings import OTHERS, RINGS, SECTORS
-from damian.settings import DelayConfig, MotionConfig, ObservationConfig, RegionConfig, ScenarioConfig
+from damian.world.config import MotionConfig, RegionConfig
 
 NAMES = ["others", "coverage_map", "place", "time_left", "number"]
 """Features in the order of the observation."""

@@ -10,10 +10,12 @@ from tensordict import TensorDictBase
 from damian import keys, make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
+from damian.server.config import ObservationConfig
 from damian.server.surroundings import OTHERS
 from damian.server.termination import EpisodeConfig
-from damian.settings import ObservationConfig, RegionConfig, ScenarioConfig
+from damian.world.config import RegionConfig
 
 SLOTS, AGENTS = 4, 3
 AGES = ("agents", "received_age")

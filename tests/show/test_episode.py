@@ -10,10 +10,11 @@ from episodes import flight
 from damian import keys
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import DelayConfig, ScenarioConfig
 from damian.show.episode import COLUMNS, Episode, record
 from damian.world.signal_source import SourceConfig
 

@@ -8,13 +8,14 @@ from geojson_pydantic import FeatureCollection
 from shapely.geometry import shape
 
 from damian.baselines.random import random_policy
+from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
-from damian.settings import DelayConfig, ScenarioConfig
 from damian.show.episode import record
 from damian.show.geojson import feature_collection
-from damian.world.regions.config import RegionConfig
 from damian.world.regions.geodesy import to_local
+from damian.world.regions.sources import RegionConfig
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,13 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from damian import keys
 from damian.delays.config import DelayConfig
+from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.server.belief import report_rows
 from damian.server.features import ObservationConfig
-from damian.settings import ScenarioConfig
 from damian.world.motion import MotionConfig
 
 LONGEST = 7

@@ -12,11 +12,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.keys import ACTION, REWARD
 from damian.server.termination import EpisodeConfig
-from damian.settings import ClockConfig, ScenarioConfig
 from damian.world.landing import ActionConfig
 
 LATE = {"law": "uniform", "low": 1, "high": 5, "probability": 0.6}

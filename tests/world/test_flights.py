@@ -18,12 +18,12 @@ from helpers import (
     usecase,
 )
 
+from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 from damian.world.battery import BatteryConfig, flight_drain
 from damian.world.landing import ActionConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 from damian.world.state import State
 
 # Positions on landing points.

@@ -15,10 +15,10 @@ from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
-from damian.settings.world import RegionConfig, WorldConfig
 from damian.world import airspace as search
 from damian.world import landing
 from damian.world.airspace import build_airspace, build_cells, inside, nearest_points
+from damian.world.config import RegionConfig, WorldConfig
 from damian.world.landing import (
     ActionConfig,
     Candidates,

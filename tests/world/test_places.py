@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.settings.world import WorldConfig
 from damian.world.battery import BatteryConfig
-from damian.world.regions.config import RegionConfig, regions_of
+from damian.world.config import WorldConfig
 from damian.world.regions.geodesy import to_latlon
 from damian.world.regions.places import local_places
 from damian.world.regions.region import Region
+from damian.world.regions.sources import RegionConfig, regions_of
 from damian.world.signal_source import SourceConfig
 from damian.world.simulation import Simulation
 

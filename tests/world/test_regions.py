@@ -14,7 +14,7 @@ from shapely.geometry import Polygon
 
 import damian
 from damian.common.errors import InputError
-from damian.settings.world import RegionConfig
+from damian.world.config import RegionConfig
 from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 
+from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
-from damian.settings import ScenarioConfig
 from damian.world.messages import Messages
 
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 from helpers import FLYING, KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
 
+from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 from damian.world.motion import MotionConfig
 
 

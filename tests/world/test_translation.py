@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from damian.common.tensors import tree_map
-from damian.settings.world import WorldConfig
 from damian.world.battery import BatteryConfig
+from damian.world.config import WorldConfig
 from damian.world.landing import ActionConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.simulation import Simulation
 

@@ -17,13 +17,13 @@ from helpers import (
     sent_messages,
 )
 
+from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.settings import ScenarioConfig
 from damian.world.landing import ActionConfig, action_table
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 TWIN_FEATURES = [name for name in GLOBAL if name != "coverage"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.settings.fields import Settings, check_place, constant, setting
+from damian.common.fields import Settings, check_place, constant, setting
 
 RANDOM, GEOJSON, POLYNOMIAL = ("random",), ("geojson",), ("polynomial",)
 DYNAMIC, CHARGING = ("dynamic",), ("charging",)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.settings.fields import Settings, constant, setting
+from damian.common.fields import Settings, constant, setting
 
 LOCAL_FEATURES = ("battery", "spotted")
 """Features of the UAV itself."""

@@ -8,7 +8,7 @@ import numpy as np
 from damian.common import checks
 from damian.common.registry import Registry
 from damian.common.text_files import data_file
-from damian.settings.world import RegionConfig
+from damian.world.config import RegionConfig
 from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon

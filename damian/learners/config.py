@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from damian import keys
 from damian.common import checks
+from damian.common.fields import Settings, constant, setting
 from damian.common.registry import Registry, resolved
-from damian.settings.fields import Settings, constant, setting
 
 if TYPE_CHECKING:
     from tensordict import NestedKey

@@ -1,0 +1,156 @@
+"""Settings of a comparison: tasks, delays, the methods (arms) that are compared, and by which score."""
+
+import re
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from damian.common import checks
+from damian.common.fields import Settings, constant, setting
+
+MISSING: Any = "???"
+"""Hydra's and OmegaConf's mark of a value that must be given."""
+_MEASURES = ("return", "success_rate", "steps")
+SCORES = (*_MEASURES, *(f"perceived_{name}" for name in _MEASURES))
+"""Measures by which arms can be compared; the first ones are from messages without delay."""
+LESS_IS_BETTER = ("steps", "perceived_steps")
+"""Scores for which lower values are better."""
+STORED = ("sampled", "deterministic")
+"""Policies of a checkpoint: its actions are drawn, or the most likely ones."""
+SEEDS = 10
+"""Seeds of a comparison, if their number is not given; with fewer, a report is marked as developing."""
+TAKEN = ("none", "random", "script")
+"""Names of an undelayed arm's delay and of the policies that fly beside each arm."""
+SET_BY_COMPARISON = ("seed", "resume", "checkpoint", "logger", "hydra")
+"""Keys that a comparison sets for each of its runs."""
+SCORE_MEANS = "The measure that counts, of what truly happened, or as the server perceived it."
+POLICY_MEANS = "The evaluated policy: actions drawn (sampled), or the most likely ones (deterministic)."
+
+
+@dataclass
+class Arm(Settings):
+    """One way to train policies for a task, or to fly those of another arm."""
+
+    overrides: list[str] = setting([], "Overrides of the settings of ``damian train``.")
+    delayed: bool = setting(True, "Whether it has delays; exactly one arm, the reference, has none.")
+    naive: bool = setting(False, "Whether it ignores the delay; the best such arm has recovery 0.")
+    policy_of: str | None = setting(None, "Arm whose policies it flies, without any training of its own.")
+    starts_from: str | None = setting(None, "Arm from whose policies, of the same seed, its training starts.")
+    teacher: str | None = setting(None, "Arm whose policies its learner imitates: its ``learner.teacher``.")
+    untrained: bool = setting(False, "Whether the networks fly as they are before the first update.")
+    tasks: list[str] | None = setting(None, "Tasks that the arm does; all of them if not given.")
+    regime: str = setting(
+        "",
+        "Information in training: R0 messages, R1 truth for the critic, R2 no delay; R3: never any delay.",
+        choices=("", "R0", "R1", "R2", "R3"),
+    )
+
+    @property
+    def source(self) -> str | None:
+        """Arm whose policies it flies, starts from, or imitates."""
+        return self.policy_of or self.starts_from or self.teacher
+
+
+@dataclass
+class HeldOut(Settings):
+    """Changes of a task under which the policies that were trained without them are evaluated too."""
+
+    overrides: list[str] = setting([], "Overrides of ``damian train``, such as another region.")
+    tasks: list[str] | None = setting(None, "Tasks to change; all of them if not given.")
+    delays: list[str] | None = setting(None, "Delays of the training; all of them if not given.")
+    arms: list[str] | None = setting(None, "Arms whose policies are flown; all of them if not given.")
+
+
+@dataclass
+class Experiment(Settings):
+    """Tasks, delays and arms to compare, as written in a file of conf/experiment."""
+
+    section: ClassVar[str] = "experiment"
+
+    tasks: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each task.")
+    delays: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each delay.")
+    arms: dict[str, Arm] = setting({}, "Ways to train or fly; one of them has ``delayed: false``.")
+    held_out: dict[str, HeldOut] = setting({}, "Changed tasks, TASK@NAME, to evaluate all policies in.")
+    first_seed: int = setting(0, "The seeds of every arm count from this one.", low=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for kind in ("tasks", "delays", "arms", "held_out"):
+            for name in getattr(self, kind):
+                good = re.fullmatch(r"[\w.+-]+", name) and name not in TAKEN
+                should = "cannot name a folder: use letters, digits, _ . + - but not none, random or script"
+                checks.require(bool(good), f"experiment.{kind}", name, should)
+        for kind in ("tasks", "arms"):
+            self.refuse(
+                not getattr(self, kind), kind, "is missing or empty; an experiment needs at least one"
+            )
+        self._check_arms()
+        for name, held_out in self.held_out.items():
+            for kind in ("tasks", "delays", "arms"):
+                for each in getattr(held_out, kind) or ():
+                    checks.one_of(f"experiment.held_out.{name}.{kind}", each, getattr(self, kind))
+
+    def _check_arms(self) -> None:
+        undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
+        should = "are not delayed: exactly one arm must have delayed=false"
+        checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
+        never = not self.delays and len(self.arms) > len(undelayed)
+        self.refuse(never, "delays", "is empty, but there are delayed arms")
+        for name, arm in self.arms.items():
+            key, good = f"experiment.arms.{name}", arm.delayed and arm.policy_of is None
+            should = "goes with neither policy_of nor delayed=false"
+            checks.require(good or not arm.untrained, key, "untrained", should)
+            source = self.arms.get(arm.source or "", arm)
+            for task in self.tasks if arm.tasks is None else arm.tasks:
+                options = self.tasks if source.tasks is None else source.tasks
+                checks.one_of(f"{key}.tasks", task, options)
+
+
+@dataclass
+class CompareConfig(Settings):
+    """All settings of ``damian compare``."""
+
+    experiment: Experiment = MISSING
+    seeds: int | None = setting(
+        None, "Number of seeds; if not given 10, or with ``report_only`` all stored ones.", low=1, high=10_000
+    )
+    processes: int = setting(1, "Runs at the same time, of one thread each.", low=1, high=1024)
+    tasks: list[str] | None = setting(None, "Tasks to run; all of the experiment's if not given.")
+    delays: list[str] | None = setting(None, "Delays to run; all of the experiment's if not given.")
+    arms: list[str] | None = setting(None, "Arms to run; all of the experiment's if not given.")
+    overrides: list[str] = setting([], "Further overrides of ``damian train`` for every run.")
+    score: str = setting("return", SCORE_MEANS, choices=SCORES)
+    policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
+    report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
+    keep: bool = setting(
+        False, "Keep the stored results of runs whose folders are gone, and run only the others."
+    )
+    own_folder: str | None = constant(None, "The folder after --config-dir; the program fills it in.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for word in self.overrides:
+            ours = word.lstrip("+~").partition("=")[0].partition(".")[0] in SET_BY_COMPARISON
+            problem = "cannot be the same for every run: the comparison sets it; leave it out"
+            checks.require(not ours, "overrides", word, problem)
+        for kind in ("tasks", "delays", "arms"):
+            none = getattr(self, kind) == [] and kind != "delays"
+            checks.require(not none, kind, [], "names none: leave it out, for all of them")
+            for name in getattr(self, kind) or ():
+                checks.one_of(kind, name, getattr(self.experiment, kind))
+        arms = self.chosen("arms")
+        trained = [n for n, a in arms.items() if not (a.policy_of or a.untrained)]
+        for name, arm in arms.items():
+            for kind in ("policy_of", "starts_from", "teacher"):
+                if getattr(arm, kind) is not None:
+                    checks.one_of(f"experiment.arms.{name}.{kind}", getattr(arm, kind), trained)
+
+    def chosen(self, kind: str) -> dict[str, Any]:
+        """The experiment's tasks, delays or arms (``kind``) that are asked for, by name."""
+        every, only = getattr(self.experiment, kind), getattr(self, kind)
+        return {name: every[name] for name in every if only is None or name in only}
+
+    @property
+    def every_seed(self) -> range:
+        """The seeds that are asked for."""
+        n_seeds = SEEDS if self.seeds is None else self.seeds
+        return range(self.experiment.first_seed, self.experiment.first_seed + n_seeds)

@@ -1,0 +1,121 @@
+"""All settings of an environment, with those of its clocks."""
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from damian.common import checks
+from damian.common.fields import Settings, constant, setting
+from damian.delays.config import DelayConfig, LinkConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
+from damian.world.config import WorldConfig
+
+
+@dataclass
+class ClockConfig(Settings):
+    """Periods of the clocks, such as ``1s``, ``200ms`` or ``2min``, each a multiple of the faster ones."""
+
+    section: ClassVar[str] = "clock"
+
+    simulation: str = setting("1s", "Length of a simulation step, ``dt``.")
+    agents: str | None = setting(None, "Period at which an agent decides; ``simulation`` if not given.")
+    server: str | None = setting(None, "Period at which the server broadcasts; ``simulation`` if not given.")
+    system: str | None = setting(
+        None, "Period at which the learner gets a batch; from learner.steps if not given."
+    )
+    trigger: str | None = setting(
+        None, "Change of that period at each tick: shorter if a UAV of half the worlds spots, else longer."
+    )
+    shortest: str | None = setting(None, "Shortest triggered period; ``trigger`` if not given.")
+    longest: str | None = setting(None, "Longest triggered period; twice the first one if not given.")
+    skip: bool = setting(False, "Let a step last until some UAV can choose again (``SkipUntilReady``).")
+    skip_discount: float = constant(
+        1.0, "Discount within a step that ``skip`` makes longer; a training sets it.", low=0, high=1
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fast, triggered = ("simulation", "agents", "server"), ("trigger", "shortest", "longest")
+        for slower, faster in itertools.permutations((*fast, "system"), 2):
+            if self._seconds(slower) >= self._seconds(faster) or faster == "simulation":
+                self._check_multiple(slower, faster)
+        given = [name for name in triggered if getattr(self, name) is not None]
+        for name, faster in itertools.product(given, fast):
+            self._check_multiple(name, faster)
+        checks.in_range("clock.simulation", self.dt, 1e-3, 86_400, "s")  # a millisecond to a day
+        unread = not self.skip and self.skip_discount != 1
+        self.refuse(unread, "skip_discount", "means nothing without clock.skip=true")
+        for name in given:
+            self.refuse(self.trigger is None, name, "means nothing without clock.trigger")
+
+    def _check_multiple(self, slow: str, fast: str) -> None:
+        ratio = self._seconds(slow) / self._seconds(fast)
+        whole = math.isclose(ratio, max(round(ratio), 1), rel_tol=1e-9)
+        problem = f"is not a multiple of clock.{fast}={self._period(fast)}"
+        checks.require(whole, f"clock.{slow}", self._period(slow), problem)
+
+    def _period(self, name: str) -> str:
+        return getattr(self, name) or self.simulation
+
+    def _seconds(self, name: str) -> float:
+        return checks.seconds(f"clock.{name}", self._period(name))
+
+    @property
+    def dt(self) -> float:
+        """Length of a simulation step [s]."""
+        return self._seconds("simulation")
+
+    def steps(self, name: str) -> int:
+        """Period of the clock of this name [simulation steps]."""
+        return round(self._seconds(name) / self.dt)
+
+
+@dataclass
+class ScenarioConfig(WorldConfig):
+    """Settings of a whole scenario, as in ``make_env(ScenarioConfig(agents=5), num_worlds=64)``."""
+
+    observation: ObservationConfig = setting(ObservationConfig)
+    reward: RewardConfig = setting(RewardConfig)
+    episode: EpisodeConfig = setting(EpisodeConfig)
+    clock: ClockConfig = setting(ClockConfig)
+    delay: DelayConfig = setting(DelayConfig)
+    links: LinkConfig = setting(LinkConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.links.check(self.agents)
+        links, observation, episode = self.links.kind, self.observation, self.episode
+        problem = "does not go with clock.server: between two broadcasts no observation changes"
+        self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)
+        problem = "does not go with links=updown: the server has computed what a UAV receives"
+        self.refuse(observation.own and links == "updown", "observation.own", problem)
+        problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
+        self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
+        per_action = "belief_gain" in observation.belief
+        problem = "needs discrete actions: it has a value for each of them"
+        self.refuse(per_action and self.actions.kind == "continuous", "observation.belief", problem)
+        problem = "is empty for a single UAV: add another feature"
+        empty = self.agents == 1 and observation.critic == ["agent_distances"]
+        self.refuse(empty, "observation.global_features", problem)
+        problem = f"does not go with links={links}: a UAV would get the messages that the server has received"
+        self.refuse(self.delay.messages and links != "server", "delay.messages", problem)
+        problem = "does not go with delay.order=arrival: a slot would change with when a message arrived"
+        self.refuse(observation.timeline and self.delay.order == "arrival", "observation.timeline", problem)
+        never = episode.discharged_share is not None and not self.battery.enabled
+        self.refuse(never, "episode.discharged_share", "needs battery.enabled=true")
+        stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
+        problem = "needs source.motion=dynamic and source.after_walk=stop"
+        self.refuse(episode.end_with_source and not stops, "episode.end_with_source", problem)
+
+    @property
+    def seeks_source(self) -> bool:
+        """Whether anything is won by finding the source."""
+        terms = {*self.reward.terms} - {"coverage", "battery", "mean_distance"}
+        return bool(terms) or self.episode.success_share is not None
+
+    @property
+    def time_scale(self) -> float:
+        """Time by which time features are divided [s]: the setting, else the time limit, else one hour."""
+        limit = None if self.episode.max_steps is None else self.episode.max_steps * self.clock.dt
+        return self.observation.time_scale or limit or 3600.0

@@ -1,0 +1,286 @@
+"""All settings of the programs but ``damian compare``: those of ``damian train``, which the others extend."""
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from damian.common import checks
+from damian.common.field_rules import FieldRules
+from damian.common.fields import constant, setting
+from damian.compare.config import LESS_IS_BETTER, POLICY_MEANS, SCORE_MEANS, SCORES, STORED
+from damian.envs.config import ScenarioConfig
+from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
+from damian.runs.config import LoggerConfig
+
+FORMATS = ("gif", "mp4", "png", "html", "geojson")
+FILMS = FORMATS[:2]
+MOST_EPISODES = 12
+"""Episodes that one page can play side by side."""
+_HIDDEN = {"hidden": {"choices": [[64, 64], [128, 128], [256, 256]]}}
+_GAMMA = {"choices": [0.8, 0.9, 0.95, 0.98, 0.99]}
+_MAPPO = {
+    "lr": {"low": 1e-4, "high": 1e-2, "log": True},
+    "entropy_coeff": {"low": 1e-4, "high": 1e-1, "log": True},
+    "gamma": _GAMMA,
+    "lmbda": {"choices": [0.8, 0.9, 0.95]},
+    "epochs": {"low": 2, "high": 10},
+    "minibatches": {"choices": [2, 4, 8]},
+}
+_SAC = {
+    "lr": {"low": 1e-4, "high": 3e-3, "log": True},
+    "alpha_lr": {"low": 1e-3, "high": 1e-1, "log": True},
+    "target_entropy": {"low": 0.1, "high": 0.9},
+    "gamma": _GAMMA,
+    "tau": {"low": 2e-3, "high": 5e-2, "log": True},
+    "batch_size": {"choices": [256, 512, 1024]},
+}
+_PREDICTIVE = {
+    "prediction_lr": {"low": 5e-4, "high": 1e-2, "log": True},
+    "width": {"choices": [16, 32, 64]},
+}
+SEARCHES: dict[str, dict[str, Any]] = {
+    "mappo": {"learner": _MAPPO, "model": _HIDDEN},
+    "predictive_mappo": {
+        "learner": {**_MAPPO, **_PREDICTIVE},
+        "model": _HIDDEN,
+        "delay": {"messages": {"choices": [4, 8, 12]}},
+    },
+    "sac": {"learner": _SAC, "model": _HIDDEN},
+    "bpql": {"learner": _SAC, "model": _HIDDEN, "delay": {"history": {"choices": [2, 4, 8, 12]}}},
+}
+"""What ``damian tune`` varies, by the learner."""
+COMPILE_FROM = 1_000_000
+"""Environment steps from which on compiling saves more time than it takes, half a minute."""
+
+
+@dataclass
+class TrainConfig(ScenarioConfig):
+    """All settings of ``damian train``, beside those of the scenario."""
+
+    learner: LearnerConfig = setting(MappoConfig)
+    model: ModelConfig = setting(ModelConfig)
+    critic: str = setting(
+        "server",
+        "The critic observes the messages that the server holds, or the true state (privileged, regime R1).",
+        choices=("server", "privileged"),
+    )
+    logger: LoggerConfig = setting(LoggerConfig)
+    seed: int = setting(0, "Seed of all random draws.", low=0, high=2**31)
+    worlds: int = setting(64, "Number of parallel environments.", low=1, high=checks.WORLDS)
+    frames: int = setting(300000, "Environment steps to learn from, over all worlds.", low=1, high=1e12)
+    episodes: int | None = setting(
+        None, "Stop after this number of episodes, if that comes before ``frames``.", low=1, high=1e12
+    )
+    eval_episodes: int = setting(200, "Episodes of each evaluation.", low=1, high=checks.WORLDS)
+    eval_every: int | None = setting(None, "Updates between two evaluations on the way.", low=1, high=1e12)
+    checkpoint_every: int = setting(
+        20, "Updates between two checkpoints: what a killed run loses at most.", low=1, high=1e12
+    )
+    backupdate: bool = setting(
+        False, "Late messages and rewards correct stored steps before the learner uses them (section 3.4)."
+    )
+    settle: bool = setting(
+        False, "With ``backupdate``: learn from a step only when nothing of it can be in transit any more."
+    )
+    corrected: list[str] = setting(
+        ["reward", "critic"],
+        "With ``backupdate``: what late messages correct: reward, critic (its observation), actor (its own).",
+    )
+    checkpoint: str | None = setting(
+        None, "Run folder, or the best.pt in it, of the policy to begin with or to fly; its overrides apply."
+    )
+    overrides: list[str] = constant([], "Words of the command line; the program fills them in.")
+    resume: str | None = setting(None, "Run folder of the run to continue.")
+    device: str = setting("cpu", "Device of all tensors: cpu, cuda, cuda:1, ...")
+    threads: int = setting(
+        1, "Threads of the learning; more help only networks much larger than the default.", low=1, high=1024
+    )
+    compile: Any = setting(
+        "auto",
+        "Compile the steps, the actor and MAPPO's loss; auto does from a million ``frames`` on.",
+        choices=("auto", True, False),
+    )
+    trust: bool = setting(False, "Import the components package.module:Name that a run folder names.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        matches = type(self.learner) is LEARNERS.get(self.learner.name, "learner")
+        problem = f"is not the learner of these settings: choose one with learner={'|'.join(LEARNERS)}"
+        checks.require(matches, "learner.name", self.learner.name, problem)
+        checks.names("corrected", self.corrected, ("reward", "critic", "actor"))
+        self.refuse(not self.corrected, "corrected", "is empty: choose reward, critic or actor")
+        if not self.seeks_source:  # aware=belief suits any task: observe no belief by which nothing is won
+            self.observation = replace(self.observation, belief=[])
+            self.model = replace(self.model, skip=False)
+
+    @property
+    def compiles(self) -> bool:
+        """Whether to compile; ``auto`` leaves out sensors of the user's own, which Inductor may crash on."""
+        return self.frames >= COMPILE_FROM and not self.sensors if self.compile == "auto" else self.compile
+
+    @property
+    def update_steps(self) -> int:
+        """Steps of every world before the first update: the system clock's period, or ``learner.steps``."""
+        return self.clock.steps("system") if self.clock.system else self.learner.steps
+
+    @property
+    def eval_scenario(self) -> ScenarioConfig:
+        """The scenario of an evaluation; it skips no steps, because every step is measured."""
+        return replace(self, clock=replace(self.clock, skip=False, skip_discount=1.0))
+
+    @property
+    def train_scenario(self) -> ScenarioConfig:
+        """The scenario of the training; rewards of skipped steps are discounted by ``learner.gamma``."""
+        discount = self.learner.gamma if self.clock.skip else 1.0
+        return replace(self, clock=replace(self.clock, skip_discount=discount))
+
+    @property
+    def eval_seed(self) -> int:
+        """Seed of the initial conditions of an evaluation; they differ from those of the training."""
+        return self.seed + 10_000
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which an episode of an evaluation is cut off, if nothing else ends it."""
+        limit = self.episode.max_steps or 200
+        return 4 * limit if self.episode.since_detection else limit
+
+
+@dataclass
+class FlownPolicyConfig(TrainConfig):
+    """All settings of ``damian train``, and which policy flies."""
+
+    policy: str | None = None
+
+    policies: ClassVar[tuple[str, ...]] = STORED
+    """The policies that the program knows; the first of them flies a checkpoint if none is chosen."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        problem = "is for damian train: nothing is trained here; give the run folder as checkpoint"
+        self.refuse(self.resume is not None, "resume", problem)
+        if self.policy is not None:
+            checks.one_of("policy", self.policy, self.policies)
+        problem = "needs checkpoint: the run folder with the policy to fly"
+        self.refuse(self.learnt and not self.checkpoint, "policy", problem)
+        problem = "flies no checkpoint: leave it out"
+        self.refuse(self.policy and self.checkpoint and not self.learnt, "policy", problem)
+
+    @property
+    def flown(self) -> str:
+        """The policy that flies, one of ``policies``."""
+        return self.policy or (self.policies[0] if self.checkpoint else "script")
+
+    @property
+    def learnt(self) -> bool:
+        """Whether it is that of a checkpoint."""
+        return self.flown in STORED
+
+
+@dataclass
+class FlyConfig(FlownPolicyConfig):
+    """All settings of ``damian fly``: those of ``damian train``, and what to fly and to keep."""
+
+    eval_episodes: int = setting(1, "Episodes to fly.")
+    policy: str | None = setting(
+        None, "sampled (default with a checkpoint), deterministic, script (default without), or random."
+    )
+    keep: str = setting(
+        "all",
+        "Episodes to keep: all, or the best, the median and the worst (extremes).",
+        choices=("all", "extremes"),
+    )
+    formats: list[str] = setting(
+        ["gif", "png"],
+        "What to make of each: films (gif, mp4), a figure (png), a page (html), or geojson for map tools.",
+        choices=FORMATS,
+    )
+    views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
+    journal: str | None = setting(
+        None, "Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply."
+    )
+    span: list[float] | None = setting(
+        None, "First and last time of the journal to show, since every UAV had reported [s]."
+    )
+    replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
+
+    policies: ClassVar[tuple[str, ...]] = ("sampled", "deterministic", "script", "random")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
+        if self.journal or self.replay:
+            flies = {"checkpoint": None, "policy": None, "eval_episodes": 1, "keep": "all"}
+            for name, none in flies.items():
+                wrong = getattr(self, name) != none
+                self.refuse(wrong, name, "means nothing with journal or replay, which fly nothing")
+        problem = f"is more than {MOST_EPISODES} episodes"
+        self.refuse(len(self.replay) > MOST_EPISODES, "replay", problem)
+        if self.span is not None:
+            good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal
+            self.refuse(not good, "span", "is not [FIRST, LAST], two times of a journal [s]")
+        films = {*self.formats} & {*FILMS}
+        self.refuse(films and not self.views, "views", "names no view for the films: choose 2d or 3d")
+
+
+@dataclass
+class AdviseConfig(FlownPolicyConfig, FieldRules):
+    """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
+
+    policy: str | None = setting(None, "deterministic (default with checkpoint), sampled, or script.")
+    reports: str | None = setting(None, "Table of reports to answer once, CSV or JSON.")
+    port: int | None = setting(None, "Port of the service over HTTP; 0: a free one.", low=0, high=65535)
+    fit: str | None = setting(
+        None, "Journal, or table with receive times: only write its delays as a trace, ``trace.csv``."
+    )
+    host: str = setting("127.0.0.1", "Address of the service; other machines do not reach the default one.")
+    token: str | None = setting(
+        None, "Password of the service; DAMIAN_TOKEN of the environment, or made and printed, if not given."
+    )
+    uavs: list[str] = setting([], "IDs of the UAVs of a table; those in it if not given.")
+    journal: str | None = setting(None, "Folder of the journals; in the run folder if not given.")
+
+    policies: ClassVar[tuple[str, ...]] = ("deterministic", "sampled", "script")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_token("token", self.token)
+
+    def check_source(self) -> None:
+        """Require exactly one source of reports."""
+        given = [name for name in ("reports", "port", "fit") if getattr(self, name) is not None]
+        problem = "is not the only one of reports=FILE, port=NUMBER, fit=FILE: give one"
+        checks.require(len(given) == 1, "reports", " and ".join(given) or "nothing", problem)
+        unread = self.journal and given[0] in ("reports", "fit")
+        self.refuse(unread, "journal", "is for a service: leave it out")
+
+
+def check_token(key: str, token: str | None) -> None:
+    """Require a password that nobody guesses and every header can carry, if there is one."""
+    good = token is None or (len(token) >= 16 and token.isascii() and token.isprintable())
+    checks.require(good, key, "it", "is not a password of at least 16 printable ASCII characters")
+
+
+@dataclass
+class TuneConfig(TrainConfig):
+    """All settings of ``damian tune``: those of ``damian train``, and how to search."""
+
+    search: dict[str, Any] = setting(
+        {}, "What to vary, each setting as {low: 1, high: 8, log: true, step: 1} or {choices: [...]}."
+    )
+    trials: int = setting(30, "Number of trainings.", low=1, high=1_000_000)
+    processes: int = setting(1, "Trainings at the same time, of one thread each.", low=1, high=1024)
+    score: str = setting("return", SCORE_MEANS, choices=SCORES)
+    policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        alike = self.episode.success_share is None and "success" in self.score
+        self.refuse(alike, "score", "is the same for every policy: in this task nothing can be reached")
+        for name in ("checkpoint", "resume"):
+            problem = "is not for a search, which trains every policy from the beginning: leave it out"
+            self.refuse(getattr(self, name) is not None, name, problem)
+
+    @property
+    def sign(self) -> int:
+        """1 if the greatest score is the best, -1 if the least is."""
+        return -1 if self.score in LESS_IS_BETTER else 1
