@@ -7,10 +7,13 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
+RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
 .PHONY: train test test-order test-deep test-slow test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
-	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=4 aware=backupdate observation.own=true frames=400000 $(ARGS)
+	$(VENV)/bin/damian train scenario=delaybench/crowded "delay.obs={law: uniform, low: 1, high: 7}" aware=timeline \
+	  frames=1000000 hydra.run.dir=$(RUN) $(ARGS)
+	$(VENV)/bin/damian evaluate checkpoint=$(RUN) delay.obs=2 # which it was not trained for
 
 test: $(VENV)/test
 	$(PY) -m pytest -n 2 $(ARGS)
