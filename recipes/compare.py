@@ -29,9 +29,10 @@ from damian.runs.interrupt import end_interrupted, number_of
 
 from . import cli
 from .evaluate import fly, fly_untrained
+from .known import key_of
 from .shared.comparison_results import FIGURE, MARKDOWN, ROWS, Results, results_of, stored_results, write_csv
 from .shared.many_runs import LOG, Run, check_stored, perform_all
-from .shared.runs import check_policy_fits
+from .shared.runs import check_policy_fits, without
 from .shared.settings import check_learning, late
 from .train import train
 
@@ -56,7 +57,8 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
         if arm.delayed == (delay != NOT_LATE) and (arm.tasks is None or task in arm.tasks)
         if (held_out.arms is None or name in held_out.arms)
         and (held_out.delays is None or delay in held_out.delays)
-        for overrides in [[*tasks[task], *delay_overrides, *held_out.overrides]]
+        for changed in [[key_of(word) for word in held_out.overrides]]  # delay=paper replaces delay.obs=4
+        for overrides in [[*without([*tasks[task], *delay_overrides], changed), *held_out.overrides]]
         for run in _seeds(config, folder / place / delay / name, task, overrides)
     ]
     by_folder = {run.folder: run.config for run in runs}

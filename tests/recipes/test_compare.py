@@ -300,7 +300,7 @@ def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
 def test_a_held_out_delay_replaces_the_one_of_the_training():
     arms = {"best": Arm(delayed=False), "naive": Arm(naive=True)}
     delays = {"constant": ["delay.obs=2"], "paper": ["delay=paper"]}
-    held_out = {"six": HeldOut(["delay.obs=6"])}
+    held_out = {"six": HeldOut(["delay.obs=6"]), "burst": HeldOut(["delay=burst"])}
     experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms, held_out)
     config = CompareConfig(experiment, seeds=1)
     with initialize_config_dir(str(CONF), version_base=None):
@@ -308,6 +308,7 @@ def test_a_held_out_delay_replaces_the_one_of_the_training():
     delay = {(run.task, run.delay): run.config.delay.obs for run in runs if run.arm == "naive"}
     assert delay["a", "constant"] == 2
     assert delay["a@six", "constant"] == delay["a@six", "paper"] == 6
+    assert delay["a@burst", "constant"]["law"] == delay["a@burst", "paper"]["law"] == "burst"
     stored = {"task": "a@six", "delay": "paper", "arm": "naive", "seed": 0}
     assert includes(config, stored)
     assert not includes(config, {**stored, "task": "a@seven"})  # of an experiment that had another one
