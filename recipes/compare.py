@@ -4,22 +4,26 @@ damian compare experiment=usecases "tasks=[usecase2]" seeds=2 "overrides=['frame
 damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench
 """
 
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
+import pandas as pd
+
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
+from damian.common.tables import write_csv
 from damian.compare.comparison import (
     HELD_OUT_MARK,
     NOT_LATE,
+    RUN,
     TRAINED,
     TRAINED_DETERMINISTIC,
     Comparison,
-    Row,
 )
 from damian.compare.config import SEEDS, CompareConfig, HeldOut
 from damian.compare.figures import plot_curves, plot_matrix, plot_norms
@@ -30,7 +34,7 @@ from damian.runs.interrupt import end_interrupted, number_of
 from . import cli
 from .evaluate import fly, fly_untrained
 from .known import key_of
-from .shared.comparison_results import FIGURE, MARKDOWN, ROWS, Results, results_of, stored_results, write_csv
+from .shared.comparison_results import FIGURE, MARKDOWN, NO_RESULTS, ROWS, Results, results_of, stored_results
 from .shared.many_runs import LOG, Run, check_stored, perform_all
 from .shared.runs import check_policy_fits, without
 from .shared.settings import check_learning, late
@@ -112,35 +116,32 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
 _composed = cache(cli.settings)  # several arms differ only in whose policy they fly; Hydra takes 0.2 s
 
 
-def includes(config: CompareConfig, row: Row) -> bool:
-    """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
-    (task, _, held_out), delays = row["task"].partition(HELD_OUT_MARK), [NOT_LATE, *config.chosen("delays")]
-    chosen = task in config.chosen("tasks") and held_out in ("", *config.experiment.held_out)
-    chosen = chosen and row["arm"] in config.chosen("arms")
-    seeds = range(config.experiment.first_seed, sys.maxsize) if config.seeds is None else config.every_seed
-    return chosen and row["delay"] in delays and row["seed"] in seeds
+def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
+    """Which rows of results are of a task, a delay, an arm and a seed that are asked for."""
+    tasks, first = [*config.chosen("tasks")], config.experiment.first_seed
+    tasks += [f"{task}{HELD_OUT_MARK}{name}" for task in tasks for name in config.experiment.held_out]
+    asked = {"task": tasks, "delay": [NOT_LATE, *config.chosen("delays")], "arm": [*config.chosen("arms")]}
+    last = math.inf if config.seeds is None else config.every_seed[-1]
+    return rows[[*asked]].isin(asked).all(axis=1) & rows["seed"].between(first, last)
 
 
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
     """Write the tables and the figures."""
-    comparison = Comparison(results.rows, config.chosen("arms"), config.score, POLICIES[config.policy])
-    write_csv(folder / TABLE, [line.cells() for line in comparison.lines])
-    text = markdown(comparison, results.curves, _notes(config, results, missing))
-    write_atomically(folder / MARKDOWN, text)
-    plot_curves(comparison, results.curves, folder / CURVES)
+    comparison = Comparison(*results, config.chosen("arms"), config.score, POLICIES[config.policy])
+    write_csv(folder / TABLE, comparison.table, unknown="")
+    write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results.rows, missing)))
+    plot_curves(comparison, folder / CURVES)
     plot_norms(comparison, folder / FIGURE)
     plot_matrix(comparison, folder / MATRIX)
 
 
-def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> list[str]:
+def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) -> list[str]:
     """Lines above the tables: the command, the number of seeds and episodes, what the columns mean."""
-    rows, by_arm = results.rows, dict[tuple[str, ...], set[int]]()
-    for row in rows:
-        by_arm.setdefault((row["task"], row["delay"], row["arm"]), set()).add(row["seed"])
-    seeds, episodes = sorted(set().union(*by_arm.values())), sorted({int(row["episodes"]) for row in rows})
+    seeds, episodes = rows["seed"], sorted(rows["episodes"].astype(int).unique())
     notes = [
         f"`{cli.command()}`",
-        f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {' or '.join(map(str, episodes))} episodes each",
+        f"{seeds.nunique()} seeds ({seeds.min()} to {seeds.max()}), "
+        f"{' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
         "else as it truly was; age in steps; back-updated: share of the rewards in training; n: seeds",
@@ -149,24 +150,24 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
         "one of the strongest naive method, with its score interval; n compared: seeds that all have",
     ]
-    if min(map(len, by_arm.values())) < SEEDS or episodes[0] < EPISODES:
+    if rows.groupby(RUN[:-1])["seed"].nunique().min() < SEEDS or episodes[0] < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")
     return notes + ([f"missing: {', '.join(missing)}"] if missing else [])
 
 
 def compare(config: CompareConfig, folder: Path) -> None:
     """Carry out the runs of a comparison that are not finished, and report on them."""
-    failed: list[Run] = []
     has_runs = any((folder / task).exists() for task in config.experiment.tasks)
     if config.report_only and (folder / ROWS).exists() and not has_runs:
-        results, missing = stored_results(folder).only(partial(includes, config)), []
+        results, missing, failed = stored_results(folder), [], []
     else:
         if config.report_only and config.seeds is None:  # all up to the last one with a run
             names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
             last = max((int(name) for name in names if name.isdecimal()), default=-1)
             config = replace(config, seeds=max(last - config.experiment.first_seed + 1, 0) or None)
         results, missing, failed = _results_of_runs(config, folder)
-    if not results.rows:
+    results = results.only(partial(includes, config))
+    if results.rows.empty:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
     report(config, results, missing, folder)
     print((folder / MARKDOWN).read_text(encoding="utf-8"))
@@ -176,16 +177,23 @@ def compare(config: CompareConfig, folder: Path) -> None:
 
 
 def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list[str], list[Run]]:
-    """Carry out the runs, unless only a report is asked for."""
-    runs, failed, kept = plan(config, folder), [], Results([], [])
+    """Carry out the runs, unless only a report is asked for, and store the rows of each as it finishes."""
+    runs, arms, failed, kept = plan(config, folder), config.chosen("arms"), [], NO_RESULTS
     if config.keep and (folder / ROWS).exists():
         kept = stored_results(folder)
         runs = _not_kept(runs, kept)
     for run in runs:
         check_stored(run)
+    stored = kept.with_those_of(results_of([run for run in runs if run.finished], arms))
+
+    def store(run: Run) -> None:
+        nonlocal stored
+        stored = stored.with_those_of(results_of([run], arms))
+        stored.write(folder)
+
     try:
         if not config.report_only:
-            failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score))
+            failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score), store)
     except KeyboardInterrupt as error:
         end_interrupted(number_of(error), "run the same command again to continue")
     for run in failed:
@@ -193,16 +201,15 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
     done = [run for run in runs if run.finished]
     if failed and not done:
         sys.exit(1)
-    results = kept.with_those_of(results_of(done, config.chosen("arms")))
+    results = kept.with_those_of(results_of(done, arms))  # in the order of the plan
     if done:
         results.write(folder)
-    results = results.only(partial(includes, config))
     return results, [run.name for run in runs if not run.finished], failed
 
 
 def _not_kept(runs: list[Run], kept: Results) -> list[Run]:
     """The runs without kept results, or with a folder, and those whose policies they need."""
-    done = {(row["task"], row["delay"], row["arm"], row["seed"]) for row in kept.rows}
+    done = {*kept.rows[RUN].itertuples(index=False, name=None)}
     todo = [r for r in runs if (r.task, r.delay, r.arm, r.config.seed) not in done or r.folder.exists()]
     needed = {run.needs for run in todo if not run.finished}
     needed |= {run.needs for run in runs if run.folder in needed}

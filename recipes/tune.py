@@ -14,12 +14,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from tqdm import tqdm
 
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
-from damian.common.tables import csv_table, markdown_table
+from damian.common.tables import markdown_table, write_csv
 from damian.runs.interrupt import end_interrupted, number_of
 
 from . import cli
@@ -159,7 +160,7 @@ def report(found: Search) -> None:
         return [str(trial.number), trial.state.name.lower(), value, *trial.user_attrs[CHOSEN].values()]
 
     head = ["trial", "state", found.config.score, *found.space]
-    write_atomically(found.folder / "trials.csv", csv_table([head, *map(row, trials)]))
+    write_csv(found.folder / "trials.csv", pd.DataFrame([*map(row, trials)], columns=head))
     lines = [
         f"`{cli.command()}`",
         f"{len(trials)} trials: {len(complete)} with a value, the others failed. All have the seed "

@@ -1,11 +1,12 @@
 """Comparison of arms over tasks, delays and seeds: means, J_norm and recovery, with 95 % intervals."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from damian.compare.config import LESS_IS_BETTER, Arm
 from damian.compare.statistics import (
@@ -33,47 +34,43 @@ NOT_LATE = "none"
 """Name that stands for the delay of an undelayed arm."""
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of numbers in the tables of a comparison."""
+class Column(NamedTuple):
+    """Column of numbers: its heading in Markdown, and the smallest and largest possible value."""
 
-    name: str
-    """Its name in files; that of the measure."""
     head: str
-    """Its heading in Markdown."""
-    bounds: tuple[float, float] = (-np.inf, np.inf)
-    """Smallest and largest possible value."""
+    low: float = -np.inf
+    high: float = np.inf
 
 
-_SHARE, _TIME = (0.0, 1.0), (0.0, np.inf)
-MEASURED = (
-    Column("return", "return"),
-    Column("success_rate", "success", _SHARE),
-    Column("steps", "steps", _TIME),
-    Column("perceived_return", "perceived return"),
-    Column("perceived_success_rate", "perceived success", _SHARE),
-    Column("perceived_steps", "perceived steps", _TIME),
-    Column("age", "age", _TIME),
-    Column("late", "late", _SHARE),
-    Column("lost", "lost", _SHARE),
-    Column("backupdated", "back-updated", _SHARE),
-)
-"""Means over seeds. The first ones are of an ``Evaluation``: from messages without delay and, ``perceived_``,
-as the server perceived them."""
-COMPARED = (
-    Column("J_norm", "J_norm"),
-    Column("recovery", "recovery"),
-    Column("improvement", "P > naive"),
-)
-"""What ``Comparison.compared`` finds of an arm: J_norm is 0 for the random policy, 1 for the undelayed arm;
-recovery is 0 for the strongest naive arm of the same track and 1 for the undelayed one; improvement: the
-probability that a run beats one of that naive arm."""
-MEASURES = tuple(column.name for column in MEASURED)
-BOUNDS = {column.name: column.bounds for column in MEASURED}
-
-Row = Mapping[str, Any]
-"""Evaluation of one policy: task, delay, arm, regime, seed, policy, a number for each measure, and of its run
-the ``frames`` (environment steps in training) and ``seconds``. Unknown or meaningless numbers are nan."""
+MEASURED = {
+    "return": Column("return"),
+    "success_rate": Column("success", 0, 1),
+    "steps": Column("steps", 0),
+    "perceived_return": Column("perceived return"),
+    "perceived_success_rate": Column("perceived success", 0, 1),
+    "perceived_steps": Column("perceived steps", 0),
+    "age": Column("age", 0),
+    "late": Column("late", 0, 1),
+    "lost": Column("lost", 0, 1),
+    "backupdated": Column("back-updated", 0, 1),
+}
+"""Means over seeds, by measure. The first ones are of an ``Evaluation``: from messages without delay and,
+``perceived_``, as the server perceived them."""
+COMPARED = {
+    "J_norm": Column("J_norm"),
+    "recovery": Column("recovery"),
+    "improvement": Column("P > naive"),
+}
+"""What is found of an arm beside others under the same delay: J_norm is 0 for the random policy, 1 for the
+undelayed arm; recovery is 0 for the strongest naive arm of the same track and 1 for the undelayed one;
+improvement: the probability that a run beats one of that naive arm."""
+RUN = ["task", "delay", "arm", "seed"]
+"""Columns of results that name a run."""
+ENDS = ("", "_low", "_high")
+"""Endings of the columns that hold a value and the ends of its 95 % interval."""
+LABELS = ["task", "delay", "arm", "regime", "policy", "seeds", "compared_seeds"]
+COLUMNS = [*LABELS, *(name + end for name in (*MEASURED, *COMPARED) for end in ENDS)]
+"""Columns of ``Comparison.table``."""
 
 
 def regime(arms: Mapping[str, Arm], name: str) -> str:
@@ -93,136 +90,153 @@ def track(arms: Mapping[str, Arm], name: str) -> str:
     return "late data only" if regime(arms, name) == "R0" else "simulator allowed"
 
 
-class Estimate(NamedTuple):
-    """A value and the ends of its 95 % interval, which are nan for fewer than three seeds."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        if np.isnan(self.value):
-            return "-"
-        if np.isnan(self.low):
-            return _short(self.value)
-        return f"{_short(self.value)} [{_short(self.low)}, {_short(self.high)}]"
-
-
-UNKNOWN = Estimate(np.nan, np.nan, np.nan)
-"""Stands for an estimate that cannot be made, or has no meaning."""
-
-
-@dataclass(frozen=True)
-class Compared:
-    """An arm compared with the undelayed one, the random policy and the naive arms, under the same delay."""
-
-    seeds: list[int] = field(default_factory=list)
-    """Seeds that all of these have finished; empty if there is none, and nothing is compared."""
-    estimates: Mapping[str, Estimate] = field(default_factory=dict)
-    """By names of ``COMPARED``; what cannot be estimated is missing."""
-
-    def __getitem__(self, name: str) -> Estimate:
-        return self.estimates.get(name, UNKNOWN)
-
-
-def _short(number: float) -> str:
-    return f"{number:.3f}" if abs(number) < 10 else f"{number:.1f}"
+def shown(line: Mapping[str, Any], name: str) -> str:
+    """A value of a line and its interval, if they are known, for people."""
+    value, low, high = (line[name + end] for end in ENDS)
+    if np.isnan(value):
+        return "-"
+    numbers = (f"{x:.3f}" if abs(x) < 10 else f"{x:.1f}" for x in (value, low, high))
+    return "{} [{}, {}]".format(*numbers) if not np.isnan(low) else next(numbers)
 
 
 def _estimates(
-    statistic: Any, scores: Floats, bounds: tuple[float, float] = (-np.inf, np.inf)
-) -> list[Estimate]:
-    """Estimates of a statistic that maps ``scores`` [strata, ..., seeds] to [K], within ``bounds``."""
-    low, high = bootstrap(statistic, scores, bounds=bounds)
-    ends = (np.ravel(statistic(scores)), np.ravel(low), np.ravel(high))
-    return [Estimate(*map(float, numbers)) for numbers in zip(*ends, strict=True)]
+    names: Sequence[str],
+    statistic: Callable[[Floats], Floats],
+    scores: Floats,
+    bounds: tuple[Any, Any] = (-np.inf, np.inf),
+) -> dict[str, float]:
+    """Columns (``ENDS``) of a statistic from ``scores`` [strata, ..., seeds] to a number for each name."""
+    found = bootstrap(statistic, scores, bounds=bounds)
+    triples = zip(names, *(np.ravel(x).tolist() for x in found), strict=True)
+    return {name + end: x for name, *triple in triples for end, x in zip(ENDS, triple, strict=True)}
+
+
+def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
+    """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for each seed."""
+    bounds = np.array([MEASURED.get(name, Column(name))[1:] for name in runs.columns]).T
+    return _estimates([*runs], lambda drawn: drawn.mean(-1)[..., 0, :], _scores(runs), (*bounds,))
+
+
+def _scores(runs: pd.DataFrame) -> Floats:
+    """Columns of a table with a row for each seed, as one stratum [1, columns, seeds]."""
+    return np.ascontiguousarray(runs.to_numpy(dtype=float).T)[None]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The rows of all runs, and the statistics that follow from them."""
+    """Results of all runs, and the statistics that follow from them.
 
-    rows: Sequence[Row]
+    ``rows`` has an evaluation of each run and policy: task, delay, arm, regime, seed, policy, episodes,
+    ``MEASURED``, and of the run ``frames`` (environment steps in training) and ``seconds``. ``points`` are
+    those of learning curves: task, delay, arm, seed, frames, episodes, and measures in training. Unknown
+    or meaningless numbers are nan.
+    """
+
+    rows: pd.DataFrame
+    points: pd.DataFrame
     arms: Mapping[str, Arm]
     score: str = "return"
     """Measure that is the J of J_norm and recovery."""
     policy: str = TRAINED
     """Policy with which the arms are compared, ``TRAINED`` or ``TRAINED_DETERMINISTIC``."""
 
-    @cached_property
-    def lines(self) -> list["Line"]:
-        """Lines of the table; cached, because the bootstrap takes time."""
-        return list(_lines(self))
-
-    @property
-    def undelayed(self) -> str:
-        """Name of the arm without delay; empty if there is none, and then nothing is compared with it."""
-        return next((name for name, arm in self.arms.items() if not arm.delayed), "")
-
     def tasks(self) -> list[str]:
         """Tasks with a finished run."""
-        return list(dict.fromkeys(row["task"] for row in self.rows))
+        return [*self.rows["task"].unique()]
 
     def delays(self, task: str) -> list[str]:
         """Delays of a task with a finished run, without ``NOT_LATE``."""
-        found = (row["delay"] for row in self.rows if row["task"] == task)
-        return [name for name in dict.fromkeys(found) if name != NOT_LATE]
+        found = self.rows.loc[self.rows["task"] == task, "delay"].unique()
+        return [name for name in found if name != NOT_LATE]
 
-    def runs(self) -> list[Row]:
+    def runs(self) -> pd.DataFrame:
         """The first row of each run."""
-        keys = ("task", "delay", "arm", "seed")
-        return list({tuple(row[key] for key in keys): row for row in reversed(self.rows)}.values())[::-1]
-
-    def present(self, task: str, delay: str) -> list[str]:
-        """Arms with a policy of their own that have a finished run of a task under a delay."""
-        found = {row["arm"] for row in self.rows if (row["task"], row["delay"]) == (task, delay)}
-        return [name for name in self.arms if name in found]
-
-    def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
-        """Values of a measure by seed; an untrained arm has none but those of its untrained network."""
-        if arm in self.arms and self.arms[arm].untrained:
-            policy = UNTRAINED_OF.get(policy, policy)
-        return {row["seed"]: row[measure] for row in self._rows_of.get((task, delay, arm, policy), ())}
+        return self.rows.drop_duplicates(RUN)
 
     @cached_property
-    def _rows_of(self) -> dict[tuple[str, ...], list[Row]]:
-        """Rows by task, delay, arm and policy."""
-        found: dict[tuple[str, ...], list[Row]] = {}
-        for row in self.rows:
-            found.setdefault((row["task"], row["delay"], row["arm"], row["policy"]), []).append(row)
+    def curves(self) -> dict[tuple[str, ...], list[pd.DataFrame]]:
+        """Points of the learning curves by task, delay and arm, a table for each seed."""
+        found: dict[tuple[str, ...], list[pd.DataFrame]] = {}
+        for (*name, _), points in self.points.groupby(RUN, sort=False):
+            found.setdefault(tuple(name), []).append(points)
         return found
 
-    def scores(self, task: str, delay: str) -> dict[str, dict[int, float]]:
-        """Scores by arm and seed, higher ones better; first come undelayed and random, without delay."""
-        sign = -1 if self.score in LESS_IS_BETTER else 1
-        sources = {self.undelayed: (NOT_LATE, self.undelayed, self.policy)}
-        sources[RANDOM] = (NOT_LATE, self.undelayed, RANDOM)
-        sources |= {arm: (delay, arm, self.policy) for arm in self.present(task, delay)}
-        found = {name: self.values(task, *source, self.score) for name, source in sources.items()}
-        return {name: {seed: sign * x for seed, x in runs.items()} for name, runs in found.items()}
+    def policy_of(self, arm: str) -> str:
+        """The policy with which an arm is compared; an untrained arm has none but its untrained network."""
+        return UNTRAINED_OF[self.policy] if self.arms[arm].untrained else self.policy
 
-    def compared(self, task: str, delay: str) -> dict[str, Compared]:
-        """Each delayed arm, over the seeds that it and all arms that it is compared with have finished."""
-        scores = self.scores(task, delay)
-        found = {name: self._compared(scores, name) for name in list(scores)[2:]}
-        return {name: result for name, result in found.items() if result.seeds}
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """A line for each task, delay, arm and policy, with ``COLUMNS``; the undelayed arm comes first."""
+        return pd.DataFrame(self._lines(), columns=COLUMNS)
 
-    def _compared(self, scores: Mapping[str, Mapping[int, float]], arm: str) -> Compared:
-        others = [name for name in list(scores)[2:] if track(self.arms, name) == track(self.arms, arm)]
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        for task in self.tasks():
+            for delay in (NOT_LATE, *self.delays(task)):
+                arms, scores = self._present(task, delay), self.scores(task, delay)
+                for arm in arms:
+                    labels = {"task": task, "delay": delay, "arm": arm, "regime": regime(self.arms, arm)}
+                    compared = self._compared(scores, arm) if delay != NOT_LATE else {}
+                    for policy in OF_ARM[2:] if self.arms[arm].untrained else OF_ARM:
+                        numbers = compared if policy == self.policy_of(arm) else {}
+                        yield from self._line(labels | {"policy": policy}, arm, numbers)
+                for policy in SCRIPTED if arms else ():
+                    labels = {"task": task, "delay": delay, "arm": policy, "regime": "", "policy": policy}
+                    yield from self._line(labels, arms[0], {})
+
+    def _line(
+        self, labels: dict[str, str], arm: str, compared: Mapping[str, Any]
+    ) -> Iterator[dict[str, Any]]:
+        """The line of a policy, if it has flown: an arm may have no untrained network, and no script."""
+        runs = self._evaluations.get((labels["task"], labels["delay"], arm, labels["policy"]))
+        if runs is not None:
+            yield {"seeds": len(runs), "compared_seeds": 0, **labels, **compared} | means_over_seeds(
+                runs[[*MEASURED]]
+            )
+
+    @cached_property
+    def _evaluations(self) -> dict[tuple[str, ...], pd.DataFrame]:
+        """Rows by task, delay, arm and policy, with the seed as their index."""
+        grouped = self.rows.groupby([*RUN[:-1], "policy"], sort=False)
+        return {name: found.set_index("seed") for name, found in grouped}
+
+    def _present(self, task: str, delay: str) -> list[str]:
+        """Arms that have a finished run of a task under a delay."""
+        found = self.rows.loc[(self.rows["task"] == task) & (self.rows["delay"] == delay), "arm"].unique()
+        return [name for name in self.arms if name in found]
+
+    def scores(self, task: str, delay: str) -> pd.DataFrame:
+        """Scores by seed, higher ones better, in a column for each arm; nan where a run is missing.
+
+        The first columns are the undelayed arm and the random policy, without delay.
+        """
+        undelayed = next((name for name, arm in self.arms.items() if not arm.delayed), "")
+        of = {undelayed: (NOT_LATE, undelayed, self.policy), RANDOM: (NOT_LATE, undelayed, RANDOM)}
+        of |= {arm: (delay, arm, self.policy_of(arm)) for arm in self._present(task, delay)}
+        none = pd.DataFrame({self.score: []}, dtype=float)
+        found = {name: self._evaluations.get((task, *key), none)[self.score] for name, key in of.items()}
+        return pd.DataFrame(found).sort_index() * (-1 if self.score in LESS_IS_BETTER else 1)
+
+    def _compared(self, scores: pd.DataFrame, arm: str) -> dict[str, Any]:
+        """``COMPARED`` of a delayed arm, over the seeds that it and all it is compared with have finished."""
+        undelayed, random, *delayed = scores.columns
+        others = [name for name in delayed if track(self.arms, name) == track(self.arms, arm)]
         naive = [name for name in others if self.arms[name].naive]
-        names = [*list(scores)[:2], *(name for name in naive if name != arm), arm]
-        seeds, array = _paired([scores[name] for name in names])
-        if not seeds:
-            return Compared()
-        found = {"J_norm": _estimates(_norms, array)[0]}
+        paired = scores[[undelayed, random, *(name for name in naive if name != arm), arm]].dropna()
+        if paired.empty:
+            return {}
+        array = _scores(paired)
+        found = {"compared_seeds": len(paired), **_estimates(["J_norm"], _norms, array)}
         if naive and arm not in naive:
             probability = float(_improvement(array))
-            found["improvement"] = Estimate(probability, *improvement_interval(probability, len(seeds)))
-            found["recovery"] = _recovery(array)
-        return Compared(seeds, found)
+            ends = (probability, *improvement_interval(probability, len(paired)))
+            found |= {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
+            if not np.isnan(_recovery(array, LEAST_GAP)):
+                found |= _estimates(["recovery"], _recovery, array)
+        return found
 
-    def overall(self) -> dict[str, tuple[int, Estimate]]:
-        """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.
+    def overall(self) -> dict[str, dict[str, float]]:
+        """Number of ``seeds`` and interquartile mean of ``J_norm`` by delayed arm, over all tasks and delays.
 
         Held-out tasks do not count. Of the others, only the arms and delays that every one has do, and of
         each arm the seeds that it and the undelayed arm have everywhere; there must be two combinations of
@@ -230,30 +244,17 @@ class Comparison:
         """
         by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT_MARK not in task}
         delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
-        cells = [[self.scores(task, delay) for delay in delays] for task in by_task]
-        flat = [cell for row in cells for cell in row]
-        if len(flat) < 2:
+        cells = [self.scores(task, delay) for task in by_task for delay in delays]
+        if len(cells) < 2:
             return {}
-        found = {}
-        for name in list(flat[0])[2:]:
-            if all(name in cell for cell in flat):
-                names = [*list(flat[0])[:2], name]
-                seeds, array = _paired([cell[name] for cell in flat for name in names])
-                if seeds:
-                    by_cell = array.reshape(len(cells), len(delays), len(names), len(seeds))
-                    found[name] = (len(seeds), *_estimates(_interquartile_norms, by_cell))
+        found, (undelayed, random, *arms) = {}, cells[0].columns
+        for arm in [arm for arm in arms if all(arm in cell for cell in cells)]:
+            columns = [cell[[undelayed, random, arm]] for cell in cells]
+            runs = pd.concat(columns, axis=1).dropna().sort_index()
+            if len(runs):
+                by_cell = _scores(runs).reshape(len(by_task), len(delays), 3, len(runs))
+                found[arm] = {"seeds": len(runs), **_estimates(["J_norm"], _interquartile_norms, by_cell)}
         return found
-
-
-def mean_over_seeds(values: Sequence[float], measure: str) -> Estimate:
-    """Mean of the values of a measure by seed."""
-    return _estimates(lambda drawn: drawn.mean(-1), np.array([values]), BOUNDS[measure])[0]
-
-
-def _paired(runs: Sequence[Mapping[int, float]]) -> tuple[list[int], Floats]:
-    """Seeds that all runs have, and their scores, [1, runs, seeds]."""
-    seeds = sorted(set.intersection(*map(set, runs)))
-    return seeds, np.array([[[scores[seed] for seed in seeds] for scores in runs]])
 
 
 def _norms(scores: Floats) -> Floats:
@@ -270,73 +271,14 @@ def _improvement(scores: Floats) -> Floats:
     return probability_of_improvement(scores[..., 0, -1, :], other)
 
 
+def _recovery(scores: Floats, least: float = 0.0) -> Floats:
+    """Recovery of the last arm, [*, 1, arms, seeds] to [*]; before it undelayed, random and the naive."""
+    means = scores.mean(-1)[..., 0, :]
+    return recovery(means[..., -1], means[..., 2:-1].max(-1), means[..., 0], means[..., 1], least)
+
+
 def _interquartile_norms(scores: Floats) -> Floats:
-    """Interquartile means of J_norm, [*, tasks, delays, arms, seeds] to [*, arms - 2]."""
+    """Interquartile mean of J_norm, [*, tasks, delays, 3, seeds] to [*]: undelayed, random and an arm."""
     means = scores.mean(-1, keepdims=True)
-    norms = normalised(scores[..., 2:, :], means[..., :1, :], means[..., 1:2, :])
-    by_arm = np.moveaxis(norms, -2, -4)
-    return interquartile_mean(by_arm.reshape(*by_arm.shape[:-3], -1))
-
-
-def _recovery(scores: Floats) -> Estimate:
-    """Recovery of the last arm, [1, arms, seeds]; first come undelayed and random, then the naive arms."""
-
-    def statistic(scores: Floats, least: float = 0.0) -> Floats:
-        means = scores.mean(-1)[..., 0, :]
-        return recovery(means[..., -1], means[..., 2:-1].max(-1), means[..., 0], means[..., 1], least)
-
-    return UNKNOWN if np.isnan(statistic(scores, LEAST_GAP)) else _estimates(statistic, scores)[0]
-
-
-@dataclass(frozen=True)
-class Line:
-    """Line of the table: one policy of one arm, over its seeds."""
-
-    task: str
-    delay: str
-    arm: str
-    regime: str
-    policy: str
-    seeds: list[int]
-    measures: dict[str, Estimate]
-    compared: Compared = field(default_factory=Compared)
-
-    def cells(self) -> dict[str, Any]:
-        """Columns of ``table.csv`` by name; unknown numbers are empty."""
-        cells: dict[str, Any] = {k: getattr(self, k) for k in ("task", "delay", "arm", "regime", "policy")}
-        cells |= {"seeds": len(self.seeds), "compared_seeds": len(self.compared.seeds)}
-        found = {**self.measures, **{column.name: self.compared[column.name] for column in COMPARED}}
-        for name, estimate in found.items():
-            parts = UNKNOWN if np.isnan(estimate.value) else estimate
-            for suffix, value in zip(("", "_low", "_high"), parts, strict=True):
-                cells[name + suffix] = "" if np.isnan(value) else value
-        return cells
-
-
-def _lines(comparison: Comparison) -> Iterator[Line]:
-    """Lines of every arm and policy, task by task and delay by delay; the undelayed arm comes first."""
-    for task in comparison.tasks():
-        for delay in (NOT_LATE, *comparison.delays(task)):
-            arms = comparison.present(task, delay)
-            compared = {} if delay == NOT_LATE else comparison.compared(task, delay)
-            for arm in arms:
-                for policy in OF_ARM[2:] if comparison.arms[arm].untrained else OF_ARM:
-                    # An arm that flies the policies of another one has no untrained network.
-                    if comparison.values(task, delay, arm, policy, comparison.score):
-                        line = _line(comparison, task, delay, arm, policy)
-                        untrained = UNTRAINED_OF if comparison.arms[arm].untrained else {}
-                        best = policy == untrained.get(comparison.policy, comparison.policy)
-                        found = compared.get(arm) if best else None
-                        yield replace(line, compared=found) if found else line
-            for arm in arms[:1]:
-                for policy in SCRIPTED:
-                    # The script does not fly in every region.
-                    if comparison.values(task, delay, arm, policy, comparison.score):
-                        yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
-
-
-def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) -> Line:
-    found = {name: comparison.values(task, delay, arm, policy, name) for name in MEASURES}
-    means = {name: mean_over_seeds(list(runs.values()), name) for name, runs in found.items()}
-    information = regime(comparison.arms, arm)
-    return Line(task, delay, arm, information, policy, sorted(found["age"]), means)
+    norms = normalised(scores[..., 2, :], means[..., 0, :], means[..., 1, :])
+    return interquartile_mean(norms.reshape(*norms.shape[:-3], -1))

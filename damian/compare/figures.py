@@ -1,33 +1,31 @@
 """Figures of a comparison: learning curves, J_norm of each arm, and the matrix of held-out tasks."""
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from damian.common.plotting import COLOURS, STYLE
 from damian.compare.comparison import (
-    BOUNDS,
+    ENDS,
     HELD_OUT_MARK,
+    MEASURED,
     NOT_LATE,
+    Arm,
     Comparison,
-    Estimate,
-    mean_over_seeds,
 )
 from damian.compare.statistics import Floats, bootstrap
 from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
 
 Panel = TypeVar("Panel")
-Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
-"""Rows of ``metrics.csv`` of each seed, by task, delay and arm."""
 
 LABELS = {
     "hindsight_return": "return in hindsight",
@@ -54,11 +52,13 @@ _POINTS = 200
 """Number of points of a learning curve."""
 _DELAY, _FLOWN = "delay_", 4
 """Begin of the name of a held-out delay; least number of them under which a policy flew, to be drawn."""
+_SPECIALISTS = ", trained at each delay"
+"""End of the label of a line of policies that fly under the delay at which they were trained."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
 
-def plot_curves(comparison: Comparison, curves: Curves, path: Path) -> None:
+def plot_curves(comparison: Comparison, path: Path) -> None:
     """Draw learning curves over environment steps; over episodes if the runs made different numbers of steps.
 
     One task has a row of panels for each delay, with return and, where it can succeed, success rate and
@@ -66,26 +66,29 @@ def plot_curves(comparison: Comparison, curves: Curves, path: Path) -> None:
     A curve is the mean over seeds, with its 95 % band. Dashed lines: the random policy; dash-dotted: the
     undelayed script; dotted: arms that train nothing.
     """
-    grid = [row for row in _panels(comparison, curves) if row]
+    grid = [row for row in _panels(comparison) if row]
     if all(len(row) == 1 for row in grid):
         grid = _rows([panel for (panel,) in grid], 2)
-    ends = [run[-1]["frames"] for runs in curves.values() for run in runs] or [0]
+    ends = [run["frames"].iloc[-1] for runs in comparison.curves.values() for run in runs] or [0]
     progress = "frames" if min(ends) > 0.95 * max(ends) else "episodes"  # batches end a little later
-    _save(path, grid, partial(_curve_panel, comparison, curves, progress), (3.2, 2.6))
+    _save(path, grid, partial(_curve_panel, comparison, progress), (3.2, 2.6))
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
     """Draw J_norm of each arm under each delay, with 95 % intervals, in a panel for each task with any."""
-    norms = {task: found for task in comparison.tasks() if (found := _known_norms(comparison, task))}
-    grid = _rows([*norms], 4)
+    known = comparison.table.dropna(subset="J_norm")
+    grid = _rows([*known["task"].unique()], 4)
     arms = [name for name, arm in comparison.arms.items() if arm.delayed]
 
     def panel(axis: Axes, task: str) -> None:
-        for arm in [arm for arm in arms if arm in norms[task]]:
-            place = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
-            known = [(x + place, norm) for x, norm in norms[task][arm].items()]
-            _error_bars(axis, known, label=arm, **look(comparison, arm) | {"linestyle": ""})
         delays = comparison.delays(task)
+        for arm in arms:
+            lines = known[(known["task"] == task) & (known["arm"] == arm)]
+            shift = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
+            places = [delays.index(delay) + shift for delay in lines["delay"]]
+            _error_bars(
+                axis, places, lines, "J_norm", label=arm, **look(comparison.arms, arm) | {"linestyle": ""}
+            )
         axis.set_xticks(range(len(delays)), delays)
         title = task.replace(HELD_OUT_MARK, ", held-out ")
         axis.set(title=title, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
@@ -101,60 +104,72 @@ def plot_matrix(comparison: Comparison, path: Path) -> None:
     """Draw the scores of policies over the held-out delays under which they flew, a line for each training.
 
     Held-out tasks of delays have names that begin with ``delay_``; a policy must have flown under four.
+    Dashed, an arm that was trained at several constant delays: at each one, the policies trained there.
     """
-    flown: dict[str, list[str]] = {}
-    for task in comparison.tasks():
-        trained_in, _, change = task.partition(HELD_OUT_MARK)
-        flown.setdefault(trained_in, []).extend([task] * change.startswith(_DELAY))
-    flown = {task: sorted(tasks, key=lambda name: (len(name), name)) for task, tasks in flown.items()}
-
-    def lines(task: str) -> Iterator[tuple[str, str, dict[int, Estimate]]]:
-        trained = {(row["delay"], row["arm"]): None for row in comparison.rows if row["task"] in flown[task]}
-        for delay, arm in trained:
-            runs = (
-                comparison.values(each, delay, arm, comparison.policy, comparison.score)
-                for each in flown[task]
-            )
-            known = {x: mean_over_seeds([*of.values()], comparison.score) for x, of in enumerate(runs) if of}
-            if len(known) >= _FLOWN:
-                yield delay, arm, known
+    drawn = {task: found for task in comparison.tasks() if (found := _matrix(comparison, task))}
 
     def panel(axis: Axes, task: str) -> None:
-        names = [each.partition(HELD_OUT_MARK)[2].removeprefix(_DELAY) for each in flown[task]]
-        for number, (delay, arm, known) in enumerate(lines(task)):
+        names = sorted({name for lines in drawn[task].values() for name in lines.index}, key=_delay_order)
+        for number, (label, lines) in enumerate(drawn[task].items()):
             style = {
                 "color": ARM_COLOURS[number % len(ARM_COLOURS)],
                 "marker": _MARKERS[number % len(_MARKERS)],
             }
-            _error_bars(axis, [*known.items()], label=f"{arm}, trained at {delay}", linewidth=1.2, **style)
+            style["linestyle"] = "--" if label.endswith(_SPECIALISTS) else "-"
+            in_order = lines.loc[[name for name in names if name in lines.index]]
+            places = [names.index(name) for name in in_order.index]
+            _error_bars(axis, places, in_order, comparison.score, label=label, linewidth=1.2, **style)
         axis.set_xticks(range(len(names)), names, rotation=90)
         axis.set(title=task, xlabel="delay of the flight [steps], or its law", ylabel=comparison.score)
 
-    _save(path, [[task] for task in flown if [*lines(task)]], panel, (6.4, 3.6))
+    _save(path, [[task] for task in drawn], panel, (6.4, 3.6))
 
 
-def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Path) -> None:
-    """Draw means with 95 % intervals in a row for each group of runs, and a colour for each policy."""
-    groups = list(dict.fromkeys(name for found in means.values() for name in found))
+def _matrix(comparison: Comparison, task: str) -> dict[str, pd.DataFrame]:
+    """Lines of the figure of a task by their labels: lines of the table, by the delay of the flight."""
+    table = comparison.table[comparison.table["policy"] == comparison.policy]
+    away = table[table["task"].str.startswith(f"{task}{HELD_OUT_MARK}{_DELAY}")]
+    away = away.set_index(away["task"].str.removeprefix(f"{task}{HELD_OUT_MARK}{_DELAY}"))
+    drawn = {
+        f"{arm}, trained at {delay}": lines
+        for (delay, arm), lines in away.groupby(["delay", "arm"], sort=False)
+        if len(lines) >= _FLOWN
+    }
+    constant = [name for name in away.index.unique() if name.isdecimal()]
+    own = table[(table["task"] == task) & table["delay"].isin(constant)].set_index("delay", drop=False)
+    of_arms = own.groupby("arm", sort=False)
+    special = {f"{arm}{_SPECIALISTS}": lines for arm, lines in of_arms if len(lines) > 1}
+    return drawn | special if drawn else {}
+
+
+def _delay_order(name: str) -> tuple[bool, int, str]:
+    """Constant delays by their number of steps, then laws."""
+    return (False, int(name), "") if name.isdecimal() else (True, 0, name)
+
+
+def plot_means(table: pd.DataFrame, name: str, path: Path) -> None:
+    """Draw a column of a table with a line for each group of runs and policy: a row for each group."""
+    groups, policies = table["group"].unique().tolist(), table["policy"].unique().tolist()
 
     def panel(axis: Axes, _: None) -> None:
-        for place, (policy, found) in enumerate(means.items()):
-            shift = 0.5 * ((place + 0.5) / len(means) - 0.5)
-            rows = [groups.index(name) + shift for name in found]
-            value, low, high = np.array([*found.values()], dtype=float).reshape(-1, 3).T
+        for place, policy in enumerate(policies):
+            lines = table[table["policy"] == policy]
+            shift = 0.5 * ((place + 0.5) / len(policies) - 0.5)
+            rows = [groups.index(group) + shift for group in lines["group"]]
+            value, low, high = (lines[name + end].to_numpy() for end in ENDS)
             ends = np.nan_to_num([value - low, high - value])
             axis.errorbar(value, rows, xerr=ends, fmt="o", color=colour_of(policy), label=policy)
         axis.set_yticks(range(len(groups)), groups)
         axis.invert_yaxis()
-        axis.set_xlabel(label)
+        axis.set_xlabel(name)
 
     _save(path, [[None]], panel, (5.2, 0.4 * len(groups) + 1.4))
 
 
-def look(comparison: Comparison, arm: str) -> dict[str, Any]:
+def look(arms: Mapping[str, Arm], arm: str) -> dict[str, Any]:
     """Colour of an arm; line and marker, which tell it from those before it that have the same colour."""
-    before = list(comparison.arms)[: list(comparison.arms).index(arm)]
-    again, of_arm = sum(colour_of(other) == colour_of(arm) for other in before), comparison.arms[arm]
+    before = [*arms][: [*arms].index(arm)]
+    again, of_arm = sum(colour_of(other) == colour_of(arm) for other in before), arms[arm]
     trains = of_arm.policy_of is None and not of_arm.untrained
     lines = _LINES if trains else _DOTTED
     return {
@@ -201,47 +216,44 @@ def _save(
         figure.savefig(path, dpi=150)
 
 
-def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str, str]]]:
+def _panels(comparison: Comparison) -> list[list[tuple[str, str, str]]]:
     """Task, delay and measure of each panel, by rows."""
     tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
     delays = {task: comparison.delays(task) or [NOT_LATE] for task in tasks}
     if len(tasks) > 1:
         return [[(task, delay, "hindsight_return") for delay in delays[task]] for task in tasks]
-    rows = [row for runs in curves.values() for run in runs for row in run]
-    succeeds = any(not np.isnan(row["perceived_success_rate"]) for row in rows)
+    succeeds = comparison.points["perceived_success_rate"].notna().any()
     measures = [*LABELS] if succeeds else ["hindsight_return"]  # else episodes end at their limit
     return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]
 
 
-def _curve_panel(
-    comparison: Comparison, curves: Curves, progress: str, axis: Axes, content: tuple[str, str, str]
-) -> None:
+def _curve_panel(comparison: Comparison, progress: str, axis: Axes, content: tuple[str, str, str]) -> None:
     """Draw all arms in a panel of ``_panels``."""
     task, delay, measure = content
     flown = "return" if measure == "hindsight_return" else measure  # of an evaluation, which knows the truth
     axis.set(xlabel=PROGRESS[progress], ylabel=LABELS[measure], title=f"{task}, delay {delay}")
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    table = comparison.table.set_index(["task", "delay", "arm", "policy"])[flown]
     for name, arm in comparison.arms.items():
         run = (task, delay if arm.delayed else NOT_LATE, name)
-        style: dict[str, Any] = look(comparison, name) | {"marker": "", "label": name}
-        if run in curves:
-            place, values = curve(curves[run], measure, progress)
-            low, high = bootstrap(lambda v: v.mean(-1), values[None], draws=500, bounds=BOUNDS[flown])
-            axis.plot(place, values.mean(-1), linewidth=1.2, **style)
-            axis.fill_between(place, low[0], high[0], color=style["color"], alpha=0.2, linewidth=0)
-        elif values := comparison.values(*run, comparison.policy, flown):
-            axis.axhline(fmean(values.values()), **style)
+        style: dict[str, Any] = look(comparison.arms, name) | {"marker": "", "label": name}
+        if run in comparison.curves:
+            place, values = curve(comparison.curves[run], measure, progress)
+            mean, low, high = bootstrap(
+                lambda v: v.mean(-1)[..., 0, :], values[None], draws=500, bounds=MEASURED[flown][1:]
+            )
+            axis.plot(place, mean, linewidth=1.2, **style)
+            axis.fill_between(place, low, high, color=style["color"], alpha=0.2, linewidth=0)
+        elif (level := table.get((*run, comparison.policy_of(name)))) is not None:
+            axis.axhline(level, **style)
     for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, f"{SCRIPT}, undelayed", "-.")):
-        if values := comparison.values(task, NOT_LATE, comparison.undelayed, policy, flown):
-            level: dict[str, Any] = _LEVEL | {"linestyle": line}
-            axis.axhline(fmean(values.values()), label=label, **level)
+        if (level := table.get((task, NOT_LATE, policy, policy))) is not None:
+            axis.axhline(level, label=label, **_LEVEL | {"linestyle": line})
 
 
-def curve(
-    runs: Sequence[Sequence[Mapping[str, float]]], name: str, progress: str = "frames"
-) -> tuple[Floats, Floats]:
+def curve(runs: Sequence[pd.DataFrame], name: str, progress: str = "frames") -> tuple[Floats, Floats]:
     """Steps or episodes (``progress``) that all seeds reached, [points]; a measure there, [points, seeds]."""
-    points = [np.array([(r[progress], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
+    points = [run[[progress, name]].dropna(subset=name).to_numpy() for run in runs]
     points = [run for run in points if len(run)]
     first = max((run[0, 0] for run in points), default=np.inf)
     last = min((run[-1, 0] for run in points), default=-np.inf)
@@ -251,18 +263,7 @@ def curve(
     return place, np.stack([np.interp(place, *run.T) for run in points], -1)
 
 
-def _known_norms(comparison: Comparison, task: str) -> dict[str, dict[int, Estimate]]:
-    """J_norm by arm and number of the delay, where it is known."""
-    found: dict[str, dict[int, Estimate]] = {}
-    for x, delay in enumerate(comparison.delays(task)):
-        for arm, compared in comparison.compared(task, delay).items():
-            if not np.isnan(compared["J_norm"].value):
-                found.setdefault(arm, {})[x] = compared["J_norm"]
-    return found
-
-
-def _error_bars(axis: Axes, known: Sequence[tuple[float, Estimate]], **style: Any) -> None:
-    """Draw known estimates at their places; an infinite interval has no bar."""
-    bars = np.array([(each.value - each.low, each.high - each.value) for _, each in known]).T
-    places, values = zip(*((x, each.value) for x, each in known), strict=True)
-    axis.errorbar(places, values, yerr=bars, markersize=4, **style)
+def _error_bars(axis: Axes, places: Sequence[float], lines: pd.DataFrame, name: str, **style: Any) -> None:
+    """Draw a column of a comparison's table at these places; an infinite interval has no bar."""
+    value, low, high = (lines[name + end].to_numpy() for end in ENDS)
+    axis.errorbar(places, value, yerr=[value - low, high - value], markersize=4, **style)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from damian.common.tables import markdown_table
@@ -13,24 +14,24 @@ from damian.compare.comparison import (
     NOT_LATE,
     SCRIPTED,
     Comparison,
-    Line,
+    shown,
 )
-from damian.compare.figures import Curves, curve
+from damian.compare.figures import curve
 
 
-def markdown(comparison: Comparison, curves: Curves, notes: Sequence[str]) -> str:
+def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
     """Return the whole comparison as Markdown, with ``notes`` as lines at the top."""
-    all_lines, parts = comparison.lines, ["\n".join(f"- {note}" for note in notes)]
+    table, parts = comparison.table, ["\n".join(f"- {note}" for note in notes)]
     for task in comparison.tasks():
         for delay in comparison.delays(task) or [NOT_LATE]:
-            lines = [line for line in all_lines if line.task == task and line.delay in (NOT_LATE, delay)]
+            lines = table[(table["task"] == task) & table["delay"].isin([NOT_LATE, delay])]
             parts += [f"## {task}, delay {delay}", _length(comparison, task), _table(lines)]
             if delay != NOT_LATE:
-                parts += _steps(comparison, curves, task, delay)
-    overall = [(arm, seeds, str(norm)) for arm, (seeds, norm) in comparison.overall().items()]
+                parts += _steps(comparison, task, delay)
+    overall = [(arm, found["seeds"], shown(found, "J_norm")) for arm, found in comparison.overall().items()]
     if overall:
-        table = markdown_table(("method", "n", "interquartile mean of J_norm"), overall)
-        parts += ["## All tasks and delays", table]
+        head = ("method", "n", "interquartile mean of J_norm")
+        parts += ["## All tasks and delays", markdown_table(head, overall)]
     return "\n\n".join([*parts, "## Compute", _compute(comparison)]) + "\n"
 
 
@@ -38,32 +39,33 @@ def _length(comparison: Comparison, task: str) -> str:
     """How long the policies of a task were trained."""
     if HELD_OUT_MARK in task:
         return "Policies of another task."
-    trained = sorted(
-        {int(run["frames"]) for run in comparison.runs() if run["task"] == task and run["frames"]}
-    )
-    least_to_most = " to ".join(f"{frames:,}" for frames in dict.fromkeys([*trained[:1], *trained[-1:]]))
+    runs = comparison.runs()
+    trained = runs.loc[(runs["task"] == task) & (runs["frames"] > 0), "frames"]
+    ends = dict.fromkeys((trained.min(), trained.max())) if len(trained) else ()
+    least_to_most = " to ".join(f"{frames:,.0f}" for frames in ends)
     return f"Trained for {least_to_most or 'no'} environment steps."
 
 
-def _table(lines: Sequence[Line]) -> str:
+def _table(lines: pd.DataFrame) -> str:
     rows = []
-    for line in lines:
-        name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
-        measured = [str(line.measures[column.name]) for column in MEASURED]
-        compared = [str(line.compared[column.name]) for column in COMPARED]
-        n_compared = str(len(line.compared.seeds) or "-")
-        rows.append([name, line.regime, line.policy, str(len(line.seeds)), *measured, n_compared, *compared])
-    heads = [*(column.head for column in MEASURED), "n compared", *(column.head for column in COMPARED)]
-    return markdown_table(["method", "regime", "policy", "n", *heads], rows, left=3)
+    for line in lines.to_dict("records"):
+        undelayed = " (undelayed)" if line["delay"] == NOT_LATE and line["arm"] in SCRIPTED else ""
+        labels = (line["arm"] + undelayed, line["regime"], line["policy"], line["seeds"])
+        measured, compared = ([shown(line, name) for name in names] for names in (MEASURED, COMPARED))
+        rows.append([*labels, *measured, line["compared_seeds"] or "-", *compared])
+    measured, compared = ([column.head for column in columns.values()] for columns in (MEASURED, COMPARED))
+    return markdown_table(
+        ["method", "regime", "policy", "n", *measured, "n compared", *compared], rows, left=3
+    )
 
 
-def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> list[str]:
+def _steps(comparison: Comparison, task: str, delay: str) -> list[str]:
     """Table of the environment steps in which arms reach the final training return of the best naive arm."""
     found = {}
     for arm, of_arm in comparison.arms.items():
-        run = (task, delay if of_arm.delayed else NOT_LATE, arm)
-        if run in curves:
-            steps, values = curve(curves[run], "hindsight_return")
+        runs = comparison.curves.get((task, delay if of_arm.delayed else NOT_LATE, arm))
+        if runs is not None:
+            steps, values = curve(runs, "hindsight_return")
             tenth = len(steps) // 10
             found[arm] = steps[tenth - 1 :], sliding_window_view(values, tenth, axis=0).mean(-1)
     ends = {arm: found[arm][1][-1].mean() for arm in found if comparison.arms[arm].naive}
@@ -82,10 +84,7 @@ def _steps(comparison: Comparison, curves: Curves, task: str, delay: str) -> lis
 def _compute(comparison: Comparison) -> str:
     """Number and time of the runs of each arm."""
     runs = comparison.runs()
-    by_arm = {arm: [run["seconds"] for run in runs if run["arm"] == arm] for arm in comparison.arms}
-    rows = [
-        (arm, len(times), f"{sum(times) / len(times):.0f}", f"{sum(times) / 3600:.2f}")
-        for arm, times in (by_arm | {"all": [run["seconds"] for run in runs]}).items()
-        if times
-    ]
+    of_arms = dict(iter(runs.groupby("arm")["seconds"]))
+    times = {arm: of_arms[arm] for arm in comparison.arms if arm in of_arms} | {"all": runs["seconds"]}
+    rows = [(arm, len(x), f"{x.mean():.0f}", f"{x.sum() / 3600:.2f}") for arm, x in times.items()]
     return markdown_table(("method", "runs", "seconds a run", "hours of all runs"), rows)

@@ -1,18 +1,17 @@
 """Numbers of a training, written row by row: ``metrics.csv``, TensorBoard events, the user's own loggers."""
 
-import csv
-import io
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from damian.common.atomic_files import write_atomically, writing
+from damian.common.atomic_files import writing
 from damian.common.errors import InputError, naming_errors
+from damian.common.tables import read_csv, write_csv
 from damian.runs.loggers import Logger
 
 METRICS = "metrics.csv"
@@ -36,10 +35,12 @@ class MetricsLog:
     ) -> None:
         self._folder, self._loggers, self._settings = folder, loggers, settings or {}
         self._path = folder / METRICS if to_csv else None
-        self.rows = [row for row in read_metrics(folder) if row["frames"] <= frames]
-        self._columns = [*self.rows[0]] if self.rows else []
+        stored = read_metrics(folder)
+        stored = stored[stored[_FIRST_COLUMN] <= frames]
+        self.rows = stored.to_dict("records")
+        self._columns = [*stored.columns] if self.rows else []
         if self._path:
-            write_atomically(self._path, self._text(self.rows, head=True) if self.rows else "")
+            write_csv(self._path, pd.DataFrame(self.rows))
         # TensorBoard does not show what older files hold of steps from ``purge_step`` on.
         purge_step = frames + 1 if frames else None
         self._events = SummaryWriter(str(folder), purge_step=purge_step) if tensorboard else None
@@ -62,10 +63,11 @@ class MetricsLog:
         new = [name for name in row if name not in self._columns]
         self._columns += new
         if self._path and new:  # a learner may log more once it has begun to learn
-            write_atomically(self._path, self._text(self.rows, head=True))
+            write_csv(self._path, pd.DataFrame(self.rows))
         elif self._path:
-            with writing(self._path), self._path.open("a", encoding="utf-8", newline="") as file:
-                file.write(self._text([row]))
+            line = pd.DataFrame([row], columns=self._columns)
+            with writing(self._path):
+                line.to_csv(self._path, mode="a", header=False, index=False, na_rep="nan")
 
     def sync(self) -> None:
         """Make the rows last, even if the machine stops; a checkpoint comes after its rows."""
@@ -98,29 +100,11 @@ class MetricsLog:
             for summary in hparams(plain, dict.fromkeys(numbers, 0.0)):
                 self._events.file_writer.add_summary(summary)  # type: ignore[union-attr]
 
-    def _text(self, rows: Sequence[Mapping[str, float]], head: bool = False) -> str:
-        """Rows as CSV, with the line of the names above them if ``head``."""
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self._columns, restval=math.nan)
-        if head:
-            writer.writeheader()
-        writer.writerows(rows)
-        return text.getvalue()
 
-
-def read_metrics(folder: Path) -> list[dict[str, float]]:
+def read_metrics(folder: Path) -> pd.DataFrame:
     """The rows of a run's ``metrics.csv``, if there is one, without an unfinished last line."""
     path = folder / METRICS
-    if not path.exists():
-        return []
-    try:
-        text = path.read_text(encoding="utf-8")
-        reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
-        rows = [{name: float(number) for name, number in row.items()} for row in reader]
-    except OSError as error:
-        raise InputError(f"{path}: it cannot be read: {error.strerror}") from None
-    except (TypeError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: it is not a table of numbers ({error})") from None
-    if rows and _FIRST_COLUMN not in rows[0]:
+    table = read_csv(path) if path.exists() else pd.DataFrame()
+    if len(table) and _FIRST_COLUMN not in table:
         raise InputError(f"{path}: it has no column {_FIRST_COLUMN}")
-    return rows
+    return table if len(table) else pd.DataFrame({_FIRST_COLUMN: []}, dtype=float)

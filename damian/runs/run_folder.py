@@ -5,9 +5,11 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+import pandas as pd
+
 from damian.common.atomic_files import write_atomically
-from damian.common.tables import csv_table, markdown_table
-from damian.runs.metrics import EVALUATED, Evaluation
+from damian.common.tables import markdown_table, read_csv, write_csv
+from damian.runs.metrics import Evaluation
 
 FIGURE = "learning_curve.png"
 CHECKPOINT = "checkpoint.pt"
@@ -66,9 +68,14 @@ def save_results(
     below = "\n".join(filter(None, [note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
-    cells = [["policy", *EVALUATED], *([name, *each.row().values()] for name, each in rows.items())]
-    write_atomically(folder / RESULTS, csv_table(cells))  # last: with it, a run counts as finished
+    cells = pd.DataFrame([{"policy": name, **each.row()} for name, each in rows.items()])
+    write_csv(folder / RESULTS, cells)  # last: with it, a run counts as finished
     return table
+
+
+def read_results(path: Path) -> pd.DataFrame:
+    """Evaluations as a run or a comparison has written them, one in a row."""
+    return read_csv(path, text=("task", "delay", "arm", "regime", "policy"))
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:

@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))  # for recipes, in a clone
 
 import torch
 from lockstep import BEGIN, Lockstep
+from scipy.special import stdtrit
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from vehicles import Airframe, Radio, Weather
@@ -33,7 +34,6 @@ from damian.advice.node import Node, for_uavs
 from damian.advice.rows import Report, validated
 from damian.advice.session import AdviceSession
 from damian.baselines.greedy import greedy_policy
-from damian.compare.statistics import student_quantile
 from damian.envs.pipeline import make_env
 from recipes import cli
 from recipes.evaluate import stored_actor, untrained_actor
@@ -145,7 +145,7 @@ def write_reports(folder: Path) -> Path:
 
 def mean(values: Tensor) -> str:
     """A mean with its 95 % interval, by Student's t."""
-    half = student_quantile(0.975, len(values) - 1) * float(values.std()) / math.sqrt(len(values))
+    half = stdtrit(len(values) - 1, 0.975) * float(values.std()) / math.sqrt(len(values))
     return (
         f"{float(values.mean()):.2f} [{float(values.mean()) - half:.2f}, {float(values.mean()) + half:.2f}]"
     )

@@ -17,6 +17,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -24,7 +25,7 @@ from tqdm import tqdm
 from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.common.tables import markdown_table
-from damian.compare.comparison import mean_over_seeds
+from damian.compare.comparison import means_over_seeds, shown
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.keys import next_key
@@ -41,6 +42,14 @@ DIRECTIONS, AT_REST = 8, 0.4
 """Directions of the classes of velocity; share of the steps, the slowest ones, that count as rest."""
 WALKS, STEPS, RARE = 512, 128, 1e-6
 """Walks from which moves are counted, and their steps; weight of a move that was never counted."""
+HEADER = (
+    "task",
+    "return: place",
+    "place and velocity",
+    "more [%]",
+    "log-probability: place",
+    "and velocity",
+)
 GridBuilder = Callable[..., SourceGrid]
 
 
@@ -139,21 +148,10 @@ def main() -> None:
         ]
         returns, logs = ([[each[i] for each in runs] for runs in found] for i in (0, 1))
         more = [100 * (b / a - 1) for a, b in zip(*returns, strict=True)]
-        rows.append(
-            (
-                f"{task}, {late} steps late",
-                *(mean_over_seeds(each, "return") for each in (*returns, more, *logs)),
-            )
-        )
-    header = (
-        "task",
-        "return: place",
-        "place and velocity",
-        "more [%]",
-        "log-probability: place",
-        "and velocity",
-    )
-    print(markdown_table(header, rows))
+        columns = dict(zip(HEADER[1:], (*returns, more, *logs), strict=True))
+        means = means_over_seeds(pd.DataFrame(columns))
+        rows.append((f"{task}, {late} steps late", *(shown(means, name) for name in columns)))
+    print(markdown_table(HEADER, rows))
 
 
 if __name__ == "__main__":

@@ -3,13 +3,12 @@
 Finished runs are not repeated, and interrupted ones continue from their checkpoints.
 """
 
-import csv
 import multiprocessing
 import os
 import signal
 import threading
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -30,7 +29,7 @@ from damian.common.errors import InputError, RunError
 from damian.common.fields import leaves
 from damian.runs.checkpoint import digest
 from damian.runs.interrupt import interrupt
-from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS
+from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS, read_results
 from damian.runs.run_lock import locked
 from damian.runs.run_record import read_record
 
@@ -38,8 +37,6 @@ from ..cli import Work
 from ..config import TrainConfig
 from .runs import POLICY, perform, stored_values
 
-WORDS = ("task", "delay", "arm", "regime", "policy")
-"""Columns of results that are not numbers."""
 LOG = "log.txt"
 
 
@@ -79,15 +76,8 @@ class Run:
 
     def score(self, policy: str, measure: str) -> float:
         """A measure of one policy in the results of a finished run, or of its first one."""
-        rows = {row["policy"]: row for row in read_rows(self.folder / RESULTS)}
-        return rows.get(policy, next(iter(rows.values())))[measure]
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of results in a CSV file."""
-    kinds = dict.fromkeys(WORDS, str) | {"seed": int}
-    with path.open(encoding="utf-8", newline="") as file:
-        return [{k: kinds.get(k, float)(x) for k, x in row.items()} for row in csv.DictReader(file)]
+        values = read_results(self.folder / RESULTS).set_index("policy")[measure]
+        return float(values.get(policy, values.iloc[0]))
 
 
 def check_stored(run: Run) -> None:
@@ -109,8 +99,13 @@ def check_stored(run: Run) -> None:
             )
 
 
-def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> list[Run]:
-    """Carry out the runs that are not finished; returns those that failed. The bar shows ``told``."""
+def perform_all(
+    runs: Sequence[Run], processes: int, told: tuple[str, str], done: Callable[[Run], None]
+) -> list[Run]:
+    """Carry out the runs that are not finished, and call ``done`` after each; returns those that failed.
+
+    The bar shows the measure ``told`` (policy and name) of the run that finished last.
+    """
     todo, failed = [run for run in runs if not run.finished], []
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
         for stage in range(3):
@@ -120,6 +115,7 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
                     failed.append(run)
                 else:
                     bar.set_postfix_str(f"{run.name}: {run.score(*told):.3g}")
+                    done(run)
     return failed
 
 

@@ -3,19 +3,21 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
+from matplotlib.figure import Figure
 
 from damian.compare.comparison import (
     RANDOM,
     TRAINED,
     TRAINED_DETERMINISTIC,
-    UNKNOWN,
     UNTRAINED,
     Arm,
     Comparison,
+    shown,
 )
-from damian.compare.figures import look, plot_curves
+from damian.compare.figures import look, plot_curves, plot_matrix
 from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
 
@@ -52,40 +54,51 @@ def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float
     ]
 
 
+def comparison(rows: list[dict], arms: dict[str, Arm] = ARMS, curves: list[dict] = ()) -> Comparison:
+    columns = ["task", "delay", "arm", "seed", "frames", "hindsight_return", "perceived_success_rate"]
+    return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), arms)
+
+
+def compared(found: Comparison) -> dict[str, dict]:
+    """Lines of the delayed arms of a table by arm."""
+    table = found.table
+    lines = table[(table["delay"] != "none") & (table["policy"] == TRAINED) | (table["arm"] == "prior")]
+    return {line["arm"]: line for line in lines.to_dict("records")}
+
+
 THREE = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3], "flown": [5.0, 3, 4], "aware": [6.0, 9, 7]}
 SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
 
 
 def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
-    compared = Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
-    aware = compared["aware"]
-    assert aware.seeds == [0, 1]
-    assert aware["J_norm"].value == 7.5 / 10
-    assert aware["recovery"].value == (7.5 - 4) / (10 - 4)
-    assert aware["improvement"].value == 1
-    assert np.isnan([aware["J_norm"].low, *aware["recovery"][1:]]).all()  # two seeds give no interval
-    assert compared["blind"]["J_norm"].value == 3 / 10
-    for naive in ("blind", "flown"):
-        assert compared[naive]["recovery"] is compared[naive]["improvement"] is UNKNOWN
+    lines = compared(comparison(rows_of("t", "late", SCORES)))
+    aware = lines["aware"]
+    assert aware["compared_seeds"] == 2
+    assert aware["J_norm"] == 7.5 / 10
+    assert aware["recovery"] == (7.5 - 4) / (10 - 4)
+    assert aware["improvement"] == 1
+    assert np.isnan([aware["J_norm_low"], aware["recovery_high"]]).all()  # two seeds give no interval
+    assert lines["blind"]["J_norm"] == 3 / 10
+    assert np.isnan(
+        [lines[naive][name] for naive in ("blind", "flown") for name in ("recovery", "improvement")]
+    ).all()
 
 
 def test_recovery_is_left_out_if_the_delay_costs_nothing():
     scores = SCORES | {"blind": [9.0, 9.5]}
-    aware = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
-    assert aware["J_norm"].value == 0.75
-    assert str(aware["recovery"]) == "-"
+    aware = compared(comparison(rows_of("t", "late", scores)))["aware"]
+    assert aware["J_norm"] == 0.75
+    assert shown(aware, "recovery") == "-"
 
 
 def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
     rows = rows_of("t", "late", THREE)
-    alone = Comparison(rows, ARMS).compared("t", "late")
-    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("aware", 2)]
-    compared = Comparison(unfinished, ARMS).compared("t", "late")
-    assert compared["aware"].seeds == [0, 1]
-    assert repr(compared["blind"]) == repr(alone["blind"])  # an unfinished arm changes no other one
-    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("blind", 0)]
-    compared = Comparison(unfinished, ARMS).compared("t", "late")
-    assert [compared[arm].seeds for arm in ("blind", "flown", "aware")] == [[1, 2]] * 3
+    alone = compared(comparison(rows))
+    lines = compared(comparison([row for row in rows if (row["arm"], row["seed"]) != ("aware", 2)]))
+    assert lines["aware"]["compared_seeds"] == 2
+    assert str(lines["blind"]) == str(alone["blind"])  # an unfinished arm changes no other one
+    lines = compared(comparison([row for row in rows if (row["arm"], row["seed"]) != ("blind", 0)]))
+    assert [lines[arm]["compared_seeds"] for arm in ("blind", "flown", "aware")] == [2] * 3
 
 
 def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
@@ -95,23 +108,20 @@ def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
             rows += rows_of(task, delay, {"blind": [0.0] * 3, "aware": aware})
             norms += [x / np.mean(best) for x in aware]
         rows += rows_of(task, "none", {"best": best})
-    overall = Comparison(rows, ARMS).overall()
-    n_seeds, norm = overall["aware"]
-    assert n_seeds == 3
-    assert norm.value == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
-    assert norm.low < norm.value < norm.high
-    assert overall["blind"][1].value == 0
-    assert Comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")], ARMS).overall()
+    overall = comparison(rows).overall()
+    assert overall["aware"]["seeds"] == 3
+    assert overall["aware"]["J_norm"] == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
+    assert overall["aware"]["J_norm_low"] < overall["aware"]["J_norm"] < overall["aware"]["J_norm_high"]
+    assert overall["blind"]["J_norm"] == 0
+    assert comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")]).overall()
     held_out = rows_of("t@other", "late", {"best": [1.0] * 3, "aware": [9.0] * 3})
-    assert repr(Comparison(rows + held_out, ARMS).overall()) == repr(overall)
-    one = Comparison(rows_of("t", "late", SCORES), ARMS)
-    assert one.overall() == {}
+    assert comparison(rows + held_out).overall() == overall
+    assert comparison(rows_of("t", "late", SCORES)).overall() == {}
 
 
 def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
-    lines = Comparison(rows_of("t", "late", THREE), ARMS).lines
-    labels = [(line.delay, line.arm, line.policy) for line in lines]
-    assert labels == [
+    table = comparison(rows_of("t", "late", THREE)).table
+    assert [*table[["delay", "arm", "policy"]].itertuples(index=False, name=None)] == [
         ("none", "best", TRAINED),
         ("none", "best", TRAINED_DETERMINISTIC),
         ("none", RANDOM, RANDOM),
@@ -122,7 +132,7 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
         ],
         ("late", RANDOM, RANDOM),
     ]
-    cells = lines[7].cells()
+    cells = table.loc[7]
     assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", TRAINED]
     assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
     value, low, high = (cells[f"return{end}"] for end in ("", "_low", "_high"))
@@ -132,7 +142,7 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert cells["recovery"] == pytest.approx((22 / 3 - 4) / 6)
     assert cells["improvement"] == cells["improvement_high"] == 1
     assert cells["improvement_low"] == pytest.approx(0.5, abs=0.01)
-    assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
+    assert np.isnan([table.loc[3, "recovery"], table.loc[8, "J_norm"]]).all()
 
 
 def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
@@ -143,11 +153,20 @@ def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
         ("t", "late", "aware"): [3.0, 13.0],
         ("t", "none", "best"): [40.0],
     }
-    curves = {
-        run: [[{"frames": x, "hindsight_return": end * x / 100} for x in (0, 100)] for end in seeds]
-        for run, seeds in ends.items()
-    }
-    lines = markdown(Comparison(rows_of("t", "late", SCORES), ARMS), curves, []).splitlines()
+    points = [
+        {
+            "task": task,
+            "delay": delay,
+            "arm": arm,
+            "seed": seed,
+            "frames": x,
+            "hindsight_return": end * x / 100,
+        }
+        for (task, delay, arm), of_seeds in ends.items()
+        for seed, end in enumerate(of_seeds)
+        for x in (0, 100)
+    ]
+    lines = markdown(comparison(rows_of("t", "late", SCORES), ARMS, points), []).splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.endswith("of *blind*, 3.8:")) :]
     rows = {arm: numbers for arm, *numbers in (line.strip("| ").split(" | ") for line in table[4:7])}
     assert rows["best"] == ["15", "15", "15"]
@@ -156,17 +175,34 @@ def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
 
 
 def test_arms_that_train_nothing_are_drawn_without_curves(tmp_path):
-    plot_curves(Comparison(rows_of("t", "late", SCORES), ARMS), {}, tmp_path / "curves.png")
+    plot_curves(comparison(rows_of("t", "late", SCORES)), tmp_path / "curves.png")
     assert (tmp_path / "curves.png").exists()
+
+
+def test_the_matrix_shows_policies_for_every_delay_beside_those_of_each_delay(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    rows = [
+        row for delay in ("2", "10", "1-7") for row in rows_of("t", delay, {"aware": [float(len(delay))] * 3})
+    ]
+    for number, flown in enumerate(("lag", "10", "1-7", "2", "0")):
+        rows += rows_of(f"t@delay_{flown}", "1-7", {"aware": [float(number)] * 3})
+    plot_matrix(comparison(rows), tmp_path / "matrix.png")
+    (axis,) = drawn[0].axes
+    assert [tick.get_text() for tick in axis.get_xticklabels()] == ["0", "2", "10", "1-7", "lag"]
+    lines = dict(zip(axis.get_legend_handles_labels()[1], axis.get_lines(), strict=False))
+    every, each = lines["aware, trained at 1-7"], lines["aware, trained at each delay"]
+    assert (every.get_xdata().tolist(), every.get_ydata().tolist()) == ([0, 1, 2, 3, 4], [4, 3, 1, 2, 0])
+    assert (each.get_xdata().tolist(), each.get_ydata().tolist()) == ([1, 2], [1, 2])
+    assert (every.get_linestyle(), each.get_linestyle()) == ("-", "--")
 
 
 def test_a_recovery_is_from_the_naive_arm_of_the_same_track():
     scores = SCORES | {"flown": [9.0, 8.0]}  # naive, but trained undelayed: not the reference of late data
     arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
-    comparison = Comparison(rows_of("t", "late", scores), arms)
-    compared = comparison.compared("t", "late")
-    assert compared["aware"]["recovery"].value == pytest.approx((7.5 - 3) / (10 - 3))
-    assert compared["flown"]["recovery"] is UNKNOWN  # the strongest naive arm of its track
+    lines = compared(comparison(rows_of("t", "late", scores), arms))
+    assert lines["aware"]["recovery"] == pytest.approx((7.5 - 3) / (10 - 3))
+    assert np.isnan(lines["flown"]["recovery"])  # the strongest naive arm of its track
 
 
 def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its_own():
@@ -175,20 +211,21 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     rows += [
         row("t", "late", arm, seed, 2.0 + seed, UNTRAINED) for arm in ("aware", "prior") for seed in (0, 1)
     ]
-    lines = [line for line in Comparison(rows, arms).lines if line.policy == UNTRAINED]
-    assert [line.arm for line in lines] == ["aware", "prior"]
-    assert all(line.measures["return"].value == 2.5 for line in lines)
-    aware, prior = (line.compared for line in lines)
-    assert aware.seeds == []  # only the trained policy of an arm is compared with others
-    assert prior["J_norm"].value == pytest.approx(2.5 / 10)
-    assert prior["recovery"].value == pytest.approx((2.5 - 4) / 6)
+    table = comparison(rows, arms).table
+    lines = table[table["policy"] == UNTRAINED]
+    assert [*lines["arm"]] == ["aware", "prior"]
+    assert (lines["return"] == 2.5).all()
+    aware, prior = lines.to_dict("records")
+    assert aware["compared_seeds"] == 0  # only the trained policy of an arm is compared with others
+    assert prior["J_norm"] == pytest.approx(2.5 / 10)
+    assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
 
 
 def test_methods_of_an_experiment_look_different_and_keep_their_colours_without_the_others():
     for path in Path("conf/experiment").glob("*.yaml"):
         arms = {name: Arm(**given) for name, given in yaml.safe_load(path.read_text())["arms"].items()}
-        looks = {name: look(Comparison([], arms), name) for name in arms}
+        looks = {name: look(arms, name) for name in arms}
         for style in ("linestyle", "marker"):
             assert len({(each["color"], each[style]) for each in looks.values()}) == len(arms)
         for name, arm in arms.items():
-            assert look(Comparison([], {name: arm}), name)["color"] == looks[name]["color"]
+            assert look({name: arm}, name)["color"] == looks[name]["color"]

@@ -61,7 +61,8 @@ def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
 
 
 def test_a_sweep_ends_with_a_table_of_means_over_seeds(sweep, capsys):
-    rows = [row for row in damian.results(sweep) if row["policy"] == "trained"]
+    rows = damian.results(sweep)
+    rows = rows[rows["policy"] == "trained"].to_dict("records")
     assert [(row["delay.obs"], row["seed"]) for row in rows] == [(d, s) for d in (1, 2) for s in (0, 1, 2)]
     for row in rows:
         assert stored(sweep / row["folder"], "trained")["return"] == row["return"]
@@ -109,9 +110,8 @@ def test_a_sweep_in_several_processes_ends_with_its_table_too(tmp_path):
 
 def test_results_of_a_run_and_of_a_comparison_are_rows_too(sweep):
     run = next(path.parent for path in sweep.rglob("result.csv"))
-    assert [row["policy"] for row in damian.results(run)][:2] == ["untrained", "untrained, deterministic"]
+    assert [*damian.results(run)["policy"]][:2] == ["untrained", "untrained, deterministic"]
     folder = Path(__file__).parents[2] / "docs" / "results" / "delaybench"
-    rows = damian.results(folder)
-    assert {row["arm"] for row in rows} >= {"undelayed", "backupdate"}
+    assert {*damian.results(folder)["arm"]} >= {"undelayed", "backupdate"}
     with pytest.raises(InputError, match="no run has finished there"):
         damian.results(folder.parent / "none")
