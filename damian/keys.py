@@ -85,10 +85,6 @@ LOGITS, LOC, SCALE = (AGENTS, "logits"), (AGENTS, "loc"), (AGENTS, "scale")
 continuous ones, [B, N, 2] each."""
 HIDDEN, HIDDEN_BEFORE = (AGENTS, "hidden"), (AGENTS, "hidden_before")
 """Recurrent state of the actor after and before a step, [B, N, H]."""
-ENCODING = (AGENTS, "encoding")
-"""What the actor of ``PredictiveMappo`` makes of its observation and the messages it knows, [B, N, H]."""
-PREDICTION = (AGENTS, "prediction")
-"""What it predicted for each discrete action when it acted, [B, N, A G]."""
 IS_INIT = "is_init"
 """Does an episode begin with this step, [B, 1] bool (TorchRL's ``InitTracker``)."""
 STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")

@@ -8,6 +8,7 @@ arrived, and the policy reads what it makes of them. docs/extending.md explains 
 """
 
 import torch
+from extending.predictive_mappo import PredictiveMappo, PredictiveMappoConfig
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -25,8 +26,7 @@ from damian import (
     keys,
     set_seed,
 )
-from damian.learners.networks import ModelConfig
-from damian.learners.predictive_mappo import PredictiveMappo, PredictiveMappoConfig
+from damian.learners.config import ModelConfig
 
 WORLDS, STEPS, LATEST = 8, 16, 9
 

@@ -33,17 +33,8 @@ _SAC = {
     "tau": {"low": 2e-3, "high": 5e-2, "log": True},
     "batch_size": {"choices": [256, 512, 1024]},
 }
-_PREDICTIVE = {
-    "prediction_lr": {"low": 5e-4, "high": 1e-2, "log": True},
-    "width": {"choices": [16, 32, 64]},
-}
 SEARCHES: dict[str, dict[str, Any]] = {
     "mappo": {"learner": _MAPPO, "model": _HIDDEN},
-    "predictive_mappo": {
-        "learner": {**_MAPPO, **_PREDICTIVE},
-        "model": _HIDDEN,
-        "delay": {"messages": {"choices": [4, 8, 12]}},
-    },
     "sac": {"learner": _SAC, "model": _HIDDEN},
     "bpql": {"learner": _SAC, "model": _HIDDEN, "delay": {"history": {"choices": [2, 4, 8, 12]}}},
 }

@@ -26,7 +26,7 @@ from damian.runs.interrupt import end_interrupted, number_of
 from . import cli
 from .compare import POLICIES
 from .config import TrainConfig, TuneConfig
-from .known import key_of, known_settings, no_such_key
+from .known import is_known, key_of, known_settings, no_such_key
 from .shared.many_runs import Run, perform_each
 from .shared.settings import check_learning
 from .train import train
@@ -62,7 +62,7 @@ def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistr
         checks.require(isinstance(written, Mapping), f"search.{key}", written, should)
         if not {*written} & {"low", "high", "choices"}:
             space |= read_space(written, f"{key}.")
-        elif key not in known_settings("train"):
+        elif not is_known(key, known_settings("train")):
             raise InputError(f"search: {no_such_key(key, 'train')}")
         else:
             try:

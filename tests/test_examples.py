@@ -41,8 +41,9 @@ def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
 
 
 @pytest.mark.slow
-def test_a_belief_head_learns_to_predict_on_an_environment_that_is_not_ours():
+def test_a_belief_head_learns_to_predict_on_an_environment_that_is_not_ours(monkeypatch):
     pytest.importorskip("vmas")
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
     example = runpy.run_path(str(ROOT / "examples" / "belief_head.py"))
-    assert example["batch"]["agents", "history"].shape == (8, 16, 3, 12, 18 + 3)
+    assert example["batch"]["agents", "timeline"].shape == (8, 16, 3, 12, 18 + 1)
     assert example["errors"][-1] < example["errors"][0]

@@ -39,7 +39,9 @@ class DelayConfig(Settings):
         choices=("generation", "arrival"),
     )
     history: int = setting(0, "Number of its latest actions that a UAV observes.", low=0, high=1000)
-    messages: int = setting(0, "Latest steps whose messages predictive_mappo gets.", low=0, high=1000)
+    messages: int = setting(
+        0, "Latest steps of which a learner gets all messages, as a timeline.", low=0, high=1000
+    )
     reward_window: int = setting(
         1, "Steps over which rewards are summed (eq. 4) [steps].", low=1, high=LONGEST
     )

@@ -120,6 +120,8 @@ class LearnerConfig(Settings):
     """Optional outputs of the environment that the learner needs in its batches: ``message``, ``state``,
     ``reward_terms`` or ``privileged`` (``damian.make_env``); and ``hindsight``: with back-updating, stored
     steps then also hold the newest message that has arrived since (``keys.HINDSIGHT``)."""
+    actor_follows_critic: ClassVar[bool] = False
+    """Whether the sizes of the actor's layers also follow from what the critic observes."""
     learner: ClassVar[str] = ""
     """Path of the class that ``make`` builds, from environment, settings, setup and replay buffer."""
 
@@ -184,47 +186,6 @@ class MappoConfig(LearnerConfig):
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         return setup.least_buffer if setup.backupdate else None
-
-
-@LEARNERS.register("predictive_mappo")
-@dataclass
-class PredictiveMappoConfig(MappoConfig):
-    """MAPPO with a learnt belief: attention over the messages that have arrived, trained by prediction."""
-
-    name: str = "predictive_mappo"
-    prediction_steps: int = setting(
-        100, "Steps of gradient descent on the predictions after each update.", low=1, high=checks.STEPS
-    )
-    prediction_batch: int = setting(400, "Environment steps in each of them.", low=1, high=checks.STEPS)
-    prediction_lr: float = setting(0.002, "Learning rate of the predictions.", above=0, high=1)
-    prediction_buffer: int = setting(
-        32000, "Environment steps from which predictions are learnt.", low=1, high=checks.STEPS
-    )
-    heads: int = setting(4, "Number of attention heads over the messages.", low=1, high=1024)
-    width: int = setting(32, "Size of the embedding of a message.", low=1, high=16384)
-
-    learner: ClassVar[str] = "damian.learners.predictive_mappo:PredictiveMappo"
-
-    def check(self, setup: LearningSetup) -> None:
-        super().check(setup)
-        model, constant_delay = setup.model, setup.action_delay is not None
-        should = "needs backupdate=true and a message delay (delay.obs): it predicts what arrives late"
-        checks.require(setup.backupdate, "learner", self.name, should)
-        should = "needs a constant action delay (delay.act): it predicts when actions take effect"
-        checks.require(constant_delay, "learner", self.name, should)
-        should = "does not go with learner=predictive_mappo, whose actor has an encoder of its own"
-        checks.require(not model.recurrent, "model.rnn", model.rnn, should)
-        checks.require(not model.skip, "model.skip", True, should)
-        checks.require(bool(model.hidden), "model.hidden", [], should)
-        checks.require(not setup.recompute_actor, "corrected", "actor", should)
-
-    def buffer_size(self, setup: LearningSetup) -> int | None:
-        least = super().buffer_size(setup)
-        return None if least is None else max(least, self.prediction_buffer // setup.worlds * setup.worlds)
-
-    def make_actor(self, env: "EnvBase", model: ModelConfig) -> "ProbabilisticActor":
-        make = resolved("damian.learners.predictive_mappo:make_belief_actor")
-        return make(env, model, self.heads, self.width)
 
 
 @LEARNERS.register("sac")

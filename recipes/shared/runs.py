@@ -16,7 +16,7 @@ from damian.common.fields import filled, leaves
 from damian.common.registry import IMPORTED, stored_settings
 from damian.common.text_files import show
 from damian.envs.config import ScenarioConfig
-from damian.learners.config import LEARNERS, PredictiveMappoConfig
+from damian.learners.config import LEARNERS, LearnerConfig
 from damian.runs.checkpoint import digest
 from damian.runs.run_folder import CONFIG
 from damian.runs.run_record import check_version, read_record, timed, write_record
@@ -197,20 +197,21 @@ def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
 
 def any_number_of_uavs(config: TrainConfig) -> bool:
     """Do the layers of a policy's networks have the same sizes for any number of UAVs?"""
-    # An actor with a learnt belief predicts the critic's observation, so that its layers depend on it too.
-    predicts = isinstance(config.learner, PredictiveMappoConfig)
-    return "agent_distances" not in (config.observation.critic if predicts else config.observation.actor)
+    observation, both = config.observation, config.learner.actor_follows_critic
+    return "agent_distances" not in (observation.critic if both else observation.actor)
 
 
 def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
     observation, actions, model = config.observation, config.actions, config.model
-    discrete, predicts = actions.kind == "discrete", isinstance(config.learner, PredictiveMappoConfig)
+    discrete, learner = actions.kind == "discrete", config.learner
+    own_actor = type(learner).make_actor is not LearnerConfig.make_actor
     return {
-        "learner=predictive_mappo": predicts,
+        "learner": learner.name if own_actor else "an actor as mappo and sac have",
         "observation.ctde": observation.ctde,
         "observation.local_features": [*observation.local_features],
-        "observation.global_features": [*observation.global_features] * (predicts or not observation.ctde),
+        "observation.global_features": [*observation.global_features]
+        * (learner.actor_follows_critic or not observation.ctde),
         "observation.belief": [*observation.belief],
         # After the features, from which it follows: a policy with other features does not lack UAVs.
         "agents": "any number of UAVs" if any_number_of_uavs(config) else config.agents,

@@ -4,7 +4,7 @@ from damian import keys
 from damian.common import checks
 from damian.delays.scenario import check_laws, delay_sampler, link_reads
 from damian.envs.pipeline import has_delay, has_message_delay
-from damian.learners.config import LearningSetup, PredictiveMappoConfig
+from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
 from damian.runs.loggers import check_loggers
 from damian.server.features import check_features
@@ -84,9 +84,8 @@ def check_learning(config: TrainConfig) -> None:
     checks.require(not (config.model.recurrent and config.clock.skip), "clock.skip", True, problem)
     _check_backupdate(config)
     messages, name = config.delay.messages, config.learner.name
-    unread = messages and ":" not in name and not isinstance(config.learner, PredictiveMappoConfig)
-    problem = f"is not read by learner={name}; choose learner=predictive_mappo, or leave it out"
-    checks.require(not unread, "delay.messages", messages, problem)
+    problem = f"is not read by learner={name}, only by a learner of your own: leave it out"
+    checks.require(not messages or ":" in name, "delay.messages", messages, problem)
 
 
 def _check_backupdate(config: TrainConfig) -> None:

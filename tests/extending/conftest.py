@@ -1,14 +1,24 @@
 """A folder with the files of examples/extending/, and programs that are started from it."""
 
+import importlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from damian.recipes.command import main
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
+
+
+@pytest.fixture
+def example(request, monkeypatch) -> ModuleType:
+    """The module of the examples that a test module tests, test_NAME.py."""
+    name = request.module.__name__.removeprefix("test_")
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    return importlib.import_module(name)
 
 
 @pytest.fixture

@@ -1,9 +1,6 @@
 """QMIX as a learner of one's own: what it draws and how it explores; it is trained, resumed and evaluated."""
 
 import csv
-import importlib
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,19 +15,10 @@ from damian.learners.config import ModelConfig
 from damian.replay.time_storage import TimeStorage
 from damian.world.landing import ActionConfig
 
-EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
 
-
-@pytest.fixture
-def qmix(monkeypatch):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    yield importlib.import_module("qmix")
-    sys.modules.pop("qmix")
-
-
-def learner_of(qmix, env, **changed):
+def learner_of(example, env, **changed):
     buffer = ReplayBuffer(storage=TimeStorage(1000))
-    config = qmix.QmixConfig(updates=2, batch_size=64, epsilon=0.4, epsilon_end=0.4)
+    config = example.QmixConfig(updates=2, batch_size=64, epsilon=0.4, epsilon_end=0.4)
     return config.make(env, learning(ModelConfig(hidden=[8]), worlds=4, **changed), buffer)
 
 
@@ -48,9 +36,9 @@ def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run,
         assert {"trained", "trained, deterministic"} <= {row["policy"] for row in csv.DictReader(file)}
 
 
-def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_the_legal_ones(qmix):
+def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_the_legal_ones(example):
     env = UavEnv(everything(actions=ActionConfig(kind="discrete")), 4, 0)
-    actor = qmix.QmixConfig(epsilon=0.4).make_actor(env, ModelConfig(hidden=[8]))
+    actor = example.QmixConfig(epsilon=0.4).make_actor(env, ModelConfig(hidden=[8]))
     seen = env.reset().select(keys.OBSERVATION, keys.ACTION_MASK)
     legal, values = seen[keys.ACTION_MASK], actor[0].module.network(seen[keys.OBSERVATION])
     best = values.masked_fill(~legal, -torch.inf).argmax(-1)
@@ -63,9 +51,9 @@ def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_t
 
 
 @pytest.mark.parametrize("backupdate", [False, True])
-def test_it_draws_what_can_no_longer_change_once_it_corrects(qmix, backupdate):
+def test_it_draws_what_can_no_longer_change_once_it_corrects(example, backupdate):
     env = UavEnv(everything(), 4, 0)
-    learner = learner_of(qmix, env, longest_delay=5, backupdate=backupdate)
+    learner = learner_of(example, env, longest_delay=5, backupdate=backupdate)
     drawn = []
     learner.joint = lambda steps, joint=learner.joint: (drawn.append(steps), joint(steps))[1]
     steps = env.rollout(20, break_when_any_done=False)
@@ -75,9 +63,9 @@ def test_it_draws_what_can_no_longer_change_once_it_corrects(qmix, backupdate):
     assert latest == (14 if backupdate else 19)
 
 
-def test_a_team_step_has_the_mean_reward_all_critic_inputs_and_one_action_in_flight(qmix):
+def test_a_team_step_has_the_mean_reward_all_critic_inputs_and_one_action_in_flight(example):
     env = UavEnv(everything("polynomial"), 4, 0)
-    learner = learner_of(qmix, env)
+    learner = learner_of(example, env)
     steps = env.rollout(20, break_when_any_done=False).flatten(0, 1)
     valid = torch.rand(80, 1) < 0.7
     team = learner.joint(TensorDict({**steps, keys.VALID: valid}, [80]))

@@ -1,11 +1,9 @@
 """UAVs that attend to what they have heard of each other: what they observe of it, and that they learn."""
 
 import csv
-import importlib
 
 import pytest
 import torch
-from conftest import EXAMPLES
 from extensions import TINY
 from tensordict import TensorDict
 
@@ -20,12 +18,6 @@ WINDOW = 2
 WIDTH = 2 * WINDOW + 4
 
 
-@pytest.fixture
-def talking(monkeypatch):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    return importlib.import_module("talking")
-
-
 def make(agents):
     observation = ObservationConfig(["spotted"], ["talking:heard"], window=WINDOW)
     links = LinkConfig(kind="matrix", delay={"law": "uniform", "low": 1, "high": 4})
@@ -35,7 +27,7 @@ def make(agents):
 
 
 @pytest.mark.parametrize("agents", [2, 4])
-def test_what_a_uav_hears_equals_a_plain_loop_over_the_others(talking, agents):
+def test_what_a_uav_hears_equals_a_plain_loop_over_the_others(example, agents):
     env = make(agents)
     (node,) = (each for each in env.transform if isinstance(each, OnboardNode))
     node.dropped_keys = []
@@ -57,10 +49,10 @@ def test_what_a_uav_hears_equals_a_plain_loop_over_the_others(talking, agents):
     assert seen[..., -1].unique().numel() > 2, "the ages differ"
 
 
-def test_attention_takes_the_others_in_any_order_and_number_and_reads_their_ages(talking):
+def test_attention_takes_the_others_in_any_order_and_number_and_reads_their_ages(example):
     torch.manual_seed(0)
     model = ModelConfig(hidden=[8])
-    three, five = (talking.TalkingConfig(width=8).make_actor(make(n), model) for n in (3, 5))
+    three, five = (example.TalkingConfig(width=8).make_actor(make(n), model) for n in (3, 5))
     five.load_state_dict(three.state_dict())
     n_actions = make(5).full_action_spec_unbatched[keys.ACTION].n
     heard, own = torch.randn(4, 5, 4, WIDTH), torch.rand(4, 5, 1)

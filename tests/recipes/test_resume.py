@@ -36,7 +36,6 @@ CASES = {
     "skipped": ["clock.skip=true", "motion=polynomial", "scenario=energy"],
     "lags": ["delay=lag", "delay.rew=2", "scenario=coverage", "region=random", "region.pool=2"],
     "matrix": ["links=matrix", "links.delay=2", "scenario=mixed", "actions=continuous"],
-    "predictive": ["learner=predictive_mappo", "delay.messages=4", "delay.obs=2", "aware=backupdate", *FEW],
     "privileged": ["critic=privileged", "source.motion=dynamic", "observation.own=true", "delay.obs=2"],
 }
 QUICK = ("sac",)
@@ -59,7 +58,7 @@ def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case, monke
     assert (
         updates[0] <= len((whole / "metrics.csv").read_text().splitlines()) - 1 - 6
     )  # 6 were in the checkpoint
-    has_memory = case in ("recurrent", "sac", "sac bursts", "everything", "predictive")
+    has_memory = case in ("recurrent", "sac", "sac bursts", "everything")
     assert any(name.startswith("replay/") for name in files(whole)) == has_memory
 
 

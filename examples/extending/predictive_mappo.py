@@ -1,10 +1,15 @@
-"""A learnt belief: MAPPO whose actor predicts, from the messages that have arrived, what arrives later.
+"""Your own learner: MAPPO whose actor predicts, from the messages that have arrived, what arrives later.
+
+    damian train scenario=delaybench/tracking delay=paper aware=backupdate delay.messages=8 \\
+        learner=examples.extending.predictive_mappo:PredictiveMappoConfig            (in a clone)
 
 The actor asks the messages, by attention, one question for each action, predicts what they will have said
 when that action has ended, and chooses. It learns to predict from the replay buffer.
+docs/extending.md says more.
 """
 
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -12,19 +17,66 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.modules import ProbabilisticActor, recurrent_mode
+from torchrl.modules import PopArtValueNorm, ProbabilisticActor, recurrent_mode
 from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
 from damian.common import checks
+from damian.common.fields import setting
 from damian.common.tensors import expand_mask, gather_rows, next_true
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
-from damian.learners.config import PredictiveMappoConfig
+from damian.learners.config import MappoConfig, ModelConfig
 from damian.learners.mappo import LOSS_KEYS, Mappo
-from damian.learners.networks import POLICY_GAIN, ModelConfig, hidden_layers, make_mlp, with_distribution
+from damian.learners.networks import POLICY_GAIN, hidden_layers, make_mlp, with_distribution
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
+
+ENCODING = (keys.AGENTS, "encoding")
+"""What the actor makes of its observation and the messages it knows, [B, N, H]."""
+PREDICTION = (keys.AGENTS, "prediction")
+"""What it predicted for each discrete action when it acted, [B, N, A G]."""
+
+
+@dataclass
+class PredictiveMappoConfig(MappoConfig):
+    """MAPPO with a learnt belief: attention over the messages that have arrived, trained by prediction."""
+
+    prediction_steps: int = setting(
+        100, "Steps of gradient descent on the predictions after each update.", low=1, high=checks.STEPS
+    )
+    prediction_batch: int = setting(400, "Environment steps in each of them.", low=1, high=checks.STEPS)
+    prediction_lr: float = setting(0.002, "Learning rate of the predictions.", above=0, high=1)
+    prediction_buffer: int = setting(
+        32000, "Environment steps from which predictions are learnt.", low=1, high=checks.STEPS
+    )
+    heads: int = setting(4, "Number of attention heads over the messages.", low=1, high=1024)
+    width: int = setting(32, "Size of the embedding of a message.", low=1, high=16384)
+
+    actor_follows_critic: ClassVar[bool] = True
+
+    def check(self, setup: LearningSetup) -> None:
+        super().check(setup)
+        model, constant_delay = setup.model, setup.action_delay is not None
+        should = "needs backupdate=true and a message delay (delay.obs): it predicts what arrives late"
+        checks.require(setup.backupdate, "learner", self.name, should)
+        should = "needs a constant action delay (delay.act): it predicts when actions take effect"
+        checks.require(constant_delay, "learner", self.name, should)
+        should = "does not go with this learner, whose actor has an encoder of its own"
+        checks.require(not model.recurrent, "model.rnn", model.rnn, should)
+        checks.require(not model.skip, "model.skip", True, should)
+        checks.require(bool(model.hidden), "model.hidden", [], should)
+        checks.require(not setup.recompute_actor, "corrected", "actor", should)
+
+    def buffer_size(self, setup: LearningSetup) -> int | None:
+        least = super().buffer_size(setup)
+        return None if least is None else max(least, self.prediction_buffer // setup.worlds * setup.worlds)
+
+    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "PredictiveMappo":
+        return PredictiveMappo(env, self, setup, buffer)
+
+    def make_actor(self, env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
+        return make_belief_actor(env, model, self.heads, self.width)
 
 
 class PredictiveMappo(Mappo):
@@ -36,7 +88,7 @@ class PredictiveMappo(Mappo):
 
     config: PredictiveMappoConfig
     buffer: ReplayBuffer
-    loss_keys = (*LOSS_KEYS, keys.ENCODING, keys.PREDICTION)
+    loss_keys = (*LOSS_KEYS, ENCODING, PREDICTION)
 
     def __init__(
         self, env: EnvBase, config: PredictiveMappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None
@@ -60,8 +112,9 @@ class PredictiveMappo(Mappo):
     def learn_prediction(self, last: Tensor) -> Tensor:
         """Make one step of gradient descent on random steps of the replay buffer; the error before it, []."""
         before, target, counts = self.sample(last)
-        self.head.norm.update(target, counts)
-        wanted = self.head.norm.normalize(target)
+        if counts.any():
+            self.head.norm.update(target[counts.squeeze(-1)].double())
+        wanted = self.head.norm.normalize(target).clamp(-LARGEST, LARGEST).to(target.dtype)
         error = prediction_loss(self.head.predict(*before), wanted.unsqueeze(-2), counts.unsqueeze(-2))
         self.head_optimizer.zero_grad()
         error.backward()
@@ -196,32 +249,6 @@ def _apply(layers: list[nn.Module], features: Tensor) -> Tensor:
     return features
 
 
-class TargetScale(nn.Module):
-    """Running mean and standard deviation of each of G numbers, so that errors have one scale."""
-
-    moments: Tensor
-    """Running means of 1, the numbers and their squares, which begin with 0, [3, G]."""
-
-    def __init__(self, n_targets: int, device: torch.device | None = None) -> None:
-        super().__init__()
-        self.register_buffer("moments", torch.zeros(3, n_targets, dtype=torch.float64, device=device))
-
-    @torch.no_grad()
-    def update(self, target: Tensor, counts: Tensor) -> None:
-        """Add numbers [*, G] where they count, [*, 1] bool; nothing changes if none does."""
-        values = target.double().flatten(0, -2)
-        weight = counts.flatten(0, -2).double() / counts.sum().clamp(min=1)
-        new = torch.stack([torch.ones_like(values), values, values.square()])
-        kept = torch.where(counts.any(), FORGETTING, 1.0)
-        self.moments.mul_(kept).add_((1 - FORGETTING) * (new * weight).sum(1))
-
-    def normalize(self, target: Tensor) -> Tensor:
-        """Numbers [*, G] with mean 0 and standard deviation 1, within ``LARGEST``; 0 before any update."""
-        known, mean, square = self.moments / self.moments[0].clamp(min=1e-12)
-        deviation = (square - mean.square()).clamp(min=1e-8 * square + 1e-30).sqrt()
-        return ((target - mean) * known / deviation).clamp(-LARGEST, LARGEST).to(target.dtype)
-
-
 class BeliefHead(TensorDictModuleBase):
     """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
 
@@ -243,9 +270,10 @@ class BeliefHead(TensorDictModuleBase):
         self.encoder, self.n_actions = encoder, n_actions
         self.codes = nn.Parameter(0.5 * torch.randn((n_actions or 0) + 1, n_code, device=device))
         self.predictor = nn.Linear(n_encoding, n_targets, device=device)
-        self.norm = TargetScale(n_targets, device)
+        norm = PopArtValueNorm(shape=n_targets, beta=FORGETTING, epsilon=1e-16, device=device)
+        self.norm = norm.double()  # the variance is a difference of squares
         self.in_keys = [keys.OBSERVATION, keys.TIMELINE]  # type: ignore[assignment]
-        written = [keys.ENCODING, *[keys.PREDICTION] * (n_actions is not None)]
+        written = [ENCODING, *[PREDICTION] * (n_actions is not None)]
         self.out_keys = written  # type: ignore[assignment]
 
     @torch.no_grad()
@@ -255,9 +283,9 @@ class BeliefHead(TensorDictModuleBase):
         observation, history = tensordict[keys.OBSERVATION], tensordict[keys.TIMELINE]
         codes = self.codes.expand(*observation.shape[:-1], -1, -1)
         encodings = self.encoder(observation, history, codes)
-        tensordict.set(keys.ENCODING, encodings[..., 0, :])
+        tensordict.set(ENCODING, encodings[..., 0, :])
         if self.n_actions is not None:
-            tensordict.set(keys.PREDICTION, self.predictor(encodings[..., 1:, :]).flatten(-2))
+            tensordict.set(PREDICTION, self.predictor(encodings[..., 1:, :]).flatten(-2))
         return tensordict
 
     def predict(self, observation: Tensor, history: Tensor, action: Tensor) -> Tensor:
@@ -296,7 +324,7 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
     """Make the policy from observations and histories to ``("agents", "action")``."""
     known, device = env.observation_spec.keys(True, True), env.device
     should = "reads no messages: set delay.messages, or add damian.ObservationTimeline to the environment"
-    checks.require(keys.TIMELINE in known, "learner", "predictive_mappo", should)
+    checks.require(keys.TIMELINE in known, "learner", "this one", should)
     observation, history = env.observation_spec[keys.OBSERVATION], env.observation_spec[keys.TIMELINE]
     n_targets, n_encoding = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1], config.hidden[-1]
 
