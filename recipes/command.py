@@ -21,15 +21,11 @@ PROGRAMS = {
     "tune": "search for better settings of a learner with Optuna",
     "fly": "fly episodes, and keep or replay them as files, films, figures and pages",
     "advise": "advise real UAVs: from what they report, where each should land next",
-    "oracle": "fly the script with ever more known on time: which delay costs how much",
     "export": "export a policy that flies without damian: damian export RUN",
     "results": "show the results in a folder as one table: damian results FOLDER",
 }
 """What each program does, by its name; the program is the module of this name."""
-SETTINGS = {name: name for name in PROGRAMS if name not in ("export", "results")} | {
-    "evaluate": "train",
-    "oracle": "train",
-}
+SETTINGS = {name: name for name in PROGRAMS if name not in ("export", "results")} | {"evaluate": "train"}
 """Whose settings each program has; the others take a folder."""
 
 

@@ -30,7 +30,6 @@ SHORTER = {
     "tune": ["trials=2", "processes=1", *TINY],
     "evaluate": FLIGHTS,
     "fly": [*FLIGHTS, "episode.max_steps=12"],
-    "oracle": FLIGHTS,
     "compare": ["seeds=1", "processes=1", OF_RUNS],
 }
 """Settings that make the commands of a program short; they replace those of the document."""

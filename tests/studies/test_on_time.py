@@ -1,40 +1,28 @@
-"""The oracle recipe: the script with ever more known on time."""
+"""The study ``on_time``: the script with ever more known on time."""
 
-import csv
-import sys
 from itertools import pairwise
 
 import pytest
 import torch
+from on_time import script_rows, true_belief
 
 from damian import keys
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.recipes import oracle
+from damian.recipes.cli import settings
 from damian.server.features import ObservationConfig
 from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 WORDS = ["scenario=delaybench/tracking", "observation.belief_cell=60", "eval_episodes=300"]
-WORDS += ["episode.max_steps=25", "delay.obs=6", "hydra.run.dir=script"]
-
-
-@pytest.fixture
-def returns(tmp_path, monkeypatch):
-    """The true return of every row of the recipe's table."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["damian oracle", *WORDS])
-    oracle.run()
-    with (tmp_path / "script/result.csv").open(newline="") as file:
-        return {row["policy"]: float(row["return"]) for row in csv.DictReader(file)}
+WORDS += ["episode.max_steps=25", "delay.obs=6"]
 
 
 @pytest.mark.slow
-def test_who_knows_more_on_time_wins_more(returns):
-    rows = ["what has arrived", "its own messages", "all messages", "the source's place"]
-    assert [*returns] == rows
-    for less, more in pairwise(rows):
-        assert returns[less] < returns[more], (less, more)
+def test_who_knows_more_on_time_wins_more():
+    returns = [row.return_ for row in script_rows(settings(*WORDS)).values()]
+    assert len(returns) == 4
+    assert all(less < more for less, more in pairwise(returns)), returns
 
 
 def test_the_true_belief_is_certain_of_the_cell_with_the_nearest_centre():
@@ -46,7 +34,7 @@ def test_the_true_belief_is_certain_of_the_cell_with_the_nearest_centre():
     env = make_env(scenario, 12, seed=0, extras=["message", "state"])
     steps = env.rollout(5, break_when_any_done=False)[:, -1]
     grid = env.server.grid
-    belief = oracle.true_belief(env)(steps.clone())[keys.BELIEF]
+    belief = true_belief(env)(steps.clone())[keys.BELIEF]
     assert torch.equal(belief.sum(-1), torch.ones(12))
     region = env.server.region_of(env.server.messages(steps[keys.MESSAGE]))
     for world in range(12):

@@ -1,11 +1,13 @@
-"""Fly the script with ever more known on time: which late messages cost how much (docs/protocol.md).
+"""Which late messages cost how much: the script flies with ever more known on time.
+
+    python examples/studies/on_time.py scenario=delaybench/tracking delay.obs=4 eval_episodes=500
 
 With all messages on time the script is a strong reference, and no proven limit: a policy that plans further
-ahead may win more.
+ahead may win more. The words are those of ``damian train``.
 """
 
+import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import cast
 
 import torch
@@ -16,44 +18,25 @@ from torch.nn.functional import one_hot
 from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
-from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
+from damian.recipes.cli import settings
+from damian.recipes.config import TrainConfig
 from damian.runs.metrics import Evaluation, evaluate
-from damian.runs.run_folder import save_results
+from damian.runs.run_folder import results_table
 from damian.server.belief import SourceGrid
-
-from . import cli
-from .config import TrainConfig
-from .shared.runs import save_config
 
 KNOWN_ON_TIME = ("what has arrived", "its own messages", "all messages", "the source's place")
 """What the script knows on time in each row of the results."""
 
 
-def fly(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the script by what is known on time, and fill the run folder."""
-    check(config)
-    save_config(config, folder)
-    table = save_results(script_rows(config), folder, config.episode.success_share is not None, late=True)
-    print(f"\nwhat is known on time:\n\n{table}")
-
-
-def check(config: TrainConfig) -> None:
-    """Check that the rows can differ, and that they follow from what the server broadcasts."""
-    if config.checkpoint:
-        remedy = "a policy flies with more on time by damian evaluate with observation.own=true or delay=none"
-        raise InputError(f"checkpoint: the script flies here; {remedy}")
-    if not has_message_delay(config):
-        raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
-    should = "is not supported: the rows compare what the server can know; choose links=server"
-    checks.require(config.links.kind == "server", "links", config.links.kind, should)
-    if not config.seeks_source:
-        raise InputError("reward: nothing is won by finding the source, which is all that the script does")
-
-
 def script_rows(config: TrainConfig) -> dict[str, Evaluation]:
     """Evaluations of the script, in the same episodes, by what is known on time."""
+    checks.require(has_message_delay(config), "delay.obs", config.delay.obs, "leaves no message late or lost")
+    should = "is nothing that the script seeks: it finds sources, of which the server knows"
+    checks.require(
+        config.seeks_source and config.links.kind == "server", "scenario", config.links.kind, should
+    )
     features = config.observation.belief or ["belief_moments"]
     late, own = (
         replace(config.eval_scenario, observation=replace(config.observation, own=knows, belief=features))
@@ -83,5 +66,6 @@ def true_belief(env: DelayedEnv) -> TensorDictModule:
     return TensorDictModule(know, in_keys=[keys.STATE, keys.MESSAGE], out_keys=[keys.BELIEF])
 
 
-def run() -> None:
-    cli.run(fly)
+if __name__ == "__main__":
+    config = settings(*sys.argv[1:])
+    print(results_table(script_rows(config), config.episode.success_share is not None, late=True))
