@@ -2,10 +2,11 @@
 
 import ast
 import itertools
+import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,65 +15,66 @@ import damian
 
 ROOT = Path(damian.__file__).parent
 RECIPES = ROOT.parent / "recipes"
-FLOORS = [
-    {"common", "keys"},
-    {"world", "delays"},
-    {"server"},
-    {"transforms"},
-    {"envs", "replay"},
-    {"learners"},
-    {"baselines"},
-    {"runs", "show"},
-    {"compare", "interop", "advice"},
-]
-"""Folders and modules of ``damian``; each may import only those on lower floors."""
-FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
-ROOMS = 16
-
-FILES = sorted(path for folder in (ROOT, RECIPES) for path in folder.rglob("*.py"))
-MODULES = {".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in FILES}
-"""Files by module; those of the recipes without the ``damian`` that an installation puts before it."""
+TREE = (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("\ndamian/\n")[2]
+ROOMS = re.findall(r"^  (\w+)(?:/|\.py) ", TREE.partition("\nconf/")[0], re.MULTILINE)
+"""Folders and modules of ``damian``, as CONTRIBUTING.md lists them: each imports only from those above it."""
+MOST_ROOMS = 16
+DOORS = ("damian", "damian.interop")
+"""Modules with the public names of programs, which are loaded when one is used."""
+FOR_ALL = ("damian.recipes.shared", "damian.recipes.cli", "damian.recipes.known", "damian.recipes.config")
+"""What the programs share."""
 
 
-def imported(path: Path) -> Iterator[str]:
-    """Every module, or name within one, that a file imports."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def module_of(path: Path) -> str:
+    """Name of a module, as it is installed: the recipes are a package of damian."""
+    parts = path.relative_to(ROOT.parent).with_suffix("").parts
+    parts = ("damian", *parts) if parts[0] == "recipes" else parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_of(path): path for folder in (ROOT, RECIPES) for path in sorted(folder.rglob("*.py"))}
+FILES = [*MODULES.values()]
+
+
+def imported(module: str, strings: bool = False) -> Iterator[str]:
+    """Every module, or name within one, that a module imports anywhere; also those that ``strings`` name."""
+    package = module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            within = ".".join([*above, *[node.module] * bool(node.module)])
+            yield from (f"{within}.{alias.name}" for alias in node.names)
+        elif strings and isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield from re.findall(r"^(damian(?:\.\w+)+)(?::\w+)?$", node.value)
 
 
-def room(module: str) -> str:
-    """Folder or module at the top of ``damian``."""
-    return module.split(".")[1]
+def is_in(name: str, modules: Iterable[str]) -> bool:
+    """Is a module, or a name within one, one of these modules or in one of them?"""
+    return any(f"{name}.".startswith(f"{module}.") for module in modules)
 
 
-def test_every_room_has_a_floor_and_there_are_few():
+def test_the_document_lists_every_room_and_there_are_few():
     rooms = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert rooms - {"__init__"} == set(FLOOR)
-    assert len(rooms) <= ROOMS
+    assert rooms - {"__init__"} == set(ROOMS)
+    assert len(rooms) <= MOST_ROOMS + 1
 
 
-def test_a_module_imports_only_from_its_own_folder_and_lower_floors():
-    for module, path in MODULES.items():
-        if not module.startswith("damian.") or module == "damian.__init__":  # which has the public names
-            continue
-        for name in imported(path):
-            if name.startswith("damian.") and room(name) != room(module):
-                assert FLOOR[room(name)] < FLOOR[room(module)], f"{module} imports {name}"
+def test_a_module_imports_only_from_its_own_room_and_from_those_above_it():
+    places = [f"damian.{room}" for room in (*ROOMS, "recipes")]
+    for module in set(MODULES) - {*DOORS}:
+        room = next(place for place in places if is_in(module, [place]))
+        below = places[places.index(room) + 1 :]
+        for name in imported(module, strings=True):
+            assert not is_in(name, below), f"{module} imports {name}"
 
 
-def test_the_package_never_imports_the_recipes():
-    for path in {*ROOT.rglob("*.py")} - {ROOT / "__init__.py"}:  # which has the public names
-        assert not [name for name in imported(path) if "recipes" in name.split(".")], path
-
-
-def test_what_the_recipes_share_imports_no_recipe():
-    for path in (RECIPES / "shared").glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            beside = ("cli", "config", "known")  # what the programs share of the command line
-            assert not isinstance(node, ast.ImportFrom) or node.level <= 1 or node.module in beside, path
+def test_what_the_recipes_share_imports_no_program():
+    for module in MODULES:
+        if is_in(module, FOR_ALL):
+            for name in imported(module, strings=True):
+                assert not is_in(name, ["damian.recipes"]) or is_in(name, FOR_ALL), f"{module} imports {name}"
 
 
 def test_an_installation_has_every_folder_of_the_package_the_recipes_and_the_configuration():
@@ -84,17 +86,14 @@ def test_an_installation_has_every_folder_of_the_package_the_recipes_and_the_con
 
 
 def test_no_modules_import_each_other_in_a_circle():
-    known = {m.removesuffix(".__init__"): {*imported(path)} for m, path in MODULES.items() if "damian." in m}
-    edges = {
-        m: {
-            other
-            for other in known
-            if not m.startswith(other) and any(f"{name}.".startswith(f"{other}.") for name in names)
-        }
-        for m, names in known.items()
-    }
-    while leaves := {m for m, others in edges.items() if not others}:
-        edges = {m: others - leaves for m, others in edges.items() if m not in leaves}
+    edges = {}
+    for module in MODULES:
+        parts = [name.split(".") for name in imported(module)]
+        names = {".".join(each[:n]) for each in parts for n in range(1, len(each) + 1)} & MODULES.keys()
+        edges[module] = {name for name in names if not is_in(module, [name])}
+    assert "damian.recipes.known" in edges["damian.recipes.cli"]
+    while leaves := {module for module, others in edges.items() if not others}:
+        edges = {module: others - leaves for module, others in edges.items() if module not in leaves}
     assert edges == {}
 
 
