@@ -52,14 +52,14 @@ def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
     swept = [key for key in given if given[key].nunique() > 1]
     tables = []
     for run, (_, settings) in zip(runs, given[swept].iterrows(), strict=True):
-        rows, labels = read_results(run / RESULTS), {k: _value(x) for k, x in settings.items()}
+        rows, labels = read_results(run / RESULTS), {str(k): _value(x) for k, x in settings.items()}
         labels["folder"] = str(run.relative_to(folder))
         tables.append(rows.assign(**labels)[[*labels, *rows.columns]])
     return swept, pd.concat(tables, ignore_index=True)
 
 
 def is_comparison(folder: Path) -> bool:
-    """Has a comparison stored its results in a folder? A sweep stores them under the same name."""
+    """Whether a comparison has stored its results in a folder; a sweep stores them under the same name."""
     path = folder / ROWS
     return path.is_file() and "arm" in path.read_text(encoding="utf-8").partition("\n")[0].split(",")
 
@@ -114,6 +114,6 @@ def run() -> None:
     elif is_comparison(folder) or (folder / RESULTS).exists():
         rows = results(folder)
         cells = rows.map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
-        print(markdown_table([*rows], cells.to_numpy()))
+        print(markdown_table([*map(str, rows)], cells.to_numpy()))
     else:
         print(f"{report(folder)}\n\nresults: {folder}")

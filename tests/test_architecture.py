@@ -51,7 +51,7 @@ def imported(module: str, strings: bool = False) -> Iterator[str]:
 
 
 def is_in(name: str, modules: Iterable[str]) -> bool:
-    """Is a module, or a name within one, one of these modules or in one of them?"""
+    """Whether a module, or a name within one, is one of these modules or in one of them."""
     return any(f"{name}.".startswith(f"{module}.") for module in modules)
 
 

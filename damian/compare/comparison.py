@@ -68,8 +68,8 @@ RUN = ["task", "delay", "arm", "seed"]
 """Columns of results that name a run."""
 ENDS = ("", "_low", "_high")
 """Endings of the columns that hold a value and the ends of its 95 % interval."""
-LABELS = ["task", "delay", "arm", "regime", "policy", "seeds", "compared_seeds"]
-COLUMNS = [*LABELS, *(name + end for name in (*MEASURED, *COMPARED) for end in ENDS)]
+COLUMNS = ["task", "delay", "arm", "regime", "policy", "seeds", "compared_seeds"]
+COLUMNS += [name + end for name in (*MEASURED, *COMPARED) for end in ENDS]
 """Columns of ``Comparison.table``."""
 
 
@@ -90,7 +90,7 @@ def track(arms: Mapping[str, Arm], name: str) -> str:
     return "late data only" if regime(arms, name) == "R0" else "simulator allowed"
 
 
-def shown(line: Mapping[str, Any], name: str) -> str:
+def shown(line: Mapping[Any, Any], name: str) -> str:
     """A value of a line and its interval, if they are known, for people."""
     value, low, high = (line[name + end] for end in ENDS)
     if np.isnan(value):
@@ -114,7 +114,7 @@ def _estimates(
 def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
     """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for each seed."""
     bounds = np.array([MEASURED.get(name, Column(name))[1:] for name in runs.columns]).T
-    return _estimates([*runs], lambda drawn: drawn.mean(-1)[..., 0, :], _scores(runs), (*bounds,))
+    return _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1)[..., 0, :], _scores(runs), (*bounds,))
 
 
 def _scores(runs: pd.DataFrame) -> Floats:
@@ -154,9 +154,9 @@ class Comparison:
         return self.rows.drop_duplicates(RUN)
 
     @cached_property
-    def curves(self) -> dict[tuple[str, ...], list[pd.DataFrame]]:
+    def curves(self) -> dict[tuple[Any, ...], list[pd.DataFrame]]:
         """Points of the learning curves by task, delay and arm, a table for each seed."""
-        found: dict[tuple[str, ...], list[pd.DataFrame]] = {}
+        found: dict[tuple[Any, ...], list[pd.DataFrame]] = {}
         for (*name, _), points in self.points.groupby(RUN, sort=False):
             found.setdefault(tuple(name), []).append(points)
         return found
@@ -195,7 +195,7 @@ class Comparison:
             )
 
     @cached_property
-    def _evaluations(self) -> dict[tuple[str, ...], pd.DataFrame]:
+    def _evaluations(self) -> dict[tuple[Any, ...], pd.DataFrame]:
         """Rows by task, delay, arm and policy, with the seed as their index."""
         grouped = self.rows.groupby([*RUN[:-1], "policy"], sort=False)
         return {name: found.set_index("seed") for name, found in grouped}

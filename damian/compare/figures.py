@@ -82,13 +82,13 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
 
     def panel(axis: Axes, task: str) -> None:
         delays = comparison.delays(task)
-        for arm in arms:
-            lines = known[(known["task"] == task) & (known["arm"] == arm)]
+        of_task = known[known["task"] == task]
+        for arm in [arm for arm in arms if arm in {*of_task["arm"]}]:
+            lines = of_task[of_task["arm"] == arm]
             shift = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
             places = [delays.index(delay) + shift for delay in lines["delay"]]
-            _error_bars(
-                axis, places, lines, "J_norm", label=arm, **look(comparison.arms, arm) | {"linestyle": ""}
-            )
+            style = look(comparison.arms, arm) | {"label": arm, "linestyle": ""}
+            _error_bars(axis, places, lines, "J_norm", **style)
         axis.set_xticks(range(len(delays)), delays)
         title = task.replace(HELD_OUT_MARK, ", held-out ")
         axis.set(title=title, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
@@ -136,8 +136,9 @@ def _matrix(comparison: Comparison, task: str) -> dict[str, pd.DataFrame]:
         if len(lines) >= _FLOWN
     }
     constant = [name for name in away.index.unique() if name.isdecimal()]
-    own = table[(table["task"] == task) & table["delay"].isin(constant)].set_index("delay", drop=False)
-    of_arms = own.groupby("arm", sort=False)
+    trained = [name for name, arm in comparison.arms.items() if arm.policy_of is None]
+    own = table[(table["task"] == task) & table["delay"].isin(constant) & table["arm"].isin(trained)]
+    of_arms = own.set_index("delay", drop=False).groupby("arm", sort=False)
     special = {f"{arm}{_SPECIALISTS}": lines for arm, lines in of_arms if len(lines) > 1}
     return drawn | special if drawn else {}
 
@@ -248,7 +249,8 @@ def _curve_panel(comparison: Comparison, progress: str, axis: Axes, content: tup
             axis.axhline(level, **style)
     for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, f"{SCRIPT}, undelayed", "-.")):
         if (level := table.get((task, NOT_LATE, policy, policy))) is not None:
-            axis.axhline(level, label=label, **_LEVEL | {"linestyle": line})
+            style = _LEVEL | {"label": label, "linestyle": line}
+            axis.axhline(level, **style)
 
 
 def curve(runs: Sequence[pd.DataFrame], name: str, progress: str = "frames") -> tuple[Floats, Floats]:

@@ -139,7 +139,7 @@ def mappo_losses(
     of the Kullback-Leibler divergence from the policy that collected the steps (ratio - 1 - log ratio), the
     share of importance ratios beyond the clipping, and the entropy [nats].
 
-    The ``entries`` by key, what the networks read and ``LOSS_KEYS``, are no TensorDict, so that a compiled
+    The ``entries`` by key, what the networks read and ``LOSS_KEYS``, are not a TensorDict, so that a compiled
     function works with any number of steps; for a recurrent actor they are sequences [B, T].
     """
     ready = entries[keys.READY].float()

@@ -45,7 +45,7 @@ class Evaluation:
     """Share of the messages that never arrive."""
 
     def row(self, group: str = "") -> dict[str, float]:
-        """The measures by the names that they have in every file; ``return`` is no name for a field."""
+        """The measures by the names that they have in every file; ``return`` cannot name a field."""
         return dict(zip([group + name for name in EVALUATED], astuple(self), strict=True))
 
 

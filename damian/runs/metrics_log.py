@@ -37,7 +37,7 @@ class MetricsLog:
         self._path = folder / METRICS if to_csv else None
         stored = read_metrics(folder)
         stored = stored[stored[_FIRST_COLUMN] <= frames]
-        self.rows = stored.to_dict("records")
+        self.rows: list[dict[Any, Any]] = stored.to_dict("records")
         self._columns = [*stored.columns] if self.rows else []
         if self._path:
             write_csv(self._path, pd.DataFrame(self.rows))

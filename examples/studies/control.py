@@ -84,7 +84,7 @@ class Task(NamedTuple):
     slots: int = 0
     """Number of latest steps that are observed as a timeline; 0: only the newest observation is."""
     buffer: bool = False
-    """Is each observation held until it is as old as the longest delay?"""
+    """Whether each observation is held until it is as old as the longest delay."""
 
     @property
     def horizon(self) -> int:

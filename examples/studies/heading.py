@@ -1,4 +1,4 @@
-"""Does a filter that knows the source's velocity find it better than one that knows its place alone?
+"""A filter that knows the source's velocity beside one that knows its place alone.
 
     python examples/studies/heading.py                  (ten minutes on one core)
     python examples/studies/heading.py --seeds 8 9 10   (these seeds only)

@@ -64,17 +64,17 @@ class Arm(NamedTuple):
     """What a policy is trained with."""
 
     delayed: bool = True
-    """Are messages late in training?"""
+    """Whether messages are late in training."""
     history: bool = False
-    """Does the actor observe the age of what it sees, and its own latest actions?"""
+    """Whether the actor observes the age of what it sees, and its own latest actions."""
     registered: bool = False
-    """Is what agents see moved into their present frame?"""
+    """Whether what agents see is moved into their present frame."""
     buffer: bool = False
-    """Is each message held until it is as old as the longest delay in training?"""
+    """Whether each message is held until it is as old as the longest delay in training."""
     timeline: bool = False
-    """Do agents observe timelines?"""
+    """Whether agents observe timelines."""
     backupdate: bool = False
-    """Does the critic learn from what has arrived since?"""
+    """Whether the critic learns from what has arrived since."""
 
 
 ARMS: dict[str, Arm | None] = {

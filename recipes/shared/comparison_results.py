@@ -21,10 +21,10 @@ from damian.runs.run_record import read_record
 
 from .many_runs import Run
 
-ROWS, CURVES = "results.csv", "curves.csv"
+ROWS, POINTS = "results.csv", "curves.csv"
 MARKDOWN, FIGURE = "table.md", "figure.png"
 """What follows from the rows, also of a sweep."""
-POINTS = 50
+MOST_POINTS = 50
 """Largest number of points of a stored learning curve, evenly spaced over its updates."""
 CURVE = [*RUN, "frames", "episodes", *LABELS]
 """Columns of the points of learning curves."""
@@ -48,7 +48,7 @@ class Results(NamedTuple):
 
     def write(self, folder: Path) -> None:
         """Write both files."""
-        for name, rows in zip((ROWS, CURVES), self, strict=True):
+        for name, rows in zip((ROWS, POINTS), self, strict=True):
             write_csv(folder / name, rows)
 
 
@@ -78,18 +78,18 @@ def _of_run(run: Run, arms: Mapping[str, Arm]) -> Results:
     names = [*rows.columns]
     rows = rows.assign(**label, **of_run)[[*label, *of_run, *names]]
     rows.loc[~rows["policy"].isin(OF_ARM[:2]), "backupdated"] = math.nan
-    spread = np.linspace(0, len(metrics) - 1, min(len(metrics), POINTS)).round().astype(int)
+    spread = np.linspace(0, len(metrics) - 1, min(len(metrics), MOST_POINTS)).round().astype(int)
     points = metrics.iloc[spread].reindex(columns=CURVE[len(RUN) :])
     points = points.map(lambda number: float(f"{number:.5g}")).assign(**label)[CURVE]
     if (
         run.config.episode.success_share is None
     ):  # where nothing can succeed, a share of successes means nothing
         for table in (rows, points):
-            table[[name for name in table if name.endswith("success_rate")]] = math.nan
+            table[table.filter(like="success_rate").columns] = math.nan
     return Results(rows, points)
 
 
 def stored_results(folder: Path) -> Results:
     """Read the results that a folder stores, but no curves of a version that drew perceived returns."""
-    rows, points = (read_results(folder / name) for name in (ROWS, CURVES))
+    rows, points = (read_results(folder / name) for name in (ROWS, POINTS))
     return Results(rows, points if LABELS.keys() <= {*points} else NO_RESULTS.points)

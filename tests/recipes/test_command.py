@@ -35,8 +35,8 @@ def refusal(capsys, *words: str) -> str:
         "from damian.recipes.command import main; main(['train', 'agents=0'])",
     ],
 )
-def test_settings_help_and_wrong_words_need_no_torch(code):
-    code = f"import sys\ntry:\n    {code}\nfinally:\n    assert 'torch' not in sys.modules"
+def test_settings_help_and_wrong_words_need_neither_torch_nor_pandas(code):
+    code = f"import sys\ntry:\n    {code}\nfinally:\n    assert not {{'torch', 'pandas'}} & {{*sys.modules}}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "AssertionError" not in done.stderr
     assert done.returncode == (2 if "agents=0" in code else 0)
