@@ -190,7 +190,7 @@ class FlyConfig(FlownPolicyConfig):
         None, "Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply."
     )
     span: list[float] | None = setting(
-        None, "First and last time of the journal to show, since every UAV had reported [s]."
+        None, "First and last time of the journal to show, since every UAV had reported.", unit="s"
     )
     replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
 

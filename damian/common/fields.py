@@ -7,7 +7,6 @@ in ``__post_init__`` only what its settings exclude in each other. Nothing here 
 import dataclasses
 import functools
 import math
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ class Rule:
     """What a field declares beside its type and default."""
 
     meaning: str = ""
-    """One sentence, which ends with the unit in brackets if there is one: ``Longest flight [m].``"""
+    """One sentence; ``setting`` puts the unit at its end: ``Longest flight [m].``"""
     low: float | None = None
     """Smallest value."""
     high: float | None = None
@@ -38,13 +37,13 @@ class Rule:
     fixed: bool = False
     """A constant: no key of the command line or of a file, but Python programs may set it."""
     unit: str = ""
-    """Unit, such as ``m/s``; that at the end of the meaning if not given."""
+    """Unit, such as ``m/s``."""
 
 
-def setting(default: Any, meaning: str = "", **rule: Any) -> Any:
+def setting(default: Any, meaning: str = "", unit: str = "", **rule: Any) -> Any:
     """A field of settings: its default, copied for every instance, and the fields of its ``Rule``."""
-    unit = re.search(r"\[([^\[\]]+)\]\.$", meaning)
-    metadata = {"rule": Rule(meaning, **{"unit": unit[1] if unit else "", **rule})}
+    shown = f"{meaning.removesuffix('.')} [{unit}]." if meaning and unit else meaning
+    metadata = {"rule": Rule(shown, unit=unit, **rule)}
     if isinstance(default, type):
         return field(default_factory=default, metadata=metadata)
     if isinstance(default, list | dict):

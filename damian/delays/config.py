@@ -43,7 +43,7 @@ class DelayConfig(Settings):
         0, "Latest steps of which a learner gets all messages, as a timeline.", low=0, high=1000
     )
     reward_window: int = setting(
-        1, "Steps over which rewards are summed (eq. 4) [steps].", low=1, high=LONGEST
+        1, "Steps over which rewards are summed (eq. 4).", unit="steps", low=1, high=LONGEST
     )
     reward_discount: float = setting(0.9, "Discount factor of that sum (eq. 4).", above=0, high=1)
 
@@ -64,7 +64,11 @@ class LinkConfig(Settings):
     )
     loss: Any = setting(0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix"))
     range: float | None = setting(
-        None, "A UAV hears only UAVs within this distance when they send [m].", above=0, kinds=("matrix",)
+        None,
+        "A UAV hears only UAVs within this distance when they send.",
+        unit="m",
+        above=0,
+        kinds=("matrix",),
     )
     hears: Any = setting(None, "Whom UAVs hear: per receiver a list of true and false.", kinds=("matrix",))
     limit: int | None = setting(

@@ -61,10 +61,12 @@ class ObservationConfig(Settings):
     )
     ctde: bool = setting(False, "Whether the actor observes only the local features.")
     time_scale: float | None = setting(
-        None, "Divides times; the time limit of episodes, or else an hour, if not given [s].", above=0
+        None, "Divides times; the time limit of episodes, or else an hour, if not given.", unit="s", above=0
     )
     age: bool = setting(False, "Whether each actor observes the age of its UAV's message on the server.")
-    age_scale: float = constant(10.0, "Divides ages; a policy scales them by its first layer [s].", above=0)
+    age_scale: float = constant(
+        10.0, "Divides ages; a policy scales them by its first layer.", unit="s", above=0
+    )
     own: bool = setting(
         False,
         "Whether each UAV knows its own messages at once, not when the server has them, as in the paper.",
@@ -81,7 +83,7 @@ class ObservationConfig(Settings):
         paths=True,
     )
     belief_cell: float | None = setting(
-        None, "Edge of a cell of the belief; 0.8 footprint radii or more if not given [m].", above=0
+        None, "Edge of a cell of the belief; 0.8 footprint radii or more if not given.", unit="m", above=0
     )
     window: int = setting(2, "Latest landing points of a UAV that its coverage counts.", low=1, high=16)
     timeline: int = setting(
@@ -178,7 +180,9 @@ class EpisodeConfig(Settings):
 
     section: ClassVar[str] = "episode"
 
-    max_steps: int | None = setting(50, "Time limit; none if not given [steps].", low=1, high=checks.STEPS)
+    max_steps: int | None = setting(
+        50, "Time limit; none if not given.", unit="steps", low=1, high=checks.STEPS
+    )
     since_detection: bool = setting(False, "Count the time limit from the latest detection.")
     success_share: float | None = setting(
         None, "Share of the UAVs that must spot at once for success; none if not given.", above=0, high=1

@@ -27,10 +27,12 @@ class RegionConfig(Settings):
         choices=("random", "vertices", "fir", "geojson"),
         paths=True,
     )
-    min_area: float = setting(100000.0, "Smallest area of a random region [m^2].", above=0, kinds=RANDOM)
-    max_area: float = setting(200000.0, "Largest area of a random region [m^2].", above=0, kinds=RANDOM)
+    min_area: float = setting(
+        100000.0, "Smallest area of a random region.", unit="m^2", above=0, kinds=RANDOM
+    )
+    max_area: float = setting(200000.0, "Largest area of a random region.", unit="m^2", above=0, kinds=RANDOM)
     pool: int = setting(1, "Number of random regions, drawn once per seed.", low=1, high=10_000, kinds=RANDOM)
-    vertices: list = setting([], "Polygon corners, [x, y] each [m].", kinds=("vertices",))
+    vertices: list = setting([], "Polygon corners, [x, y] each.", unit="m", kinds=("vertices",))
     path: str = setting(
         "",
         "File, such as park.geojson, .kml, .gpkg, .shp, .plan (fir: damian:fir.csv).",
@@ -43,8 +45,10 @@ class RegionConfig(Settings):
     where: Any = setting(
         None, "Property of the feature in the file, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
-    lattice_step: float = setting(30.0, "Distance between landing points of a lattice row [m].", above=0)
-    lattice_angle: float = setting(45.0, "Slant of the landing-point lattice [deg].", above=0, high=90)
+    lattice_step: float = setting(
+        30.0, "Distance between landing points of a lattice row.", unit="m", above=0
+    )
+    lattice_angle: float = setting(45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90)
     n_landing_points: int | None = setting(
         None, "Number of landing points kept, those nearest to the centroid; all if not given.", low=1
     )
@@ -94,14 +98,19 @@ class MotionConfig(Settings):
         paths=True,
     )
     degree: int = setting(5, "Degree of the time law of each phase.", choices=(3, 5, 7), kinds=POLYNOMIAL)
-    max_speed: float = setting(5.0, "Speed limit [m/s].", low=1e-3, kinds=POLYNOMIAL)
-    max_acceleration: float = setting(2.0, "Acceleration limit [m/s^2].", low=1e-3, kinds=POLYNOMIAL)
-    sensing_time: float = setting(0.0, "Time that a landed UAV senses before it may choose again [s].", low=0)
-    min_level: float = setting(1.0, "Flight level of the first UAV [m].", above=0)
-    max_level: float = setting(
-        20.0, "Highest flight level, shared by UAVs that fly instantly if there are too few [m].", above=0
+    max_speed: float = setting(5.0, "Speed limit.", unit="m/s", low=1e-3, kinds=POLYNOMIAL)
+    max_acceleration: float = setting(2.0, "Acceleration limit.", unit="m/s^2", low=1e-3, kinds=POLYNOMIAL)
+    sensing_time: float = setting(
+        0.0, "Time that a landed UAV senses before it may choose again.", unit="s", low=0
     )
-    level_separation: float = setting(0.5, "Vertical distance between two flight levels [m].", above=0)
+    min_level: float = setting(1.0, "Flight level of the first UAV.", unit="m", above=0)
+    max_level: float = setting(
+        20.0,
+        "Highest flight level, shared by UAVs that fly instantly if there are too few.",
+        unit="m",
+        above=0,
+    )
+    level_separation: float = setting(0.5, "Vertical distance between two flight levels.", unit="m", above=0)
     options: Any = setting(None, "Settings of a motion model of your own, as a mapping.", kinds=POLYNOMIAL)
 
     def __post_init__(self) -> None:
@@ -117,9 +126,9 @@ class SourceConfig(Settings):
 
     section: ClassVar[str] = "source"
 
-    level_db: float = setting(140.0, "Sound level at 1 m, re 1e-12 W/m^2 [dB].", low=-300, high=300)
+    level_db: float = setting(140.0, "Sound level at 1 m, re 1e-12 W/m^2.", unit="dB", low=-300, high=300)
     microphone_db: float = constant(
-        105.0, "Lowest level that is heard; only its distance from ``level_db`` counts [dB].", low=0
+        105.0, "Lowest level that is heard; only its distance from ``level_db`` counts.", unit="dB", low=0
     )
     motion: str = setting("static", "Whether the source walks.", choices=("static", "dynamic"))
     emission: str = setting(
@@ -141,14 +150,18 @@ class SourceConfig(Settings):
     min_stops: int = setting(3, "Fewest inner points around a hotspot.", low=1, kinds=DYNAMIC)
     max_stops: int = setting(7, "Most inner points around a hotspot.", low=1, high=1000, kinds=DYNAMIC)
     local_distance: float = setting(
-        50.0, "Largest distance of an inner point from its hotspot [m].", above=0, kinds=DYNAMIC
+        50.0, "Largest distance of an inner point from its hotspot.", unit="m", above=0, kinds=DYNAMIC
     )
-    speed: float = setting(20.0, "Largest speed to another hotspot [m/s].", above=0, kinds=DYNAMIC)
-    acceleration: float = setting(2.5, "Acceleration to another hotspot [m/s^2].", above=0, kinds=DYNAMIC)
-    local_speed: float = setting(1.7, "Largest speed around a hotspot [m/s].", above=0, kinds=DYNAMIC)
-    local_acceleration: float = setting(1.1, "Acceleration around a hotspot [m/s^2].", above=0, kinds=DYNAMIC)
-    min_wait: float = setting(60.0, "Shortest wait at a stop [s].", low=0, kinds=DYNAMIC)
-    max_wait: float = setting(360.0, "Longest wait at a stop [s].", low=0, kinds=DYNAMIC)
+    speed: float = setting(20.0, "Largest speed to another hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
+    acceleration: float = setting(
+        2.5, "Acceleration to another hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC
+    )
+    local_speed: float = setting(1.7, "Largest speed around a hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
+    local_acceleration: float = setting(
+        1.1, "Acceleration around a hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC
+    )
+    min_wait: float = setting(60.0, "Shortest wait at a stop.", unit="s", low=0, kinds=DYNAMIC)
+    max_wait: float = setting(360.0, "Longest wait at a stop.", unit="s", low=0, kinds=DYNAMIC)
 
     @property
     def variant(self) -> str:
@@ -181,16 +194,21 @@ class BatteryConfig(Settings):
 
     enabled: bool = setting(False, "Whether flights drain the battery.", kinds=CHARGING)
     engine_power_kw: float = setting(
-        10.0, "Power at the reference speed, and in takeoff and landing [kW].", above=0, kinds=CHARGING
+        10.0, "Power at the reference speed, and in takeoff and landing.", unit="kW", above=0, kinds=CHARGING
     )
     reference_speed: float = setting(
-        20.0, "Cruise speed at which the engine takes its full power [m/s].", above=0, kinds=CHARGING
+        20.0, "Cruise speed at which the engine takes its full power.", unit="m/s", above=0, kinds=CHARGING
     )
-    capacity_kwh: float = setting(9.0, "Energy of a full battery [kWh].", low=1e-6, kinds=CHARGING)
+    capacity_kwh: float = setting(9.0, "Energy of a full battery.", unit="kWh", low=1e-6, kinds=CHARGING)
     efficiency: float = setting(12.0, "Factor that divides the consumption.", above=0, kinds=CHARGING)
-    charging_power_kw: float = setting(4.0, "Power of a charging UAV [kW].", above=0, kinds=CHARGING)
+    charging_power_kw: float = setting(4.0, "Power of a charging UAV.", unit="kW", above=0, kinds=CHARGING)
     resolution: float = setting(
-        5.0, "Observed levels are rounded down to a multiple of this [%].", above=0, high=100, kinds=CHARGING
+        5.0,
+        "Observed levels are rounded down to a multiple of this.",
+        unit="%",
+        above=0,
+        high=100,
+        kinds=CHARGING,
     )
     charging_points: list | None = setting(
         None,
@@ -223,10 +241,11 @@ class ActionConfig(Settings):
         "discrete (every distance with every heading), or continuous (up to the largest distance).",
         choices=("discrete", "continuous"),
     )
-    distances: list[float] = setting([0.0, 50.0, 100.0, 150.0, 200.0], "Distances; 0 holds [m].", low=0)
+    distances: list[float] = setting([0.0, 50.0, 100.0, 150.0, 200.0], "Distances; 0 holds.", unit="m", low=0)
     headings: list[float] = setting(
         [-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0],
-        "Headings of discrete actions, clockwise from north [deg].",
+        "Headings of discrete actions, clockwise from north.",
+        unit="deg",
         low=-360,
         high=360,
     )
