@@ -11,14 +11,15 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from twin import Uav
+from twin import GLOBAL, LOCAL, Uav
 
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig, ServerContext
-from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.server.config import BUILT_IN
+from damian.server.features import ObservationConfig, ServerContext
+from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
@@ -99,8 +100,8 @@ def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) 
         "source": walking(emission="per_step", emission_probability=0.7),
         "battery": BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=20.0),
         "actions": ActionConfig(kind=kind),
-        "observation": ObservationConfig(list(LOCAL), list(GLOBAL), timeline=3 * in_order),
-        "reward": RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5), bonus=1.0, penalty=0.25),
+        "observation": ObservationConfig(LOCAL, GLOBAL, timeline=3 * in_order),
+        "reward": RewardConfig(**dict.fromkeys(BUILT_IN, 0.5), bonus=1.0, penalty=0.25),
         "episode": EpisodeConfig(max_steps=8, success_share=1.0, discharged_share=1.0),
     }
     return ScenarioConfig(**(sections | changed))

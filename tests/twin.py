@@ -7,8 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import shapely
 
-from damian.server.rewards import INDIVIDUAL, RewardConfig
+from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
+
+LOCAL = ["battery", "spotted"]
+GLOBAL = ["source_distance", "source_bearing", "source_drift", "source_time", "agent_distances", "coverage"]
+GLOBAL += ["mean_distance", "mean_distance_not_spotting", "mean_distance_spotting", "spotting_agents"]
+"""The features of the paper's Table 2."""
+INDIVIDUAL = ("coverage", "spotted", "battery")
+"""The terms of eq. 7; the others are those of eq. 6."""
 
 
 @dataclass
@@ -89,7 +96,7 @@ def terms(values: dict[str, float], motions: int, task: RewardConfig) -> dict[st
     weighted = {}
     for name, value in values.items():
         weight = getattr(task, name) * (task.individual if name in INDIVIDUAL else task.system)
-        if weight != 0:
+        if getattr(task, name) != 0:
             weighted[name] = weight * term(name, value, max(motions, 1), task)
     return weighted
 

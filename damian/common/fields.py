@@ -75,10 +75,6 @@ class Settings:
             _check_value(self.key(name), value, rules(type(self))[name], _base(hint))
         return value
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The settings alone, because what other modules have read from them may not be copied."""
-        return {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-
     @property
     def variant(self) -> str:
         """The kind of this section, which decides what of it is read; empty if there is none."""

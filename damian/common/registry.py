@@ -131,10 +131,15 @@ def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
     return name
 
 
+def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """The keyword-only arguments of a function, by name."""
+    accepted = inspect.signature(function).parameters
+    return {name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY}
+
+
 def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str) -> None:
     """Require that ``given`` are the keyword-only arguments of a function; ``path`` names it in errors."""
-    accepted = inspect.signature(function).parameters
-    known = {name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY}
+    known = parameters_of(function)
     for name, value in given.items():
         problem = f"is not a parameter of {path}, which has {', '.join(known) or 'none'}"
         checks.require(name in known, f"{key}.{name}", value, problem)

@@ -11,7 +11,6 @@ from damian.keys import next_key
 from damian.replay.backupdate import Recompute
 from damian.replay.hindsight import arrived_by_now
 from damian.server.belief import likelihood, predict, repeated, report_rows, weigh
-from damian.server.rewards import features_read
 from damian.server.server import Server
 
 CORRECTED = {"reward": keys.REWARD, "critic": keys.GLOBAL_OBSERVATION, "actor": keys.OBSERVATION}
@@ -27,7 +26,7 @@ def server_recompute(
     ``corrected``: names in ``CORRECTED``; the ends of episodes always are.
     """
     observes = not {"critic", "actor"}.isdisjoint(corrected)
-    names = None if observes else features_read(server.reward)
+    names = None if observes else server.reads
     believes = server.grid is not None and (observes or server.rewards_belief)
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:

@@ -1,63 +1,30 @@
 """Settings of what the server computes: observations, rewards, and the ends of episodes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
 
-LOCAL_FEATURES = ("battery", "spotted")
-"""Features of the UAV itself."""
-GLOBAL_FEATURES = (
-    "source_distance",
-    "source_bearing",
-    "source_drift",
-    "source_time",
-    "agent_distances",
-    "coverage",
-    "mean_distance",
-    "mean_distance_not_spotting",
-    "mean_distance_spotting",
-    "spotting_agents",
-)
-"""Features of all UAVs, in the order of the paper's Table 2."""
-SURROUNDINGS = (("place", "time_left", "number"), ("others", "ages", "coverage_map"))
-"""Local and global features of what surrounds a UAV, beyond Table 2 (``damian.server.surroundings``)."""
-BELIEF_FEATURES = ("belief_gain", "belief_moments", "belief_map")
-"""Features of the belief."""
-INDIVIDUAL = ("coverage", "spotted", "battery")
-"""Terms of the individual reward (eq. 7)."""
-SYSTEM = (
-    "source_distance",
-    "source_time",
-    "source_bearing",
-    "source_drift",
-    "spotting_agents",
-    "mean_distance",
-    "mean_distance_not_spotting",
-    "mean_distance_spotting",
-)
-"""Terms of the system reward (eq. 6)."""
-
 
 @dataclass
 class ObservationConfig(Settings):
-    """Which features the actor and the critic observe; ``package.module:feature`` is one of your own."""
+    """Which features the actor and the critic observe, by name; your own as ``package.module:feature``.
+
+    The last ones, from ``place`` and ``others`` on, go beyond the paper's Table 2.
+    """
 
     section: ClassVar[str] = "observation"
 
     local_features: list[str] = setting(
-        ["spotted"],
-        f"Features of the UAV itself: {', '.join(LOCAL_FEATURES + SURROUNDINGS[0])}.",
-        choices=LOCAL_FEATURES + SURROUNDINGS[0],
-        paths=True,
+        ["spotted"], "Features of the UAV itself: battery, spotted, place, time_left, number."
     )
     global_features: list[str] = setting(
         ["source_distance", "source_bearing", "source_time"],
-        f"Features from the messages of all UAVs: {', '.join(GLOBAL_FEATURES + SURROUNDINGS[1])}.",
-        choices=GLOBAL_FEATURES + SURROUNDINGS[1],
-        paths=True,
+        "Features from the messages of all UAVs: source_distance, source_bearing, source_drift, source_time, "
+        "agent_distances, coverage, mean_distance, mean_distance_not_spotting, mean_distance_spotting, "
+        "spotting_agents, others, ages, coverage_map.",
     )
     ctde: bool = setting(False, "Whether the actor observes only the local features.")
     time_scale: float | None = setting(
@@ -79,8 +46,6 @@ class ObservationConfig(Settings):
     belief: list[str] = setting(
         [],
         "Where the source is, by Bayes' rule: belief_gain (per action), belief_moments, belief_map.",
-        choices=BELIEF_FEATURES,
-        paths=True,
     )
     belief_cell: float | None = setting(
         None, "Edge of a cell of the belief; 0.8 footprint radii or more if not given.", unit="m", above=0
@@ -126,10 +91,8 @@ class ObservationConfig(Settings):
 
 
 @dataclass
-class RewardConfig(Settings):
-    """The task, as weights of the reward terms (eq. 5-8). A term with weight 0 is not computed."""
-
-    section: ClassVar[str] = "reward"
+class RewardWeights(Settings):
+    """The weights of the built-in reward terms (eq. 6 and 7). A term with weight 0 is not computed."""
 
     coverage: float = setting(0.0, "Weight of newly covered area that no other UAV covers (R1^a, eq. 7).")
     spotted: float = setting(1.0, "Weight of spotting the source, over the motions since (R2^a, eq. 7).")
@@ -146,6 +109,18 @@ class RewardConfig(Settings):
     mean_distance: float = setting(0.0, "Weight of a mean distance as desired between UAVs (R6^s, eq. 6).")
     mean_distance_not_spotting: float = setting(0.0, "The same between UAVs that do not spot (R7^s, eq. 6).")
     mean_distance_spotting: float = setting(0.0, "The same from spotting UAVs to the source (R8^s, eq. 6).")
+
+
+BUILT_IN = tuple(each.name for each in fields(RewardWeights))
+"""Names of the built-in reward terms."""
+
+
+@dataclass
+class RewardConfig(RewardWeights):
+    """The task: weights and parameters of the reward terms, bonus and penalty (eq. 5-8)."""
+
+    section: ClassVar[str] = "reward"
+
     individual: float = constant(1.0, "w_a of eq. 8; the weights of the terms scale the same.")
     system: float = constant(1.0, "w_s of eq. 8; the weights of the terms scale the same.")
     drift: str = setting(
@@ -167,11 +142,9 @@ class RewardConfig(Settings):
     @property
     def terms(self) -> list[str]:
         """Names of the terms whose weight is not 0, the user's own last."""
-        individual = [name for name in INDIVIDUAL if getattr(self, name) * self.individual != 0]
-        system = [name for name in SYSTEM if getattr(self, name) * self.system != 0]
         own = [each for each in self.custom if isinstance(each, Mapping) and each.get("weight", 1.0) != 0]
         names = [each.get("name") or str(each.get("term")).rpartition(":")[2] for each in own]
-        return [*individual, *system, *names]
+        return [*(name for name in BUILT_IN if getattr(self, name) != 0), *names]
 
 
 @dataclass

@@ -20,7 +20,7 @@ from damian.server.belief import (
     first_belief,
     report_rows,
 )
-from damian.server.config import GLOBAL_FEATURES, LOCAL_FEATURES, ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.world.battery import BatteryConfig, observed
 from damian.world.coverage import (
     FootprintTables,
@@ -209,8 +209,20 @@ def check_features(config: ObservationConfig) -> None:
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
     """Features by name of messages [*, N], each [*, N], or in the shape and range that it declares."""
-    cache = FeatureCache(messages, context)
-    return {name: feature_of(name).compute(cache) for name in names}
+    cache, found = FeatureCache(messages, context), {}
+    for name in names:
+        found[name] = feature_of(name).compute(cache)
+        _check_shape(name, found[name], messages.time.shape)
+    return found
+
+
+def _check_shape(name: str, values: Tensor, of_messages: torch.Size) -> None:
+    width = feature_of(name).width
+    columns = () if width == 1 else (values.shape[-1:] if width is None else (width,))
+    expected = [*of_messages, *columns]
+    if [*values.shape] != expected:
+        right = "(worlds, UAVs, values): return this shape, or declare another width"
+        raise InputError(f"feature {name}: shape: {[*values.shape]} is not {expected} {right}")
 
 
 def observe_own(known: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
@@ -457,7 +469,3 @@ def _belief_map(v: FeatureCache) -> Tensor:
     share = v.belief.unsqueeze(-2).expand_as(east)
     bins = share.new_zeros(*part.shape[:-1], (len(RINGS) + 1) * SECTORS)
     return bins.scatter_add(-1, part, share).clamp(max=1)
-
-
-LOCAL, GLOBAL = tuple(LOCAL_FEATURES), tuple(GLOBAL_FEATURES)
-"""Names of the built-in features of the UAV itself, and of all UAVs (Table 2)."""

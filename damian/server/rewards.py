@@ -1,6 +1,5 @@
 """The terms of the reward, by the names of their features (paper, eq. 5-8), and terms of users."""
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -8,8 +7,9 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.registry import Registry, check_parameters, name_of
-from damian.server.config import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.common.errors import InputError
+from damian.common.registry import Registry, check_parameters, name_of, parameters_of
+from damian.server.config import BUILT_IN, RewardConfig
 from damian.server.features import FEATURES
 from damian.server.termination import Status
 
@@ -57,75 +57,62 @@ def reward_term(
 REWARD_TERMS = Registry[RewardTerm](
     "reward term", RewardTerm, "is not a reward term: decorate it with damian.reward_term"
 )
-"""Reward terms from outside the package, by name or as ``package.module:name``."""
+"""Reward terms by name; those outside the package as ``package.module:name``."""
 
 
-class CustomTerm(NamedTuple):
-    """A reward term as a configuration uses it."""
+class WeightedTerm(NamedTuple):
+    """A reward term as settings use it."""
 
     name: str
-    """Key of the term in logs: ``name`` in the settings, or else the function's name."""
     weight: float
-    """Weight of the term within its scope."""
+    """Weight in the total reward (eq. 8)."""
     term: RewardTerm
     parameters: Mapping[str, Any]
     """Keyword arguments of the function."""
 
-
-def custom_term(written: Any, key: str) -> CustomTerm:
-    """Read ``{term: package.module:name, weight: 0.1, ...}``; ``name`` tells terms of one function apart."""
-    path, term, parameters = REWARD_TERMS.read(written, key, "term")
-    for read in term.reads:
-        FEATURES.get(read, f"{key}.term: reads of {path}")
-    weight = parameters.pop("weight", 1.0)
-    checks.in_range(f"{key}.weight", weight, -1e6, 1e6)
-    name = name_of(parameters, path.rpartition(":")[2], key)
-    check_parameters(term.compute, parameters, path, key)
-    return CustomTerm(name, float(weight), term, parameters)
+    def value(self, features: Mapping[str, Tensor], counters: Counters) -> Tensor:
+        """The term before it is weighted, [*, N]."""
+        known = {name: features[name] for name in self.term.reads}
+        value = self.term.compute(known, counters, **self.parameters)
+        if value.shape != counters.motions.shape:  # it would be broadcast without a word
+            shapes = f"{[*value.shape]} is not {[*counters.motions.shape]} (worlds, UAVs)"
+            raise InputError(f"reward term {self.name}: shape: {shapes}: return a value for each UAV")
+        return value.float()
 
 
-def own_terms(config: RewardConfig) -> dict[str, CustomTerm]:
-    """The user's own terms by name, read once from the settings."""
-    found: dict[str, CustomTerm] | None = getattr(config, "_own_terms", None)
-    if found is None:
-        terms = [custom_term(written, f"reward.custom[{i}]") for i, written in enumerate(config.custom)]
-        found = {term.name: term for term in terms}
-        names, problem = [term.name for term in terms], "must differ from each other and the built-in terms"
-        once = len(found) == len(terms) and not {*INDIVIDUAL, *SYSTEM} & {*found}
-        remedy = "; a name does, as in {term: ..., name: low}"
-        checks.require(once, "reward.custom", names, problem + remedy)
-        config._own_terms = found  # type: ignore[attr-defined]
+def terms_of(config: RewardConfig) -> dict[str, WeightedTerm]:
+    """The terms whose weight is not 0, by name: built-in ones, then the user's own (``reward.custom``).
+
+    The parameters of a built-in term are the settings of their names.
+    """
+    factor = {"individual": config.individual, "system": config.system}
+    found = {}
+    for name in BUILT_IN:
+        if weight := getattr(config, name):
+            term = REWARD_TERMS.get(name, f"reward.{name}")
+            parameters = {each: getattr(config, each) for each in parameters_of(term.compute)}
+            found[name] = WeightedTerm(name, weight * factor[term.scope], term, parameters)
+    for number, written in enumerate(config.custom):
+        key = f"reward.custom[{number}]"
+        path, term, parameters = REWARD_TERMS.read(written, key, "term")
+        for read in term.reads:
+            FEATURES.get(read, f"{key}.term: reads of {path}")
+        weight = parameters.pop("weight", 1.0)
+        checks.in_range(f"{key}.weight", weight, -1e6, 1e6)
+        name = name_of(parameters, path.rpartition(":")[2], key)
+        check_parameters(term.compute, parameters, path, key)
+        problem = f"is the name of another term: give it another one, as in {{term: {path}, name: other}}"
+        checks.require(name not in (*BUILT_IN, *found), f"{key}.name", name, problem)
+        if weight != 0:
+            found[name] = WeightedTerm(name, weight * factor[term.scope], term, parameters)
     return found
 
 
-def features_read(config: RewardConfig) -> list[str]:
-    """Names of the features that the terms read; a built-in term reads the feature of its name."""
-    own = own_terms(config)
-    reads = [own[name].term.reads if name in own else [name] for name in config.terms]
-    return list(dict.fromkeys(itertools.chain(*reads)))
-
-
-def weight_of(config: RewardConfig, name: str) -> float:
-    """The weight of a term in the total reward (eq. 8)."""
-    if own := own_terms(config).get(name):
-        return own.weight * (config.individual if own.term.scope == "individual" else config.system)
-    group = config.individual if name in INDIVIDUAL else config.system
-    return getattr(config, name) * group
-
-
-def value_of(config: RewardConfig, name: str, features: dict[str, Tensor], counters: Counters) -> Tensor:
-    """A term before it is weighted, [*, N]."""
-    if own := own_terms(config).get(name):
-        value = own.term.compute({n: features[n] for n in own.term.reads}, counters, **own.parameters)
-        return value.float().view_as(counters.motions)  # another shape would be broadcast without a word
-    return _TERMS[name](features[name], counters, config)
-
-
-def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
+def reward(
+    features: Mapping[str, Tensor], counters: Counters, terms: Mapping[str, WeightedTerm]
+) -> dict[str, Tensor]:
     """Weighted reward terms by name, [*, N] (eq. 6 and 7); their sum is the reward (eq. 8)."""
-    return {
-        name: weight_of(config, name) * value_of(config, name, features, counters) for name in config.terms
-    }
+    return {name: each.weight * each.value(features, counters) for name, each in terms.items()}
 
 
 def final_reward(ended: Status, counters: Counters, config: RewardConfig) -> Tensor:
@@ -135,30 +122,56 @@ def final_reward(ended: Status, counters: Counters, config: RewardConfig) -> Ten
     return ended.success * bonus - failure * config.penalty
 
 
+# The terms of the paper. Each reads the feature of its name.
+
+
 def _per_motion(value: Tensor, counters: Counters) -> Tensor:
     return value / counters.motions.clamp(min=1)
 
 
-def _drift(theta: Tensor, config: RewardConfig) -> Tensor:
-    if config.drift == "printed":
-        return torch.where(theta <= 0.5, 2 * theta, 1 - theta)
-    return 1 - (2 * theta - 1).abs()
+def _straight(turn: Tensor, drift: str) -> Tensor:
+    """R4^s, from the feature ``source_drift``; it is largest at 1/2, for a UAV that flies at the source."""
+    if drift == "printed":
+        return torch.where(turn <= 0.5, 2 * turn, 1 - turn)
+    return 1 - (2 * turn - 1).abs()
 
 
-def _near(desired: str) -> Callable[[Tensor, Counters, RewardConfig], Tensor]:
-    return lambda value, _, config: 1 - (getattr(config, desired) - value).abs()
+def _near(value: Tensor, desired: float) -> Tensor:
+    return 1 - (desired - value).abs()
 
 
-_TERMS: dict[str, Callable[[Tensor, Counters, RewardConfig], Tensor]] = {
-    "coverage": lambda value, *_: value,
-    "spotted": lambda value, counters, _: _per_motion(value, counters),
-    "battery": lambda value, *_: value,
-    "source_distance": lambda value, counters, _: _per_motion(1 - value, counters),
-    "source_time": lambda value, *_: 1 - value,
-    "source_bearing": lambda value, *_: 1 - value,
-    "source_drift": lambda value, _, config: _drift(value, config),
-    "spotting_agents": _near("desired_spotting"),
-    "mean_distance": _near("desired_distance"),
-    "mean_distance_not_spotting": _near("desired_distance_not_spotting"),
-    "mean_distance_spotting": _near("desired_distance_spotting"),
-}
+def _add(name: str, scope: str, compute: Callable[..., Tensor]) -> None:
+    REWARD_TERMS.register(name)(reward_term([name], scope)(compute))
+
+
+_add("coverage", "individual", lambda f, counters: f["coverage"])
+_add("spotted", "individual", lambda f, counters: _per_motion(f["spotted"], counters))
+_add("battery", "individual", lambda f, counters: f["battery"])
+_add("source_distance", "system", lambda f, counters: _per_motion(1 - f["source_distance"], counters))
+_add("source_time", "system", lambda f, counters: 1 - f["source_time"])
+_add("source_bearing", "system", lambda f, counters: 1 - f["source_bearing"])
+_add("source_drift", "system", lambda f, counters, *, drift: _straight(f["source_drift"], drift))
+_add(
+    "spotting_agents",
+    "system",
+    lambda f, counters, *, desired_spotting: _near(f["spotting_agents"], desired_spotting),
+)
+_add(
+    "mean_distance",
+    "system",
+    lambda f, counters, *, desired_distance: _near(f["mean_distance"], desired_distance),
+)
+_add(
+    "mean_distance_not_spotting",
+    "system",
+    lambda f, counters, *, desired_distance_not_spotting: _near(
+        f["mean_distance_not_spotting"], desired_distance_not_spotting
+    ),
+)
+_add(
+    "mean_distance_spotting",
+    "system",
+    lambda f, counters, *, desired_distance_spotting: _near(
+        f["mean_distance_spotting"], desired_distance_spotting
+    ),
+)

@@ -22,7 +22,7 @@ from damian.server.features import (
     observe_own,
     stack,
 )
-from damian.server.rewards import Counters, features_read, final_reward, reward
+from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
 from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
@@ -73,59 +73,75 @@ class Server:
         checks.require(n_points < MAX_EXACT_INTEGER, "region.lattice_step", n_points, should)
         check_features(observation)
         self.observation, self.reward, self.episode = observation, reward, episode
-        self.battery, self.dt, self._scale = battery, simulation.dt, airspace.scale
-        self._names = sorted({*observation.actor, *observation.critic, *features_read(reward)})
+        self.battery, self.dt, self._scales = battery, simulation.dt, airspace.scale
+        self._read_terms()
+        self.names: list[str] = sorted({*observation.actor, *observation.critic, *self.reads})
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._n_readings = sum(widths.values())
         footprints: FootprintTables | None = None
-        if "coverage" in self._names:
+        if "coverage" in self.names:
             polygons = [region.polygon for region in airspace.regions]
             footprints = build_tables(polygons, airspace.points.double().cpu().numpy(), simulation.radius)
         grid: SourceGrid | None = None
         if observation.belief:
             cell = observation.belief_cell
             grid = build_source_grid(airspace, simulation.config.source, simulation.radius, self.dt, cell)
-        gains = "belief_gain" in observation.belief
-        self._constants: dict[str, Any] = {
-            "time_scale": time_scale,
-            "battery": battery,
-            "footprints": footprints,
-            "points": airspace.points.flatten(0, 1),
-            "age_scale": observation.age_scale,
-            "window": observation.window,
-            "slots": observation.timeline,
-            "dt": simulation.dt,
-            "newest": observation.estimate == "newest",
-            "readings": {name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
-            "radius": simulation.radius,
-            "n_points": airspace.max_points,
-            "goals": simulation.candidates.goals() if gains else None,
-            "grid": grid,
-            "places_inside": places_inside(airspace, simulation.radius)
-            if "coverage_map" in self._names
-            else None,
-        }
-        """The fields of ``ServerContext`` that never change."""
+        gains, surrounded = "belief_gain" in observation.belief, "coverage_map" in self.names
+        self._context = ServerContext(
+            now=torch.zeros(()),
+            scale=torch.zeros(()),
+            time_scale=time_scale,
+            battery=battery,
+            footprints=footprints,
+            points=airspace.points.flatten(0, 1),
+            age_scale=observation.age_scale,
+            window=observation.window,
+            slots=observation.timeline,
+            dt=simulation.dt,
+            newest=observation.estimate == "newest",
+            readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
+            radius=simulation.radius,
+            n_points=airspace.max_points,
+            goals=simulation.candidates.goals() if gains else None,
+            places_inside=places_inside(airspace, simulation.radius) if surrounded else None,
+            grid=grid,
+        )
+        """What the server knows besides the messages, but for what changes from step to step."""
         # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.
         self.remembers_coverage = footprints is not None and not simulation.vehicles.instant
+
+    def _read_terms(self) -> None:
+        self.terms = terms_of(self.reward)
+        """The terms of the reward, by name."""
+        self.reads = [*dict.fromkeys(itertools.chain(*(each.term.reads for each in self.terms.values())))]
+        """Names of the features that they read."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state without the terms: pickle does not find a function behind its decorator."""
+        return self.__dict__ | {"terms": {}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._read_terms()
 
     @property
     def grid(self) -> SourceGrid | None:
         """Cells of the belief; None if no feature reads it."""
-        return self._constants["grid"]
+        return self._context.grid
 
     @property
     def rewards_belief(self) -> bool:
         """Whether any reward term reads the belief."""
-        return any(feature_of(name).scope == "belief" for name in features_read(self.reward))
+        return any(feature_of(name).scope == "belief" for name in self.reads)
 
     def to(self, device: torch.device) -> "Server":
         """Move the tables to a device, in place."""
-        self._scale = self._scale.to(device)
-        for name, each in self._constants.items():
-            if isinstance(each, Tensor | FootprintTables | SourceGrid):
-                self._constants[name] = each.to(device)
+        self._scales = self._scales.to(device)
+        moving = (Tensor, FootprintTables, SourceGrid)
+        self._context = ServerContext(
+            *(each.to(device) if isinstance(each, moving) else each for each in self._context)
+        )
         return self
 
     def messages(self, rows: Tensor) -> Messages:
@@ -146,7 +162,7 @@ class Server:
 
     def region_of(self, messages: Messages) -> Tensor:
         """Index of the region to which each world's landing points belong, [*]."""
-        return messages.region(self._constants["n_points"])
+        return messages.region(self._context.n_points)
 
     def __call__(
         self,
@@ -173,8 +189,8 @@ class Server:
         belief: Tensor | None = None,
     ) -> Features:
         """The features of these names, or all that an observation or a reward term needs (paper, Table 2)."""
-        context = self._context(messages, steps)._replace(coverage=coverage, belief=belief)
-        return observe(messages, context, names or self._names)
+        context = self._known(messages, steps)._replace(coverage=coverage, belief=belief)
+        return observe(messages, context, names or self.names)
 
     def privileged_features(self, messages: Messages, steps: Tensor, source: Tensor) -> Features:
         """The features of somebody who knows where the source is, [*, 2] metres."""
@@ -199,7 +215,7 @@ class Server:
 
     def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
         """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K]."""
-        context = self._context(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
+        context = self._known(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
         context = context._replace(belief=belief)
         return stack(observe_own(known, context, self.observation.actor), self.observation.actor)
 
@@ -213,15 +229,16 @@ class Server:
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         counters = Counters(steps, messages.motions)
         ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
-        terms = reward(features, counters, self.reward)
+        terms = reward(features, counters, self.terms)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
         return sum(terms.values(), start=final), terms, ended
 
-    def _context(self, messages: Messages, steps: Tensor) -> ServerContext:
+    def _known(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages."""
-        return ServerContext(now=steps * self.dt, scale=self.scales(messages), **self._constants)
+        return self._context._replace(now=steps * self.dt, scale=self.scales(messages))
 
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
         region = self.region_of(messages)
-        return self._scale.expand(region.shape) if len(self._scale) == 1 else gather_rows(self._scale, region)
+        scales = self._scales
+        return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from damian.common.tensors import distances, gather_rows
-from damian.server.features import FEATURES, FeatureCache, feature
+from damian.server.features import FEATURES, FeatureCache, feature, of_others
 from damian.world.airspace import Airspace
 
 RINGS = (0.6, 1.25, 2.5)
@@ -116,13 +116,12 @@ def _timeline(v: FeatureCache) -> Tensor:
 
 def _nearest(v: FeatureCache) -> Tensor:
     """Indices of at most four other UAVs, those with the nearest targets, the nearest first, [*, N, 4]."""
-    own = v.wanted(v.messages.target).unsqueeze(-2)
-    n, device = v.messages.target.shape[-2], own.device
-    itself = torch.eye(n, dtype=torch.bool, device=device)
-    itself = itself.unsqueeze(-2) if v.own_only else itself
-    ways = (v.messages.target.unsqueeze(-3) - own) / (v.context.scale / 2)[..., None, None, None]
-    distance = ways.square().sum(-1).masked_fill(itself, torch.inf)  # [*, N, N]
-    return distance.argsort(dim=-1, stable=True)[..., : min(OTHERS, n - 1)]
+    target, half = v.messages.target, (v.context.scale / 2)[..., None, None, None]
+    ways = (target.unsqueeze(-3) - v.wanted(target).unsqueeze(-2)) / half
+    distance = of_others(v, ways.square().sum(-1, keepdim=True)).squeeze(-1)
+    found = distance.argsort(dim=-1, stable=True)[..., :OTHERS]  # of the others
+    itself = torch.arange(target.shape[-2], device=target.device).unsqueeze(-1)
+    return found + (found >= (itself.unsqueeze(-1) if v.own_only else itself))
 
 
 def _of_nearest(v: FeatureCache, table: Tensor) -> Tensor:

@@ -1,7 +1,6 @@
 """A short flight that shows whether components from outside the package keep what they declare."""
 
 import math
-from collections.abc import Sequence
 from typing import cast
 
 import torch
@@ -13,7 +12,7 @@ from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.tensors import tree_map, tree_where
 from damian.server.features import feature_of, stack
-from damian.server.rewards import Counters, features_read, own_terms
+from damian.server.rewards import Counters
 from damian.server.server import Server
 from damian.world.simulation import Simulation
 from damian.world.state import State
@@ -23,51 +22,40 @@ _ROUNDING = 1e-5
 
 
 def try_own_components(server: Server, simulation: Simulation) -> None:
-    """Fly ``STEPS`` steps of random actions, and check sensors, features, reward terms and motion of users.
+    """Fly ``STEPS`` steps of random actions, and check features, reward terms and motion models of users.
 
-    Values have the declared shape and bounds, and are finite; a local feature follows from the UAV's own
-    message alone. Without such components nothing is flown. What only later states show is not found.
+    Values are finite and within the declared bounds, a local feature follows from the UAV's own message
+    alone, and a motion model keeps the types of the state. (Shapes are checked wherever values are computed.)
+    Without such components nothing is flown. What only later states show is not found.
 
     Raises:
         InputError: a component does not keep what it declares; the message names it.
     """
-    observation, terms = server.observation, own_terms(server.reward)
-    read = {*observation.actor, *observation.critic, *features_read(server.reward)}
-    names = [name for name in sorted(read) if _is_own(feature_of(name).compute)]
-    moves = _is_own(type(simulation.vehicles))
-    if not (names or terms or moves or simulation.sensors):
+    names = [name for name in server.names if _is_own(feature_of(name).compute)]
+    terms = {name: each for name, each in server.terms.items() if _is_own(each.term.compute)}
+    if not (names or terms or _is_own(type(simulation.vehicles))):
         return
     draw, config = torch.Generator().manual_seed(0), simulation.config
     state = first = tree_map(lambda table: table[:WORLDS], simulation.initial)
     with torch.random.fork_rng(devices=[]):  # a component may draw, but a training draws the same as without
         for _ in range(STEPS):
-            widths = [sensor.width for sensor in simulation.sensors.values()]
-            for name, values in zip(simulation.sensors, state.sent.readings.split(widths, -1), strict=True):
-                _check(f"sensor {name}", values, values.shape)
             for name in names:
                 with naming_errors(f"feature {name}"):
                     _check_feature(server, name, state, first)
             features = server.features(state.sent, state.steps) if terms else {}
-            for name, own in terms.items():
-                known, counters = (
-                    {n: features[n] for n in own.term.reads},
-                    Counters(state.steps, state.sent.motions),
-                )
+            for name, each in terms.items():
                 with naming_errors(f"reward term {name}"):
-                    values = own.term.compute(known, counters, **own.parameters)
-                _check(f"reward term {name}", values, state.track.shape)
+                    values = each.value(features, Counters(state.steps, state.sent.motions))
+                _check(f"reward term {name}", values)
             action = torch.rand(*state.track.shape, 2, generator=draw)
             if config.actions.kind == "discrete":
                 action = (action[..., 0] * config.actions.n_actions).long()
             before, key = state, f"motion.kind: {config.motion.kind}"
             with naming_errors(key):
                 state = simulation.step(state, action.to(state.track.device))
-            fields = zip(
-                State._fields[:-1], cast(list[Tensor], before), cast(list[Tensor], state), strict=False
-            )
-            for name, old, new in fields:
+            for name, old, new in zip(State._fields[:-1], before, state, strict=False):
                 checks.require(new.dtype == old.dtype, f"{key}: {name}", new.dtype, f"is not {old.dtype}")
-                _check(f"{key}: {name}", new, old.shape)
+                _check(f"{key}: {name}", new)
 
 
 def not_finite(server: Server, simulation: Simulation, steps: TensorDictBase) -> str | None:
@@ -92,32 +80,20 @@ def _is_own(component: object) -> bool:
 
 def _check_feature(server: Server, name: str, state: State, first: State) -> None:
     """Check a feature of the messages of a state; ``first`` is an earlier one of the same worlds."""
-    declared, messages, shape = feature_of(name), state.sent, state.track.shape
-    values = server.features(messages, state.steps, [name])[name]
-    width = values.shape[-1] if declared.width is None and values.dim() == 3 else declared.width
-    _check(f"feature {name}", values, [*shape, *[width] * (width != 1)], declared.low, declared.high)
-    if declared.scope != "local":
-        return
-    n = shape[-1]
-    own = torch.eye(n, dtype=torch.bool, device=values.device).expand(len(values), n, n)
-    known, older = (
-        tree_map(lambda x: x.unsqueeze(1).expand(-1, n, *x.shape[1:]), each)
-        for each in (messages, first.sent)
-    )
-    steps = state.steps.unsqueeze(-1).expand(-1, n)
-    among_others = server.features(tree_where(own, known, older), steps, [name])[name]
-    same = among_others.diagonal(0, 1, 2).movedim(-1, 1).float().allclose(values.float(), atol=_ROUNDING)
-    problem = "changes with the messages of other UAVs: make it global, or read only the UAV's own"
-    checks.require(same, f"feature {name}", "local", problem)
+    declared, n = feature_of(name), state.track.shape[-1]
+    alone = server.features(state.sent, state.steps, [name])[name]
+    _check(f"feature {name}", alone, declared.low, declared.high)
+    for uav in range(n if declared.scope == "local" else 0):
+        own = (torch.arange(n, device=alone.device) == uav).expand(len(alone), n)
+        mixed = tree_where(own, state.sent, first.sent)
+        among_others = server.features(mixed, state.steps, [name])[name]
+        same = among_others[:, uav].float().allclose(alone[:, uav].float(), atol=_ROUNDING)
+        problem = "changes with the messages of other UAVs: make it global, or read only the UAV's own"
+        checks.require(same, f"feature {name}", "local", problem)
 
 
-def _check(
-    key: str, values: Tensor, shape: Sequence[int | None], low: float = -math.inf, high: float = math.inf
-) -> None:
-    """Require a shape, and finite values within bounds."""
-    expected = [*shape]
-    right = f"is not {expected} (worlds, UAVs, values): return this shape, or declare another width"
-    checks.require([*values.shape] == expected, f"{key}: shape", [*values.shape], right)
+def _check(key: str, values: Tensor, low: float = -math.inf, high: float = math.inf) -> None:
+    """Require finite values within bounds."""
     number = values.double()
     wrong = number[~((number >= low - _ROUNDING) & (number <= high + _ROUNDING) & number.isfinite())]
     bounds = f"between {low:g} and {high:g}, which it declares: scale it, or declare its bounds"

@@ -35,8 +35,9 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.learners.networks import ModelConfig, make_actor
 from damian.recipes.cli import settings as composed_config
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig
-from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.server.config import BUILT_IN
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
@@ -45,6 +46,10 @@ RIVAL_TASKS, RIVAL_LIMIT = ("discovery", "navigation", "simple_spread"), 100
 JAXMARL, JAXMARL_PYTHON = "JaxMARL simple_spread, one graph", Path("build/jaxmarl-venv/bin/python")
 BARE, WHOLE = "bare", "whole chain"
 NO_BELIEF = "no belief"
+
+TABLE_2 = ["source_distance", "source_bearing", "source_drift", "source_time", "agent_distances", "coverage"]
+TABLE_2 += ["mean_distance", "mean_distance_not_spotting", "mean_distance_spotting", "spotting_agents"]
+"""Global features of the paper."""
 
 Scenarios = dict[str, ScenarioConfig]
 
@@ -73,8 +78,8 @@ def scenarios() -> Scenarios:
         motion=MotionConfig(kind="polynomial"),
         battery=BatteryConfig(enabled=True),
         actions=replace(paper.actions, mask=True),
-        observation=ObservationConfig(list(LOCAL), list(GLOBAL), ctde=True),
-        reward=RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 1.0)),
+        observation=ObservationConfig(["battery", "spotted"], TABLE_2, ctde=True),
+        reward=RewardConfig(**dict.fromkeys(BUILT_IN, 1.0)),
         episode=EpisodeConfig(max_steps=100),
     )
     return {"use case 2": paper, "everything": full}

@@ -8,7 +8,7 @@ from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
 from damian.runs.loggers import check_loggers
 from damian.server.features import check_features
-from damian.server.rewards import own_terms
+from damian.server.rewards import terms_of
 from damian.world.regions.sources import REGION_SOURCES
 from damian.world.sensors import sensors_of
 from damian.world.vehicles import MOTION_MODELS
@@ -71,7 +71,7 @@ def check_components(config: TrainConfig) -> None:
     check_laws(config.delay, config.clock.dt)
     link_reads(config.links, config.clock.dt)
     check_features(config.observation)
-    own_terms(config.reward)
+    terms_of(config.reward)
     sensors_of(config.sensors)
     check_loggers(config.logger.custom)
 

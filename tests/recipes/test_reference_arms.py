@@ -19,6 +19,7 @@ from helpers import (
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from twin import GLOBAL, LOCAL
 
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
@@ -31,7 +32,7 @@ from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig
+from damian.server.features import ObservationConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -82,7 +83,7 @@ def test_delays_and_losses_do_not_change_the_privileged_observation(motion, orde
         "delay": DelayConfig(obs=BURST, loss=0.3, order=order, history=2, rew=1),
         "clock": ClockConfig(server="2s"),
     }
-    same = {"episode": KEEPS_GOING, "observation": ObservationConfig(list(LOCAL), list(GLOBAL))}
+    same = {"episode": KEEPS_GOING, "observation": ObservationConfig(LOCAL, GLOBAL)}
     undelayed, delayed = (
         rollout_of(everything(motion, **same, **sections), ("privileged",)) for sections in ({}, late)
     )

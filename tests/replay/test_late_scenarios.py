@@ -9,6 +9,7 @@ from helpers import everything, random_actions
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
+from twin import GLOBAL, LOCAL
 
 from damian import keys
 from damian.delays.config import DelayConfig, LinkConfig
@@ -18,7 +19,7 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import CORRECTED, server_recompute
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig
+from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
 
 STEPS, WORLDS, LONGEST = 40, 4, 5
@@ -62,7 +63,7 @@ CASES: dict[str, dict[str, Any]] = {
     "late messages": {"delay": DelayConfig(obs=LATE)},
     "late messages, the same features for all": {
         "delay": DelayConfig(obs=LATE, history=2),
-        "observation": ObservationConfig(list(LOCAL), list(GLOBAL), ctde=True),
+        "observation": ObservationConfig(LOCAL, GLOBAL, ctde=True),
     },
     "late messages, summed rewards": {"delay": DelayConfig(obs=LATE, **SUMMED)},
     "late messages, slow server": {"delay": DelayConfig(obs=LATE), "clock": ClockConfig(server="3s")},

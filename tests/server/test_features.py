@@ -1,14 +1,18 @@
 """Features equal those of plain loops over UAVs, on random messages, and lie within [0, 1]."""
 
+import re
+
 import torch
 import twin
 from helpers import SCALE, TIME_SCALE, messages_of, random_worlds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig, observe
+import damian.server.surroundings  # noqa: F401 (registers features)
+from damian.common.fields import rules
+from damian.server.features import FEATURES, ObservationConfig, observe
 
-NAMES = [name for name in (*LOCAL, *GLOBAL) if name != "coverage"]
+NAMES = [name for name in (*twin.LOCAL, *twin.GLOBAL) if name != "coverage"]
 seeds = st.integers(0, 2**32 - 1)
 fleets = st.integers(1, 6)
 shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
@@ -62,3 +66,10 @@ def test_the_actor_observes_the_age_of_the_uavs_message_and_the_critic_does_not(
     assert config.actor == ["spotted", "age"]
     assert config.critic == ["source_time", "spotted"]
     assert ObservationConfig(["spotted"], ["source_time"], age=True).actor == [*config.critic, "age"]
+
+
+def test_the_help_names_every_feature():
+    said = rules(ObservationConfig)
+    for key, scope in (("local_features", "local"), ("global_features", "global"), ("belief", "belief")):
+        known = {name for name in FEATURES if FEATURES.get(name, key).scope == scope}
+        assert known <= {*re.findall(r"\w+", said[key].meaning)}, key

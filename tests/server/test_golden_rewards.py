@@ -29,7 +29,7 @@ from golden_records import (
 from helpers import GOLDEN, act, usecase
 
 from damian.server.features import observe
-from damian.server.rewards import RewardConfig, reward
+from damian.server.rewards import RewardConfig, reward, terms_of
 
 
 def reason_for_other_feature(name: str, transition: Transition, uav: int, value: float) -> str | None:
@@ -129,7 +129,7 @@ def test_recorded_features_give_the_recorded_reward_terms(case, compared, reason
         desired_distance_not_spotting=desired,
         desired_distance_spotting=desired,
     )
-    ours = {name: value.tolist() for name, value in reward(features, counters, task).items()}
+    ours = {name: value.tolist() for name, value in reward(features, counters, terms_of(task)).items()}
     assert ours.keys() == features.keys()
     counts = Counter()
     for world, transition in enumerate(records):
@@ -160,7 +160,7 @@ def test_the_environment_gives_the_recorded_rewards_and_ends(case):
         features = observe(messages, server, ["source_distance"])
         total = total - terms["source_distance"]
         task = RewardConfig(spotted=0.0, source_distance=0.04)
-        expected = expected - reward(features, counters, task)["source_distance"]
+        expected = expected - reward(features, counters, terms_of(task))["source_distance"]
     torch.testing.assert_close(total, expected, atol=TOLERANCE, rtol=0)
     done = [[transition.after["done"]] for transition in records]
     assert after["done"].tolist() == done

@@ -4,10 +4,11 @@ import pytest
 import torch
 from helpers import SQUARE, everything
 from torch import Tensor
+from twin import GLOBAL, LOCAL
 
 from damian.common.tensors import tree_map
 from damian.envs.uav_env import make_server, make_simulation
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig
+from damian.server.features import ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages
 from damian.world.regions.sources import RegionConfig
@@ -18,9 +19,7 @@ B = 3
 def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
     """A server, and messages [B, N, N] about which everything differs, with the steps elapsed [B]."""
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=30.0, initial_conditions=16)
-    observation = ObservationConfig(
-        local_features=list(LOCAL), global_features=list(GLOBAL), own=True, age=True
-    )
+    observation = ObservationConfig(local_features=LOCAL, global_features=GLOBAL, own=True, age=True)
     scenario = everything(agents=n_agents, region=region, observation=observation)
     simulation = make_simulation(scenario, 0)
     generator = torch.Generator().manual_seed(n_agents)

@@ -8,10 +8,9 @@ from helpers import messages_of, random_worlds
 from hypothesis import given
 from hypothesis import strategies as st
 
-from damian.server.rewards import INDIVIDUAL, SYSTEM, Counters, RewardConfig, reward
+from damian.server.config import BUILT_IN
+from damian.server.rewards import Counters, RewardConfig, reward, terms_of
 from damian.server.termination import EpisodeConfig, status
-
-NAMES = (*INDIVIDUAL, *SYSTEM)
 
 seeds = st.integers(0, 2**32 - 1)
 weights = st.sampled_from([0.0, 0.5, 1.0, -2.0])
@@ -31,13 +30,13 @@ def features(seed, n_agents, n_worlds=3):
         steps=torch.as_tensor(rng.integers(1, 20, n_worlds)),
         motions=torch.as_tensor(rng.integers(0, 5, (n_worlds, n_agents))),
     )
-    return {name: draw() for name in NAMES}, counters
+    return {name: draw() for name in BUILT_IN}, counters
 
 
 @given(
     seed=seeds,
     n_agents=st.integers(1, 5),
-    given_weights=st.fixed_dictionaries(dict.fromkeys(NAMES, weights)),
+    given_weights=st.fixed_dictionaries(dict.fromkeys(BUILT_IN, weights)),
     individual=weights,
     system=weights,
     drift=st.sampled_from(["smooth", "printed"]),
@@ -54,14 +53,25 @@ def test_every_term_equals_that_of_a_plain_loop(seed, n_agents, given_weights, i
         desired_distance_spotting=0.2,
     )
     inputs, counters = features(seed, n_agents)
-    ours = reward(inputs, counters, task)
+    ours = reward(inputs, counters, terms_of(task))
     for b in range(3):
         for i in range(n_agents):
-            values = {name: inputs[name][b, i].item() for name in NAMES}
+            values = {name: inputs[name][b, i].item() for name in BUILT_IN}
             expected = twin.terms(values, int(counters.motions[b, i]), task)
             assert {name: value[b, i].item() for name, value in ours.items()} == pytest.approx(
-                expected, abs=1e-9
+                expected, abs=1e-6
             )
+
+
+def test_a_built_in_term_can_be_used_again_with_parameters_of_its_own():
+    again = {"term": "mean_distance", "weight": 2.0, "name": "close", "desired_distance": 0.2}
+    task = RewardConfig(spotted=0.0, mean_distance=1.0, custom=[again])
+    inputs, counters = features(0, 3)
+    ours = reward(inputs, counters, terms_of(task))
+    assert [*ours] == task.terms
+    near = RewardConfig(spotted=0.0, mean_distance=2.0, desired_distance=0.2)
+    assert ours["close"].equal(reward(inputs, counters, terms_of(near))["mean_distance"])
+    assert not ours["close"].equal(2 * ours["mean_distance"])
 
 
 @given(

@@ -16,11 +16,13 @@ from helpers import (
     random_actions,
     sent_messages,
 )
+from twin import GLOBAL, LOCAL
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig
-from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.server.config import BUILT_IN
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig, action_table
 from damian.world.regions.sources import RegionConfig
@@ -33,7 +35,7 @@ OBSERVED = [*TWIN_FEATURES, *LOCAL]
 
 def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> ScenarioConfig:
     """Every reward term and feature except the coverage; uneven distances, so that no two points tie."""
-    task = dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5) | {"coverage": 0.0}
+    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0}
     return ScenarioConfig(
         agents=n_agents,
         region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, initial_conditions=24),
@@ -44,7 +46,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> Scena
             headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4],
         ),
         observation=ObservationConfig(
-            local_features=list(LOCAL), global_features=TWIN_FEATURES, time_scale=9.0, estimate=estimate
+            local_features=LOCAL, global_features=TWIN_FEATURES, time_scale=9.0, estimate=estimate
         ),
         reward=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
         episode=EpisodeConfig(5, since_detection=since, success_share=None if since else 0.5),
