@@ -34,7 +34,7 @@ from damian.runs.metrics import Evaluation, HindsightReturns, evaluate
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
 from damian.runs.training_state import RandomState, TrainingState, load_networks
-from damian.server.trial import not_finite
+from damian.server.components import not_finite
 
 from . import cli
 from .config import TrainConfig

@@ -15,9 +15,9 @@ from damian import keys
 from damian.common import checks, counter_rng, devices
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.config import ScenarioConfig
+from damian.server.components import checked_features
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
-from damian.server.trial import try_own_components
 from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State
@@ -94,12 +94,11 @@ class UavEnv(EnvBase):
         self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         self.simulation = simulation or make_simulation(self.scenario, seed)
         self.server = server or make_server(self.scenario, self.simulation)
-        try_own_components(self.server, self.simulation)
         problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
         known = messages_only or self.server.grid is None
         checks.require(known, "observation.belief", self.server.observation.belief, problem)
         initial = self.simulation.initial
-        features = self.server.features(initial.sent, initial.steps)
+        features = checked_features(self.server, initial.sent, initial.steps)
         self.action_columns = self.server.action_columns(features)
         """Columns of the actors' observations with a value for each action; None if there are none."""
         self._reset_outputs = self._outputs_at_reset(initial, features)

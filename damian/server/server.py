@@ -215,9 +215,14 @@ class Server:
 
     def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
         """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K]."""
+        return stack(self.own_features(known, steps, self.observation.actor, belief), self.observation.actor)
+
+    def own_features(
+        self, known: Messages, steps: Tensor, names: list[str], belief: Tensor | None = None
+    ) -> Features:
+        """Features of UAVs, [*, N] each, who know messages [*, N, N] and beliefs as in ``observe_each``."""
         context = self._known(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
-        context = context._replace(belief=belief)
-        return stack(observe_own(known, context, self.observation.actor), self.observation.actor)
+        return observe_own(known, context._replace(belief=belief), names)
 
     def reward_and_status(
         self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor | None

@@ -1,0 +1,81 @@
+"""Checks that features and reward terms, built-in ones and one's own, keep what they declare."""
+
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from damian import keys
+from damian.common import checks
+from damian.common.errors import naming_errors
+from damian.common.tensors import tree_map, tree_where
+from damian.server.features import feature_of, stack
+from damian.server.server import Features, Server
+from damian.world.messages import Messages
+from damian.world.simulation import Simulation
+
+_WORLDS, _ROUNDING = 16, 1e-5
+
+
+def checked_features(server: Server, messages: Messages, steps: Tensor) -> Features:
+    """All features of the first messages of episodes [B, N], of which each is as it declares.
+
+    Values are finite and within bounds, and a local feature follows from the UAV's own message alone. A
+    reward term of these features gives one value for each UAV. What only later messages show is not found.
+
+    Raises:
+        InputError: a component does not keep what it declares; the message names it.
+    """
+    some, elapsed, found = tree_map(lambda field: field[:_WORLDS], messages), steps[:_WORLDS], {}
+    for name in server.names:
+        declared, key = feature_of(name), f"feature {name}"
+        with naming_errors(key):
+            found |= server.features(messages, steps, [name])
+            values = found[name].double()
+            within = (values >= declared.low - _ROUNDING) & (values <= declared.high + _ROUNDING)
+            should = f"is not between {declared.low:g} and {declared.high:g}: scale it, or declare its bounds"
+            checks.require(bool(within.all()), key, f"{[*values[~within], 0][0]:g}", should)
+            if declared.scope == "local":
+                own = _among_others(server, name, some, elapsed)
+                same = own.double().allclose(values[:_WORLDS], atol=_ROUNDING)
+                should = "changes with the messages of other UAVs: make it global, or read only the UAV's own"
+                checks.require(same, key, "local", should)
+    for term in server.terms.values():
+        with naming_errors(f"reward term {term.name}"):
+            server.reward_and_status(found, messages, steps, None)
+    return found
+
+
+def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) -> Tensor:
+    """A feature [B, N] of what UAVs know who know other messages of each other than these, [B, N]."""
+    n = messages.time.shape[-1]
+    own = torch.eye(n, dtype=torch.bool, device=steps.device).expand(len(steps), n, n)
+    others = tree_map(_changed, messages)
+    mine, theirs = (
+        tree_map(lambda field: field.unsqueeze(1).expand(-1, n, *field.shape[1:]), each)
+        for each in (messages, others)
+    )
+    return server.own_features(tree_where(own, mine, theirs), steps, [name])[name]
+
+
+def _changed(field: Tensor) -> Tensor:
+    if field.dtype == torch.bool:
+        return ~field
+    return field + 1 if field.is_floating_point() else field.flip(0, 1)  # ids of other landing points
+
+
+def not_finite(server: Server, simulation: Simulation, steps: TensorDictBase) -> str | None:
+    """Which feature or reward term of collected steps [*] is not finite; None if all are."""
+    first, observation = simulation.initial, server.observation
+    for key, names in ((keys.OBSERVATION, observation.actor), (keys.GLOBAL_OBSERVATION, observation.critic)):
+        for values in (steps[key], steps[keys.next_key(key)]):
+            if not values.isfinite().all():
+                features = server.features(first.sent, first.steps)
+                widths = [stack(features, [name]).shape[-1] for name in names]
+                columns = values[..., : sum(widths)].split(widths, -1)
+                wrong = [name for name, x in zip(names, columns, strict=True) if not x.isfinite().all()]
+                return f"feature {', '.join(wrong)}: a value is nan or infinite"
+    terms = cast(TensorDictBase, steps[keys.next_key(keys.REWARD_TERMS)])
+    wrong = [name for name, values in terms.items() if not values.isfinite().all()]
+    return f"reward term {', '.join(wrong)}: a value is nan or infinite" if wrong else None
