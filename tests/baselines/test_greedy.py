@@ -84,15 +84,6 @@ def test_all_uavs_fly_to_the_latest_detection_and_the_uav_that_made_it_stays(act
     assert distance[1] == 0
 
 
-def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself():
-    env = field(reward=SEARCH)
-    td = env.reset()
-    start, end = sent_messages(td).position[0], landing_points(env, td)
-    distance = torch.cdist(end, start)
-    assert (distance.diagonal() > env.uav_env.simulation.radius).all()
-    assert torch.equal(distance.argmin(-1), torch.arange(3))
-
-
 @pytest.mark.parametrize(
     ("sections", "seeks"),
     [

@@ -115,6 +115,14 @@ def radians(cache):
 def leaks(cache):
     return cache.messages.track.mean(-1, keepdim=True).expand(cache.messages.track.shape) / 7
 
+@feature("local")
+def hears(cache):
+    return cache.messages.spotted.any(-1, keepdim=True).expand(cache.messages.track.shape)
+
+@feature("local", high=1e4)
+def booked(cache):
+    return cache.messages.trail[..., 0].amin(-1, keepdim=True).expand(cache.messages.track.shape)
+
 @reward_term(reads=["spotted"], scope="system")
 def shared(features, counters):
     return features["spotted"].T
@@ -137,6 +145,8 @@ def flipped(state, world):
             "local lies:leaks",
             "feature lies:leaks: local changes with the messages of other UAVs: make it glob",
         ),
+        ("local lies:hears", "feature lies:hears: local changes with the messages of other UAVs"),
+        ("local lies:booked", "feature lies:booked: local changes with the messages of other UAVs"),
         ("reward lies:shared", r"reward term shared: shape: \[3, 20\] is not \[20, 3\]"),
         ("sensor lies:flipped", r"sensor flipped: shape: \[3, \d+, 2\] is not \[\d+, 3, 2\]"),
     ],

@@ -139,13 +139,3 @@ def test_the_default_of_a_dict_or_tuple_has_one_of_each_of_its_spaces():
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
 def test_gymnasiums_checker_finds_nothing(name):
     check_env(DelayWrapper(gymnasium.make(name).unwrapped, Uniform(0, 3), 2), skip_render_check=True)
-
-
-def test_many_environments_are_wrapped_by_make_vec():
-    worlds = gymnasium.make_vec(
-        "CartPole-v1", num_envs=3, vectorization_mode="sync", wrappers=[lambda env: DelayWrapper(env, 2)]
-    )
-    first, _ = worlds.reset(seed=0)
-    held, *_, infos = worlds.step(worlds.action_space.sample())
-    assert np.array_equal(held, first)
-    assert infos["age"].tolist() == [1, 1, 1]

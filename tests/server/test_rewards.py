@@ -65,10 +65,11 @@ def test_every_term_equals_that_of_a_plain_loop(seed, n_agents, given_weights, i
 
 def test_a_built_in_term_can_be_used_again_with_parameters_of_its_own():
     again = {"term": "mean_distance", "weight": 2.0, "name": "close", "desired_distance": 0.2}
-    task = RewardConfig(spotted=0.0, mean_distance=1.0, custom=[again])
+    unused = {"term": "battery", "weight": 0.0, "name": "unused"}
+    task = RewardConfig(spotted=0.0, mean_distance=1.0, custom=[again, unused])
     inputs, counters = features(0, 3)
     ours = reward(inputs, counters, terms_of(task))
-    assert [*ours] == task.terms
+    assert [*ours] == task.terms == ["mean_distance", "close"]
     near = RewardConfig(spotted=0.0, mean_distance=2.0, desired_distance=0.2)
     assert ours["close"].equal(reward(inputs, counters, terms_of(near))["mean_distance"])
     assert not ours["close"].equal(2 * ours["mean_distance"])

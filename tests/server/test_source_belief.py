@@ -1,12 +1,11 @@
 """The Bayes filter of the source against its slow twin, and whether its probabilities are frequencies."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 import torch
-from belief_twin import belief, chance_at, detection_table
+from belief_twin import belief, chance_at
 from helpers import everything, square, walking
 from torch import Tensor
 
@@ -115,51 +114,6 @@ def test_beliefs_equal_the_slow_twins_for_any_delays_losses_resets_and_pauses(gr
             flight.begin(flight.draw(2, 2) == 0)
         if i in (4, 11):
             flight.check()
-
-
-def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
-    """Beliefs, and whether the source is in the cell, where all happens as the grid assumes."""
-    torch.manual_seed(0)
-    n_points, everyone = (len(grid.log_reports) - 1) // 4, torch.ones(n_worlds, dtype=torch.bool)
-    region = torch.zeros(n_worlds, dtype=torch.long)
-    window, detects = empty_window(grid, LONGEST, n_worlds, 3, own=False), detection_table(grid)
-
-    def reports(cell: Tensor) -> Tensor:
-        point = torch.randint(n_points, (n_worlds, 3))
-        heard = torch.rand(n_worlds, 3) < detects[point, cell.unsqueeze(-1)]
-        return 2 * point + (heard & (torch.rand(n_worlds, 1) < grid.emits))
-
-    cell = torch.multinomial(grid.prior[0], n_worlds, replacement=True)
-    _begin(*_parts(grid, window), reports(cell), region, everyone)
-    said, was = [], []
-    for _ in range(n_steps):
-        cell = torch.multinomial(grid.moves[cell], 1).squeeze(-1) if grid.moves is not None else cell
-        delay = torch.where(torch.rand(n_worlds, 3) < 0.5, 0, torch.randint(-1, LONGEST + 1, (n_worlds, 3)))
-        slot, beliefs, _ = _advance(*_parts(grid, window), reports(cell), delay, region, everyone)
-        window = window._replace(slot=slot)
-        said.append(beliefs)
-        was.append(torch.nn.functional.one_hot(cell, beliefs.shape[-1]))
-    return torch.stack(said).flatten(), torch.stack(was).flatten().float()
-
-
-@pytest.mark.parametrize("name", ["one region", "always emitting", "static"])
-def test_of_the_times_when_it_says_so_often_the_source_is_there_so_often(name):
-    said, was = simulated(grids[name], n_worlds=2000, n_steps=10)
-    for low, high in (
-        (0.001, 0.01),
-        (0.01, 0.05),
-        (0.05, 0.2),
-        (0.2, 0.4),
-        (0.4, 0.6),
-        (0.6, 0.8),
-        (0.8, 1.0),
-    ):
-        here = (said >= low) & (said < high)
-        share, n = said[here].mean().item(), int(here.sum())
-        # Beliefs of a world follow from each other, so that they count for less than independent ones.
-        error = 4 * math.sqrt(share * (1 - share) / max(n / 4, 1))
-        assert n > 100
-        assert abs(was[here].mean().item() - share) < error, (low, high, n)
 
 
 @every_grid

@@ -91,11 +91,3 @@ def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
                 values = torch.tensor([number for name in NAMES[1:] for number in expected[name]])
                 assert rest.allclose(values, atol=1e-5), (world, step, i)
                 check_others(others.view(OTHERS, 5), expected["others"])
-
-
-def test_ground_just_covered_is_hardly_new_and_that_outside_the_region_never_is():
-    _, steps = rollout(1)
-    covered = steps["next"][keys.OBSERVATION][..., 5 * OTHERS : 5 * OTHERS + len(RINGS) * SECTORS]
-    assert covered[..., :SECTORS].amax() == pytest.approx(RINGS[0] / 2, abs=1e-5)
-    assert covered[..., -SECTORS:].amax() == 1
-    assert covered[..., -SECTORS:].amin() == 0  # outside

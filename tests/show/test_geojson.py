@@ -87,16 +87,3 @@ def test_an_episode_is_valid_and_lies_where_it_was_flown(episode):
     assert kinds["source track"][0]["geometry"]["type"] == "Point"  # it does not move
     source = local(kinds["source track"][0], episode.origin)
     np.testing.assert_allclose(source, episode.source[:1], atol=0.02)
-
-
-def test_coverage_is_what_footprints_have_covered_of_the_region(episode):
-    def in_metres(degrees: np.ndarray) -> np.ndarray:
-        return np.column_stack(to_local(degrees[:, 1], degrees[:, 0], episode.origin))
-
-    for uav, feature in enumerate(by_kind(feature_collection(episode, 10))["coverage"]):
-        covered = shapely.transform(shape(feature["geometry"]), in_metres)
-        points = np.random.default_rng(uav).uniform(*np.reshape(episode.region.bounds, (2, 2)), (4000, 2))
-        distance = np.linalg.norm(points[:, None] - episode.true[:, uav], axis=-1).min(-1)
-        expected = (distance <= episode.radius) & shapely.contains_xy(episode.region, *points.T)
-        clear = np.abs(distance - episode.radius) > 0.01 * episode.radius
-        assert (shapely.contains_xy(covered, *points.T) == expected)[clear].mean() > 0.999

@@ -1,10 +1,12 @@
 """Battery: recorded figures of the original implementation."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import KEEPS_GOING, act, everything, fresh, random_actions
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -65,3 +67,26 @@ def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical
     expected = flown * 100 * 10 / (9 * 12 * 0.9) / 3600 + cruised / 20 * 100 * 10 / (9 * 12) / 3600
     values = (tensor(x) for x in (elapsed, vertical, cruise, cruised))
     assert used_so_far(*values, BATTERY).item() == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
+    env = fresh(everything(episode=KEEPS_GOING), num_worlds=4)
+    battery, motion = env.scenario.battery, env.scenario.motion
+    power = 100 * battery.engine_power_kw / (battery.capacity_kwh * battery.efficiency) / 3600  # % a second
+    gain = 100 * battery.charging_power_kw / (3600 * battery.capacity_kwh)
+    hardest, generator, flown = 10 * math.sqrt(3) / 3, torch.Generator().manual_seed(0), 0
+    levels, before = env.state.battery.tolist(), env.state.position[..., :2].tolist()
+    for _ in range(12):
+        act(env, random_actions(env, generator))
+        after = env.state.position[..., :2].tolist()
+        for b, n in [(b, n) for b in range(4) for n in range(3)]:
+            way, height = math.dist(before[b][n], after[b][n]), motion.min_level + n * motion.level_separation
+            up = max(
+                15 / 8 * height / motion.max_speed, math.sqrt(hardest * height / motion.max_acceleration)
+            )
+            drain = power * (2 * up / 0.9 + way / battery.reference_speed) if way else -gain
+            levels[b][n] = min(max(levels[b][n] - drain, 0.0), 100.0)
+            flown += way > 0
+        before = after
+        torch.testing.assert_close(env.state.battery, torch.tensor(levels), rtol=0, atol=1e-3)
+    assert 20 < flown < 140

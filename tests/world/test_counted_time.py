@@ -9,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from damian.envs.uav_env import UavEnv
-from damian.server.termination import EpisodeConfig
 from damian.world.motion import MotionConfig
-from damian.world.signal_source import SourceConfig
 from damian.world.state import State
 
 periods = st.sampled_from(["0.1", "0.3", "0.7", "1", "2.5", "0.025", "60"])
@@ -53,24 +51,3 @@ def test_a_flight_ends_after_exactly_its_duration_but_for_its_float_error(period
         )
         if most - least <= 1:  # so many steps that the float error of the duration is more than one
             assert least <= first_step(env, holds, most, vertical=vertical, cruise=cruise) <= most
-
-
-@given(
-    period=st.sampled_from([0.1, 0.3, 0.7, 1.0, 60.0]),
-    detected=st.integers(0, 10**6),
-    limit=st.integers(1, 100),
-)
-@settings(max_examples=settings.default.max_examples // 4)
-def test_a_limit_since_the_latest_detection_is_reached_after_exactly_that_many_steps(period, detected, limit):
-    episode = EpisodeConfig(max_steps=limit, since_detection=True)
-    source = SourceConfig(level_db=180.0)
-    env = fresh(one_uav(episode=episode, source=source, clock=clock(f"{period}s")))
-    state = one_state(env, steps=detected)
-    state = env.simulation.step(state, torch.tensor([[[0.0, 0.0]]]))  # hears the source
-    steps = state.steps + torch.arange(-1, limit + 2)
-    messages = type(state.sent)(*(each.expand(len(steps), *each.shape[1:]) for each in state.sent))
-    assert messages.spotted.all()
-    over = torch.zeros_like(steps, dtype=torch.bool)
-    features = env.server.features(messages, steps)
-    ended = env.server.reward_and_status(features, messages, steps, over)[2]
-    assert ended.truncated.tolist() == (torch.arange(-1, limit + 2) >= limit).tolist()

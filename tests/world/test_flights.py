@@ -1,16 +1,11 @@
 """Positions, legal actions and readiness of UAVs, and the times at which they send messages."""
 
 import pytest
-import shapely
 import torch
 from helpers import (
     KEEPS_GOING,
-    MOTIONS,
     SQUARE,
     act,
-    both_kinds,
-    both_motions,
-    everything,
     fresh,
     random_actions,
     sent_messages,
@@ -20,59 +15,11 @@ from helpers import (
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig, flight_drain
-from damian.world.landing import ActionConfig
 from damian.world.regions.sources import RegionConfig
 from damian.world.state import State
 
 # Positions on landing points.
-
-
-@pytest.mark.sample(3)
-@both_kinds
-@both_motions
-@pytest.mark.parametrize("n_agents", [2, 5, 8])
-@pytest.mark.parametrize("together", [False, True])
-def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, kind, motion, together):
-    region = RegionConfig(
-        kind="vertices",
-        vertices=[[0.0, 0.0], [90.0, 0.0], [90.0, 40.0], [40.0, 40.0], [40.0, 90.0], [0.0, 90.0]],
-        lattice_step=24.0,
-        initial_conditions=16,
-        start_together=together,
-    )
-    scenario = ScenarioConfig(
-        agents=n_agents,
-        region=region,
-        motion=MOTIONS[motion],
-        actions=ActionConfig(kind=kind, distances=[0.0, 20.0, 50.0, 90.0]),
-        episode=EpisodeConfig(max_steps=15),
-    )
-    env = fresh(scenario, num_worlds=24)
-    airspace = env.simulation.airspace
-    assert airspace.max_points < 20
-    generator = torch.Generator().manual_seed(0)
-    moved = 0
-    for _ in range(30):
-        before = env.state
-        act(env, random_actions(env, generator))
-        goal = env.state.goal
-        moved += int((goal != before.goal).sum())
-        clash = goal.unsqueeze(-1) == goal.unsqueeze(-2)
-        clash &= ~torch.eye(n_agents, dtype=torch.bool)
-        if together:  # Two UAVs may share a point only while neither has left the common start.
-            stays = goal == before.goal
-            both = stays.unsqueeze(-1) & stays.unsqueeze(-2)
-            clash &= ~both
-        assert not clash.any()
-        assert (goal < airspace.n_points[0]).all()
-        landed = env.simulation.vehicles.on_ground(env.state)
-        place = env.state.position[landed]
-        assert place[..., :2].equal(env.simulation.points[goal[landed]])
-        assert place[..., 2].abs().max(dim=0).values < 1e-5
-        assert shapely.contains_xy(airspace.regions[0].polygon, place[..., :2].double()).all()
-    assert moved > 24 * n_agents
 
 
 def test_uavs_start_on_different_points_or_on_one_or_on_the_given_ones():
@@ -123,23 +70,3 @@ def test_masked_actions_hold_and_legal_actions_lead_to_their_nearest_point(energ
         masked, reached = masked + int((~legal).sum()), reached + int(moved.sum())
     assert masked > 100
     assert reached > 100
-
-
-@pytest.mark.parametrize("sensing_time", [0.0, 4.0])
-def test_each_decision_adds_one_point_to_the_trail_however_long_the_uav_senses(sensing_time):
-    scenario = everything("polynomial", episode=EpisodeConfig(max_steps=None))
-    scenario.motion.sensing_time = sensing_time
-    env = fresh(scenario, num_worlds=8)
-    generator = torch.Generator().manual_seed(0)
-    expected = env.state.sent.trail.tolist()
-    due = torch.zeros(8, env.n_agents, dtype=torch.bool)
-    landings = 0
-    for _ in range(60):
-        due |= env.simulation.ready(env.state)
-        act(env, random_actions(env, generator))
-        for b, n in (due & env.simulation.vehicles.on_ground(env.state)).nonzero().tolist():
-            expected[b][n] = [env.state.goal[b, n].item(), *expected[b][n][:-1]]
-            due[b, n] = False
-            landings += 1
-        assert env.state.sent.trail.tolist() == expected
-    assert landings > 50

@@ -1,14 +1,14 @@
 """Actions against plain loops: booking in index order, nearest points, inside tests, the action table."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
 import shapely
 import torch
 import twin
-from exact_distance import nearest_by_loop
-from helpers import SQUARE, both_kinds, heading
+from helpers import SQUARE, both_kinds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.affinity import translate
@@ -21,9 +21,7 @@ from damian.world.airspace import build_airspace, build_cells, inside, nearest_p
 from damian.world.config import RegionConfig, WorldConfig
 from damian.world.landing import (
     ActionConfig,
-    Candidates,
     Ranking,
-    action_table,
     assign_landing_points,
 )
 from damian.world.regions.region import Region
@@ -82,6 +80,23 @@ def test_booking_at_once_and_one_by_one_equals_a_sequential_loop(few, seed, n_ag
 
 
 # Nearest points.
+
+
+def centimetres(point, target) -> int:
+    """Distance of two places in whole centimetres, half a one rounded up, without rounding errors.
+
+    The boundary lies 1e-8 m below the half, so that float error cannot move a true half across it.
+    """
+    squared = sum((100 * (Fraction(p) - Fraction(t))) ** 2 for p, t in zip(point, target, strict=True))
+    up = Fraction(500_001, 1_000_000)
+    whole = math.isqrt(squared.numerator // squared.denominator)
+    return whole + ((whole + 1 - up) ** 2 <= squared)
+
+
+def nearest_by_loop(points, target, n) -> list[int]:
+    """The n nearest points; of equally near ones the lowest id first."""
+    ids = sorted(range(len(points)), key=lambda i: (centimetres(points[i], target), i))
+    return (ids + [-1] * n)[:n]
 
 
 def some_points(rng, kind, n) -> np.ndarray:
@@ -154,40 +169,6 @@ def test_inside_equals_shapelys_contains(polygon):
     expected = shapely.contains_xy(polygon, target[off_boundary])
     assert 0 < expected.sum() < len(expected)
     assert ours.numpy().tolist() == expected.tolist()
-
-
-# Candidates.
-
-
-def candidates(kind):
-    """Candidates and action settings for two regions, the first with a notch, and one kind of actions."""
-    notch = Polygon([(0, 0), (210, 0), (210, 190), (120, 190), (100, 60), (80, 190), (0, 190)])
-    regions = [Region(notch, "notch"), Region(HORSESHOE.buffer(40), "oval")]
-    airspace = build_airspace(regions, RegionConfig(), 3)
-    config = ActionConfig(
-        kind=kind, distances=[0.0, 41.7, 97.3, 153.9], headings=[-130.0, -31.0, 5.0, 77.0, 180.0]
-    )
-    return Candidates(airspace, config, 3), config
-
-
-def test_discrete_and_continuous_actions_have_the_same_candidates():
-    discrete, config = candidates("discrete")
-    continuous, _ = candidates("continuous")
-    airspace, table = discrete.airspace, action_table(config)
-    compared = 0
-    for region, count in enumerate(airspace.n_points.tolist()):
-        points = torch.arange(count) + region * airspace.max_points
-        flat = points[:, None].expand(-1, len(table))
-        number = torch.arange(len(table)).expand_as(flat)
-        share = [[d / 153.9, heading(math.degrees(h))] for d, h in table.tolist()]
-        action = torch.tensor(share).expand(count, -1, -1)
-        regions = torch.full((count,), region)
-        ranking, row = discrete.rank(flat, regions, number)
-        expected, expected_row = continuous.rank(flat, regions, action)
-        assert expected_row.shape == row.shape == flat.shape
-        assert ranking.point[row][..., :1].long().equal(expected.point[expected_row][..., :1])
-        compared += row.numel()
-    assert compared == 20 * int(airspace.n_points.sum())
 
 
 @both_kinds

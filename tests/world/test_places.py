@@ -72,13 +72,6 @@ def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(park):
     assert (places - torch.tensor(metres)).norm(dim=-1).max() < 20
 
 
-def test_places_are_in_the_coordinates_in_which_the_vertices_are_given():
-    worlds = build(SQUARE, source=SourceConfig(position=[20.0, 150.0]))
-    offset = torch.tensor(worlds.airspace.regions[0].offset)
-    torch.testing.assert_close(worlds.initial.source[0] + offset, torch.tensor([20.0, 150.0]))
-    assert offset.tolist() == [100.0, 100.0]
-
-
 @pytest.mark.parametrize(
     "place",
     [[math.nan, 1.0], {"lat": 1.0, "lng": 2.0}, [0.0, 100.0], {"lat": 53.1, "lon": -4.5}],

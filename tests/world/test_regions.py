@@ -82,26 +82,6 @@ def _collection(*features):
     return {"type": "FeatureCollection", "features": list(features)}
 
 
-@pytest.mark.parametrize(
-    "document",
-    [
-        _polygon(*SQUARE),
-        {"type": "MultiPolygon", "coordinates": [SQUARE]},
-        _feature(_polygon(*SQUARE)),
-        _collection(POINT, _feature(_polygon(*SQUARE))),
-    ],
-    ids=["Polygon", "MultiPolygon", "Feature", "FeatureCollection"],
-)
-def test_each_kind_of_geojson_yields_its_only_area(tmp_path, document):
-    file = tmp_path / "square.geojson"
-    file.write_text(json.dumps(document), encoding="utf-8-sig")
-    region = read_area(file)
-    corners = [[45, 8], [45, 8.01], [45.01, 8.01], [45.01, 8], [45, 8]]
-    area = (0.01 * DEGREE_M) ** 2 * np.cos(np.radians(45.005))
-    assert region.polygon.area == pytest.approx(area, rel=1e-4)
-    assert sorted(_places(region).round(9).tolist()) == sorted(corners)
-
-
 def _written(folder, name, content) -> Path:
     file = folder / name
     file.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
@@ -195,14 +175,6 @@ def test_maps_of_other_kinds_are_read_by_their_suffix(tmp_path, suffix):
     assert read_area(file, index=1).name == "yard"
 
 
-def test_a_map_in_metres_is_read_by_its_coordinate_reference_system(tmp_path):
-    file = _map(tmp_path / "utm.shp", "EPSG:3035", _in_metres()[0])
-    corners = np.unique(_places(read_area(file, index=0)).round(8), axis=0)
-    np.testing.assert_allclose(corners, np.unique(np.array(RING)[:, ::-1], axis=0), atol=1e-7)
-    file.with_suffix(".prj").unlink()
-    _assert_one_line_error(file, "no name (crs, or a file .prj)", lambda: read_area(file, index=0))
-
-
 def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(tmp_path):
     def fence(ring, inclusion):
         return {"inclusion": inclusion, "polygon": [[lat, lon] for lon, lat in ring[:-1]], "version": 1}
@@ -217,17 +189,6 @@ def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(
     fences["circles"] = [{"circle": {"center": [45, 8], "radius": 40}, "inclusion": False}]
     file = _written(tmp_path, "circle.plan", plan)
     _assert_one_line_error(file, "geoFence.circles: a circle is not read", lambda: read_area(file))
-
-
-@pytest.mark.parametrize("choice", [{"index": [1, 2]}, {"where": ["name:a", "name=b"]}])
-def test_several_features_are_united_by_choice(tmp_path, choice):
-    east = [[lon + 0.01, lat] for lon, lat in RING]
-    features = [POINT, _feature(_polygon(RING), name="a"), _feature(_polygon(east), name="b")]
-    both = read_area(_written(tmp_path, "two.geojson", _collection(*features)), **choice)
-    assert (both.name, both.polygon.geom_type) == ("a, b", "Polygon")
-    assert both.polygon.area == pytest.approx(
-        2 * (0.01 * DEGREE_M) ** 2 * np.cos(np.radians(45.005)), rel=1e-4
-    )
 
 
 @pytest.mark.parametrize("key", ["name", "ISO 3166:2", "a=b"])
@@ -285,12 +246,7 @@ def _table(*last_rows: str, header: str = HEADER) -> str:
 INVALID_TABLES = {
     "not UTF-8": (b"Airspace ID\xff", "byte 11 is not UTF-8"),
     "a wide table": (",".join("x" * 1001), "line 1: 1001 columns are more than 1000"),
-    "a column twice": (
-        _table(header=HEADER.replace("Latitude", "Latitude,Latitude")),
-        "'Latitude' appears twice",
-    ),
     "latitude 95": (_table("A,0,60,2,95,-4.12"), "line 4: Latitude 95 deg is not between -90"),
-    "crossing edges": (_table() + "A,0,60,3,52.79,-4.125\n", "A: edges cross at [-4.1225, 52.8] deg"),
 }
 
 
@@ -312,18 +268,11 @@ INVALID_GEOJSON = {
         "2 features are areas: choose by region.index=NUMBER or region.where=PROPERTY:VALUE, one or a list",
     ),
     "where no value": (TWO_FEATURES, {"where": "zone=c"}, "fits 0 features, not one; the file has 'a', 'b'"),
-    "empty": (_collection(_feature(_polygon())), {}, "features[0] is a Polygon without corners; a region is"),
-    "no geometry": (
-        _collection(_feature(None)),
-        {"index": 0},
-        "features[0] has no geometry; a region is an area",
-    ),
     "a line": (
         _feature({"type": "LineString", "coordinates": RING}),
         {},
         "feature is a LineString; a region is an area: draw a closed outline (Polygon)",
     ),
-    "no features": (_collection(), {}, "it has no features; a region is an area"),
     "index 2": (TWO_FEATURES, {"index": [0, 2]}, "region.index: 2 is not between 0 and 1"),
     "metres": (
         _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]]),
@@ -334,11 +283,6 @@ INVALID_GEOJSON = {
         _polygon(RING) | {"crs": _crs("EPSG:999999")},
         {},
         "reference system is not understood: ",
-    ),
-    "linked crs": (
-        _polygon(RING) | {"crs": {"type": "link", "properties": {"href": "a.prj"}}},
-        {},
-        "coordinate reference system has no name",
     ),
     "hole outside": (_polygon(RING, FAR_HOLE), {}, "hole lies outside shell at [18, 45] deg"),
 }

@@ -2,26 +2,68 @@
 
 import json
 import math
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 import shapely
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
-from walks import (
-    DYNAMIC,
-    USE_CASE,
-    dynamic_walks,
-    in_double,
-    n_stops,
-    twin_duration,
-    twin_position,
-)
 
-from damian.world.signal_source import leg_profile, locate
+from damian.world.signal_source import SourceConfig, Walk, draw_walks, leg_profile, locate
 
-GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
+DATA = Path(__file__).parents[1] / "data"
+GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
+SCENARIO = json.loads((DATA / "usecase1.json").read_text())["scenario"]
+USE_CASE = shapely.Polygon(SCENARIO["polygon_vertices_ring"])
+DYNAMIC = SourceConfig(motion="dynamic")
+
+
+def dynamic_walks(polygon=USE_CASE, n=8, seed=0, **settings_):
+    config = SourceConfig(**({"motion": "dynamic", "after_walk": "stop"} | settings_))
+    return draw_walks(polygon, config, n, np.random.default_rng(seed))
+
+
+def in_double(walk):
+    return Walk(*(x if x.dtype == torch.bool else x.double() for x in walk))
+
+
+def n_stops(walk):
+    return walk.arrive.isfinite().sum(1)
+
+
+def twin_duration(length, speed, acceleration):
+    """Duration of a leg: two ramps and a constant speed between them, or two ramps that meet."""
+    if length == 0:
+        return 0.0
+    ramp = speed**2 / (2 * acceleration)
+    if 2 * ramp >= length:
+        return 2 * math.sqrt(length / acceleration)
+    return 2 * speed / acceleration + (length - 2 * ramp) / speed
+
+
+def twin_covered(length, speed, acceleration, elapsed, n=4000):
+    """Integrate the speed, the least of rising, largest and falling speed, by the midpoint rule."""
+    duration = twin_duration(length, speed, acceleration)
+    end = min(max(elapsed, 0.0), duration)
+    t = (np.arange(n) + 0.5) * end / n
+    profile = np.minimum(np.minimum(acceleration * t, acceleration * (duration - t)), speed)
+    return profile.sum() * end / n
+
+
+def twin_position(walk, w, time):
+    """Position [m] and latest stop of walk w at a time, by a search over its stops."""
+    stop, arrive, depart, speed, acceleration = (x[w].tolist() for x in walk[:5])
+    n = sum(math.isfinite(a) for a in arrive)
+    k = max(i for i in range(n) if arrive[i] <= time)
+    if k == n - 1 or time <= depart[k]:
+        return stop[k], k
+    length = math.dist(stop[k], stop[k + 1])
+    share = twin_covered(length, speed[k], acceleration[k], time - depart[k]) / length
+    return [a + share * (b - a) for a, b in zip(stop[k], stop[k + 1], strict=True)], k
+
 
 HOLE = shapely.Polygon(
     [(-100, -100), (100, -100), (100, 100), (-100, 100)],
@@ -127,3 +169,37 @@ def test_a_position_equals_the_integrated_speed_profile(
         position, stop = twin_position(walk, w, time[w].item())
         assert located.position[w].tolist() == pytest.approx(position, abs=2e-2)
         assert located.stop[w].item() == stop
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    steps=st.integers(0, 10**9),
+    dt=st.sampled_from([0.1, 1.0, 3.0, 60.0, 1 / 3]),
+    n_hotspots=st.integers(1, 3),
+)
+def test_after_any_number_of_rounds_the_source_is_where_exact_arithmetic_says(seed, steps, dt, n_hotspots):
+    walk = dynamic_walks(
+        n=1,
+        seed=seed,
+        n_hotspots=n_hotspots,
+        min_stops=1,
+        max_stops=2,
+        min_wait=0.5,
+        max_wait=5.0,
+        after_walk="loop",
+    )
+    located = locate(walk, torch.tensor([steps], dtype=torch.float64) * dt, loops=True)
+    time = Fraction(steps * dt)  # as a float64 has it
+    end = Fraction(walk.depart[0, -1].item())
+    tour, place, stop = int(time // end), *twin_position(returning(walk), 0, float(time % end))
+    assert located.tour.item() == tour
+    assert located.stop.item() == stop
+    assert located.position[0].tolist() == pytest.approx(place, abs=2e-2)
+    assert not located.finished.any()
+
+
+def returning(walk):
+    """A walk for the twin, which reaches its first stop a second time."""
+    n = int(n_stops(walk)[0])
+    arrive = torch.cat([walk.arrive[:, :n], walk.depart[:, n : n + 1]], 1)
+    return Walk(*(field[:, : n + 1] for field in walk))._replace(arrive=arrive)
