@@ -20,7 +20,7 @@ from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
 from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
-from damian.world.state import INITIAL_CONDITION, PackedState, State
+from damian.world.state import INITIAL_CONDITION, PackedState, State, Truth
 
 Outputs = dict[NestedKey, Tensor]
 """Entries that a step or a reset outputs, by key."""
@@ -245,8 +245,7 @@ class UavEnv(EnvBase):
             outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
         if "state" in self.extras:
             _, emits, _ = self.simulation.source_now(state)
-            truth = [state.position.flatten(1), state.battery, emits.unsqueeze(-1), state.source]
-            outputs[keys.STATE] = torch.cat(truth, -1)
+            outputs[keys.STATE] = Truth(state.position, state.battery, emits, state.source).pack()
         return outputs
 
     def _privileged(self, state: State, features: Features | None) -> Tensor:

@@ -57,8 +57,8 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
-        self._actions.begin(self._default, seed)
-        self._observations.begin(observation, seed)
+        self._actions.reset(self._default, seed)
+        self._observations.reset(observation, seed)
         return copy.deepcopy(observation), info | {"age": 0}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -80,7 +80,7 @@ class _Link:
         self._memory: Memory | None = None
         self._sent: dict[int, Any] = {}
 
-    def begin(self, first: Any, seed: int | None) -> None:
+    def reset(self, first: Any, seed: int | None) -> None:
         """Begin an episode in which ``first`` is held; a seed decides all later delays."""
         if self._memory is None or seed is not None:
             entropy = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]

@@ -74,7 +74,7 @@ class Flight:
             self.env.seed_worlds(seed + torch.arange(self.env.batch_size[0]))
         self._now = self.env.reset()
         if self.film:
-            self.film.begin(self._now)
+            self.film.reset(self._now)
         return _instant(self._now)
 
     @torch.no_grad()

@@ -345,14 +345,16 @@ class Beliefs(NamedTuple):
     """As each of the other receivers believes, [B, V - 1, K]."""
 
 
-def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor) -> Beliefs:
+def begin_beliefs(
+    grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor
+) -> Beliefs:
     """Begin new episodes in the worlds of the mask [B], in place; all receivers know the first messages."""
     report = report_rows(grid, messages, torch.ones_like(messages.spotted))
     _begin(*_parts(grid, window), report, region, mask)
     return latest(window, window.slot)
 
 
-def advance(
+def advance_beliefs(
     grid: SourceGrid, window: Window, report: Tensor, delay: Tensor, region: Tensor, stepped: Tensor
 ) -> tuple[Window, Beliefs]:
     """Take one step in the worlds ``stepped`` [B], and correct the beliefs by what arrives, in place.

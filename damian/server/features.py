@@ -254,12 +254,12 @@ def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict
 
 
 def _has_detected(v: FeatureCache) -> Tensor:
-    """Has this UAV ever detected the source, [*, N]."""
+    """Whether this UAV has ever detected the source, [*, N]."""
     return v.messages.detected_time >= 0
 
 
 def _any_has_detected(v: FeatureCache) -> Tensor:
-    """Has any UAV ever detected the source, [*, 1]."""
+    """Whether any UAV has ever detected the source, [*, 1]."""
     return v(_has_detected).any(-1, keepdim=True)
 
 
@@ -414,9 +414,9 @@ def _age(v: FeatureCache) -> Tensor:
 
 # Where the source is believed to be (``damian.server.belief``); beyond the paper's Table 2.
 
-RINGS = (1.0, 3.0)
+BELIEF_RINGS = (1.0, 3.0)
 """Outer radii of the inner rings of ``belief_map``, in footprint radii; the outermost ring has no end."""
-SECTORS = 8
+BELIEF_SECTORS = 8
 """Sectors of ``belief_map``; the first one is centred on north, the others follow clockwise."""
 
 
@@ -457,15 +457,15 @@ def _belief_moments(v: FeatureCache) -> Tensor:
 
 
 @FEATURES.register("belief_map")
-@feature("belief", width=(len(RINGS) + 1) * SECTORS)
+@feature("belief", width=(len(BELIEF_RINGS) + 1) * BELIEF_SECTORS)
 def _belief_map(v: FeatureCache) -> Tensor:
     """Probability that the source is in each sector of three rings about the UAV, [*, N, 24]."""
     position = v.wanted(v.messages.position)
     east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, K]
     distance = torch.hypot(east, north) / v.context.radius
-    ring = sum((distance > edge).long() for edge in RINGS)
+    ring = sum((distance > edge).long() for edge in BELIEF_RINGS)
     turn = torch.atan2(east, north) / (2 * math.pi)
-    part = ring * SECTORS + (turn * SECTORS).round().long() % SECTORS
+    part = ring * BELIEF_SECTORS + (turn * BELIEF_SECTORS).round().long() % BELIEF_SECTORS
     share = v.belief.unsqueeze(-2).expand_as(east)
-    bins = share.new_zeros(*part.shape[:-1], (len(RINGS) + 1) * SECTORS)
+    bins = share.new_zeros(*part.shape[:-1], (len(BELIEF_RINGS) + 1) * BELIEF_SECTORS)
     return bins.scatter_add(-1, part, share).clamp(max=1)

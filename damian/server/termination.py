@@ -14,11 +14,11 @@ class Status(NamedTuple):
     """Status of the task, as the server knows it."""
 
     success: Tensor
-    """Is the task accomplished, [*] bool."""
+    """Whether the task is accomplished, [*] bool."""
     terminated: Tensor
-    """Has the episode ended by success or failure, [*] bool."""
+    """Whether the episode has ended by success or failure, [*] bool."""
     truncated: Tensor
-    """Has the episode ended by its time limit, [*] bool."""
+    """Whether the episode has ended by its time limit, [*] bool."""
 
     def entries(self) -> dict[str, Tensor]:
         """TorchRL's entries ``done``, ``terminated`` and ``truncated``, and ``success``, each [*, 1]."""

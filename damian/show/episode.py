@@ -25,6 +25,7 @@ from damian.common.errors import InputError
 from damian.common.plotting import COLOURS
 from damian.common.text_files import named, one_line, read_text
 from damian.envs.uav_env import UavEnv
+from damian.world.state import Truth
 
 SCHEMA, VERSION = "damian-episode", 2
 DIGITS = 5
@@ -98,7 +99,7 @@ class Episode:
 
     @property
     def is_crowded(self) -> bool:
-        """Are there so many UAVs that less must be drawn of each?"""
+        """Whether there are so many UAVs that less must be drawn of each."""
         return self.n_agents > len(COLOURS)
 
     @property
@@ -228,26 +229,26 @@ def at_instant(outputs: TensorDictBase) -> TensorDictBase:
 
 def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> Episode:
     """The episode of one world from ``at_instant`` of the reset and of each step, stacked, [T + 1]."""
-    message, state = cast(Tensor, instants[keys.MESSAGE]), cast(Tensor, instants[keys.STATE])
+    message, truth = cast(Tensor, instants[keys.MESSAGE]), Truth.unpack(cast(Tensor, instants[keys.STATE]))
     sent = cast(Tensor, instants[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on
     delay = instants.get(keys.DELAY, torch.zeros_like(sent[..., None], dtype=torch.long))
     own, held = env.server.messages(message), env.server.messages(instants.get(keys.RECEIVED, message))
-    n, dt = env.n_agents, env.scenario.clock.dt
-    time = torch.arange(len(state), dtype=torch.float64) * dt
+    dt = env.scenario.clock.dt
+    time = torch.arange(len(sent), dtype=torch.float64) * dt
     belief = instants.get(keys.BELIEF, None)
     return Episode(
         **fixed_of(env, about, int(env.server.region_of(own)[0])),
         instant=env.simulation.vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
         time=np.asarray(time),
-        position=np.asarray(state[:, : 3 * n].unflatten(-1, (n, 3))),
+        position=np.asarray(truth.position),
         target=np.asarray(own.target),
         track=np.asarray(own.track),
-        battery=np.asarray(state[:, 3 * n : 4 * n]),
+        battery=np.asarray(truth.battery),
         spotted=np.asarray(own.spotted),
-        source=np.asarray(state[:, -2:]),
-        emits=np.asarray(state[:, -3] > 0),
+        source=np.asarray(truth.source),
+        emits=np.asarray(truth.emits),
         sent=np.asarray(sent),
         delay=np.asarray(delay[..., 0]),
         believed=np.asarray(held.position),

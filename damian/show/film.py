@@ -139,7 +139,7 @@ class LiveFilm:
         self.env, self.view = env, view
         self._instants: list[TensorDictBase] = []
 
-    def begin(self, outputs: TensorDictBase) -> None:
+    def reset(self, outputs: TensorDictBase) -> None:
         """Begin an episode, with the outputs of a reset, [1]."""
         self._instants = [at_instant(outputs).detach().cpu()]
 

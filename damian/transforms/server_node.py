@@ -9,7 +9,15 @@ from torchrl.data import Bounded, Composite
 
 from damian import keys
 from damian.common.tensors import expand_mask
-from damian.server.belief import Beliefs, SourceGrid, Window, advance, begin, empty_window, report_rows
+from damian.server.belief import (
+    Beliefs,
+    SourceGrid,
+    Window,
+    advance_beliefs,
+    begin_beliefs,
+    empty_window,
+    report_rows,
+)
 from damian.server.server import Server
 from damian.transforms.base import (
     Change,
@@ -162,7 +170,7 @@ class Belief(StatefulTransform):
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         messages = self.server.messages(as_rows(entries[keys.MESSAGE], self.rows))
         region = self.server.region_of(messages)
-        return memory, self._written(begin(self._grid, Window(**memory), messages, region, mask))
+        return memory, self._written(begin_beliefs(self._grid, Window(**memory), messages, region, mask))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         rows = {key: as_rows(entries[key], self.rows) for key in self.in_keys}
@@ -172,7 +180,7 @@ class Belief(StatefulTransform):
         region = self.server.region_of(messages)
         every = torch.ones_like(region, dtype=torch.bool)
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        window, beliefs = advance(self._grid, Window(**memory), report, delay, region, stepped)
+        window, beliefs = advance_beliefs(self._grid, Window(**memory), report, delay, region, stepped)
         return window._asdict(), self._written(beliefs)
 
     def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:

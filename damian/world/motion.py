@@ -61,7 +61,7 @@ def minimum_time(length: Tensor, degree: int, max_speed: float, max_acceleration
     return torch.maximum(for_speed, for_acceleration)
 
 
-def fly(
+def poses(
     origin: Tensor,
     target: Tensor,
     level: Tensor,

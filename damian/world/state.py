@@ -53,6 +53,30 @@ class State(NamedTuple):
     """The latest message of each UAV, [B, N]."""
 
 
+class Truth(NamedTuple):
+    """What the environments' entry ``state`` tells, with any leading dimensions: the simulator's truth."""
+
+    position: Tensor
+    """Positions of the UAVs, east, north, up [m], [*, N, 3]."""
+    battery: Tensor
+    """Their battery levels [%], [*, N]."""
+    emits: Tensor
+    """Whether the source emits, [*] bool."""
+    source: Tensor
+    """Its position, east, north [m], [*, 2]."""
+
+    def pack(self) -> Tensor:
+        """One row for each world, [*, 4 N + 3]."""
+        return torch.cat([self.position.flatten(-2), self.battery, self.emits.unsqueeze(-1), self.source], -1)
+
+    @classmethod
+    def unpack(cls, rows: Tensor) -> "Truth":
+        """The truth in rows [*, 4 N + 3]."""
+        n = (rows.shape[-1] - 3) // 4
+        position, battery, emits, source = rows.split([3 * n, n, 1, 2], -1)
+        return cls(position.unflatten(-1, (n, 3)), battery, emits.squeeze(-1) > 0, source)
+
+
 SEED, EPISODE, INITIAL_CONDITION = 0, 1, 2
 """Columns of these fields in ``PackedState.integers``; they are the first fields of ``State``."""
 

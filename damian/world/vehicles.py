@@ -13,7 +13,7 @@ from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
 from damian.world.config import WorldConfig
 from damian.world.messages import Messages
-from damian.world.motion import flight_levels, fly, minimum_time
+from damian.world.motion import flight_levels, minimum_time, poses
 from damian.world.regions.places import local_places
 from damian.world.state import State
 
@@ -176,7 +176,7 @@ class PolynomialFlight(MotionModel):
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)
         elapsed = state.elapsed.double() * self.dt
-        position, cruised = fly(
+        position, cruised = poses(
             gather_rows(self.points, state.origin),
             gather_rows(self.points, state.goal),
             self.levels,

@@ -36,6 +36,7 @@ from damian.server.belief import SourceGrid, build_source_grid
 from damian.world.airspace import Airspace
 from damian.world.config import SourceConfig
 from damian.world.signal_source import draw_walks, locate
+from damian.world.state import Truth
 
 TASKS, LATE = ("tracking", "intermittent", "flights"), (0, 4)
 DIRECTIONS, AT_REST = 8, 0.4
@@ -122,7 +123,7 @@ def flown(scenario: ScenarioConfig, build: GridBuilder, worlds: int, seed: int) 
     assert env.server.grid
     rollout = env.rollout(limit, greedy_policy(env), break_when_any_done=False)
     cells = len(env.server.grid.centres.unique(dim=0))
-    place = rollout[next_key(keys.STATE)][..., -2:].float()
+    place = Truth.unpack(rollout[next_key(keys.STATE)]).source.float()
     true = torch.cdist(place, env.server.grid.centres[:cells]).argmin(-1, keepdim=True)
     probable = rollout[next_key(keys.BELIEF)].unflatten(-1, (-1, cells)).sum(-2).gather(-1, true)
     return evaluation(rollout, env.server).return_, probable.clamp(min=1e-9).log().mean().item()

@@ -35,6 +35,7 @@ from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.server.features import ObservationConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
+from damian.world.state import Truth
 
 PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
 BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}
@@ -101,7 +102,7 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
         square(motion=MOTIONS[motion], source=SourceConfig(position=position)), ("privileged", "state")
     )
     for td in outputs:
-        uavs = td["state"][:, :9].unflatten(-1, (3, 3))[..., :2]
+        uavs = Truth.unpack(td["state"]).position[..., :2]
         from_centre = torch.tensor(position) - 100.0  # the middle of the square
         to_source = (from_centre - uavs) / (200 * math.sqrt(2))
         torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)

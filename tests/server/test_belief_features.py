@@ -11,7 +11,7 @@ from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import make_server, make_simulation
 from damian.server.belief import predict
-from damian.server.features import RINGS, SECTORS, ObservationConfig, feature
+from damian.server.features import BELIEF_RINGS, BELIEF_SECTORS, ObservationConfig, feature
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
 
@@ -79,13 +79,13 @@ def test_moments_are_mean_spread_and_entropy(flown):
 def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
     simulation, server, messages, features, belief = flown
     for world, uav in ((0, 0), (5, 2)):
-        expected = [0.0] * (len(RINGS) + 1) * SECTORS
+        expected = [0.0] * (len(BELIEF_RINGS) + 1) * BELIEF_SECTORS
         x, y = messages.position[world, uav].tolist()
         for p, (east, north) in zip(belief[world].tolist(), server.grid.centres.tolist(), strict=True):
             distance = math.hypot(east - x, north - y)
-            ring = sum(distance > radius * simulation.radius for radius in RINGS)
-            sector = round(math.atan2(east - x, north - y) / (2 * math.pi) * SECTORS) % SECTORS
-            expected[ring * SECTORS + sector] += p
+            ring = sum(distance > radius * simulation.radius for radius in BELIEF_RINGS)
+            sector = round(math.atan2(east - x, north - y) / (2 * math.pi) * BELIEF_SECTORS) % BELIEF_SECTORS
+            expected[ring * BELIEF_SECTORS + sector] += p
         found = features["belief_map"][world, uav]
         torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-5)
         assert found.sum().item() == pytest.approx(1, abs=1e-4)

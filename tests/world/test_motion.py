@@ -14,8 +14,8 @@ from damian.common.errors import InputError
 from damian.world.motion import (
     MotionConfig,
     flight_levels,
-    fly,
     minimum_time,
+    poses,
     time_law,
 )
 
@@ -81,7 +81,7 @@ def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(c
     elapsed = torch.tensor([start[r[0]] + r[1] for r in rows], dtype=torch.float64)
     elapsed.requires_grad_(True)
     n = len(rows)
-    pose = fly(
+    pose = poses(
         torch.tensor(case["A"], dtype=torch.float64).expand(n, 2),
         torch.tensor(case["B"], dtype=torch.float64).expand(n, 2),
         torch.full((n,), case["flight_level"], dtype=torch.float64),
@@ -123,7 +123,7 @@ def test_flights_equal_those_of_the_twin_at_dense_times(degree):
     times = phase_times(origin, target, level, motion)
     share = torch.linspace(-0.02, 1.1, 200, dtype=torch.float64)
     elapsed = (2 * times.vertical + times.cruise) * share.clamp_min(0)
-    pose = fly(origin, target, level, elapsed, *times, degree)
+    pose = poses(origin, target, level, elapsed, *times, degree)
     assert pose.position.shape == (4, 3, 200, 3)
     assert pose.cruised.shape == (4, 3, 200)
     for b in range(4):
