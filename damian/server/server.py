@@ -139,8 +139,8 @@ class Server:
         """Move the tables to a device, in place."""
         self._scales = self._scales.to(device)
         moving = (Tensor, FootprintTables, SourceGrid)
-        self._context = ServerContext(
-            *(each.to(device) if isinstance(each, moving) else each for each in self._context)
+        self._context = ServerContext._make(
+            each.to(device) if isinstance(each, moving) else each for each in self._context
         )
         return self
 
