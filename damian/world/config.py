@@ -27,10 +27,8 @@ class RegionConfig(Settings):
         choices=("random", "vertices", "fir", "geojson"),
         paths=True,
     )
-    min_area: float = setting(
-        100000.0, "Smallest area of a random region.", unit="m^2", above=0, kinds=RANDOM
-    )
-    max_area: float = setting(200000.0, "Largest area of a random region.", unit="m^2", above=0, kinds=RANDOM)
+    min_area: float = setting(100000.0, "Smallest area of a random one.", unit="m^2", above=0, kinds=RANDOM)
+    max_area: float = setting(200000.0, "Largest area of a random one.", unit="m^2", above=0, kinds=RANDOM)
     pool: int = setting(1, "Number of random regions, drawn once per seed.", low=1, high=10_000, kinds=RANDOM)
     vertices: list = setting([], "Polygon corners, [x, y] each.", unit="m", kinds=("vertices",))
     path: str = setting(
@@ -45,9 +43,7 @@ class RegionConfig(Settings):
     where: Any = setting(
         None, "Property of the feature in the file, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
-    lattice_step: float = setting(
-        30.0, "Distance between landing points of a lattice row.", unit="m", above=0
-    )
+    lattice_step: float = setting(30.0, "Distance between landing points of a row.", unit="m", above=0)
     lattice_angle: float = setting(45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90)
     n_landing_points: int | None = setting(
         None, "Number of landing points kept, those nearest to the centroid; all if not given.", low=1
@@ -100,15 +96,10 @@ class MotionConfig(Settings):
     degree: int = setting(5, "Degree of the time law of each phase.", choices=(3, 5, 7), kinds=POLYNOMIAL)
     max_speed: float = setting(5.0, "Speed limit.", unit="m/s", low=1e-3, kinds=POLYNOMIAL)
     max_acceleration: float = setting(2.0, "Acceleration limit.", unit="m/s^2", low=1e-3, kinds=POLYNOMIAL)
-    sensing_time: float = setting(
-        0.0, "Time that a landed UAV senses before it may choose again.", unit="s", low=0
-    )
+    sensing_time: float = setting(0.0, "Time that a landed UAV senses before it chooses.", unit="s", low=0)
     min_level: float = setting(1.0, "Flight level of the first UAV.", unit="m", above=0)
     max_level: float = setting(
-        20.0,
-        "Highest flight level, shared by UAVs that fly instantly if there are too few.",
-        unit="m",
-        above=0,
+        20.0, "Highest flight level; UAVs that fly instantly share levels if need be.", unit="m", above=0
     )
     level_separation: float = setting(0.5, "Vertical distance between two flight levels.", unit="m", above=0)
     options: Any = setting(None, "Settings of a motion model of your own, as a mapping.", kinds=POLYNOMIAL)
@@ -152,10 +143,8 @@ class SourceConfig(Settings):
     local_distance: float = setting(
         50.0, "Largest distance of an inner point from its hotspot.", unit="m", above=0, kinds=DYNAMIC
     )
-    speed: float = setting(20.0, "Largest speed to another hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
-    acceleration: float = setting(
-        2.5, "Acceleration to another hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC
-    )
+    speed: float = setting(20.0, "Largest speed to a hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
+    acceleration: float = setting(2.5, "Acceleration to a hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC)
     local_speed: float = setting(1.7, "Largest speed around a hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
     local_acceleration: float = setting(
         1.1, "Acceleration around a hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC
@@ -203,17 +192,10 @@ class BatteryConfig(Settings):
     efficiency: float = setting(12.0, "Factor that divides the consumption.", above=0, kinds=CHARGING)
     charging_power_kw: float = setting(4.0, "Power of a charging UAV.", unit="kW", above=0, kinds=CHARGING)
     resolution: float = setting(
-        5.0,
-        "Observed levels are rounded down to a multiple of this.",
-        unit="%",
-        above=0,
-        high=100,
-        kinds=CHARGING,
+        5.0, "Observed levels are multiples of this.", unit="%", above=0, high=100, kinds=CHARGING
     )
     charging_points: list | None = setting(
-        None,
-        "Places as of source.position near which UAVs charge; anywhere if not given.",
-        kinds=CHARGING,
+        None, "Places as source.position near which UAVs charge; anywhere if not given.", kinds=CHARGING
     )
 
     @property
