@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | test-browser | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-advise | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | test-browser | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | fleet | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -8,7 +8,7 @@ PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick fleet benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded "delay.obs={law: uniform, low: 1, high: 7}" aware=timeline \
@@ -72,9 +72,9 @@ $(JAXMARL)/ready:
 	$(JAXMARL)/bin/python -m pip install --quiet --disable-pip-version-check jaxmarl
 	touch $@
 
-# The service of damian advise over loopback.
-bench-advise: $(VENV)/test
-	$(PY) examples/benchmarks/bench_advise.py $(ARGS)
+# The tests of the service for fleets, a distribution of its own (examples/fleet).
+fleet: $(VENV)/fleet
+	cd examples/fleet && $(abspath $(PY)) -m pytest $(ARGS)
 
 bench-quick: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py --quick
@@ -151,6 +151,10 @@ $(VENV)/package: $(VENV)/base
 
 $(VENV)/browser: $(VENV)/test
 	$(PIP) -e ".[browser]" "$(TORCH)"
+	touch $@
+
+$(VENV)/fleet: $(VENV)/base examples/fleet/pyproject.toml
+	$(PIP) -e . -e "examples/fleet[test]" "$(TORCH)"
 	touch $@
 
 $(VENV)/bench: $(VENV)/base

@@ -20,6 +20,7 @@ from damian.recipes.known import Setting, default_options, groups, known_setting
 ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
 TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff"}
+TEXTS |= {"examples/fleet/README.md": "fleet.md", "examples/fleet/docs/mavlink.md": "mavlink.md"}
 """Files beside docs/, and what they are called in the site."""
 SHOWN = ("train", "fly", "tune", "compare", "advise")
 """Programs whose settings have a page."""
@@ -37,7 +38,7 @@ PACKAGES = (
     "compare",
     "show",
     "interop",
-    "advice",
+    "field",
 )
 """Packages with a page of the API, the most used first."""
 PROGRAM_FUNCTIONS = {

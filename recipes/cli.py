@@ -61,8 +61,6 @@ from .known import (
 
 Work = Callable[[Any, Path], None]
 """The work of a program: takes checked settings and the run folder to fill."""
-SECRET = "token"
-"""Key of the setting that is a password, which no file should keep."""
 
 
 # ------------------------------------------------------------------------------------------ schemas
@@ -440,6 +438,5 @@ def shown(folder: Path) -> Path:
 
 
 def command() -> str:
-    """The command line as it was typed, to be run again in a shell; without the password of a service."""
-    words = [f"{SECRET}=..." if key_of(word) == SECRET else word for word in sys.argv[1:]]
-    return f"{Path(sys.argv[0]).name} {shlex.join(words)}"
+    """The command line as it was typed, to be run again in a shell."""
+    return f"{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}"

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.common.field_rules import FieldRules
 from damian.common.fields import constant, setting
 from damian.compare.config import LESS_IS_BETTER, POLICY_MEANS, SCORE_MEANS, SCORES, STORED
 from damian.envs.config import ScenarioConfig
@@ -187,7 +186,8 @@ class FlyConfig(FlownPolicyConfig):
     )
     views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
     journal: str | None = setting(
-        None, "Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply."
+        None,
+        "Journal of a fleet whose flight to show, instead of flying, with the settings given here.",
     )
     span: list[float] | None = setting(
         None, "First and last time of the journal to show, since every UAV had reported.", unit="s"
@@ -200,7 +200,7 @@ class FlyConfig(FlownPolicyConfig):
         super().__post_init__()
         self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
         if self.journal or self.replay:
-            flies = {"checkpoint": None, "policy": None, "eval_episodes": 1, "keep": "all"}
+            flies = {"policy": None, "eval_episodes": 1, "keep": "all"}
             for name, none in flies.items():
                 wrong = getattr(self, name) != none
                 self.refuse(wrong, name, "means nothing with journal or replay, which fly nothing")
@@ -214,41 +214,25 @@ class FlyConfig(FlownPolicyConfig):
 
 
 @dataclass
-class AdviseConfig(FlownPolicyConfig, FieldRules):
+class AdviseConfig(FlownPolicyConfig):
     """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
 
     policy: str | None = setting(None, "deterministic (default with checkpoint), sampled, or script.")
-    reports: str | None = setting(None, "Table of reports to answer once, CSV or JSON.")
-    port: int | None = setting(None, "Port of the service over HTTP; 0: a free one.", low=0, high=65535)
+    table: str | None = setting(None, "Table of reports, CSV or JSON: where should each UAV land next?")
     fit: str | None = setting(
         None, "Journal, or table with receive times: only write its delays as a trace, ``trace.csv``."
     )
-    host: str = setting("127.0.0.1", "Address of the service; other machines do not reach the default one.")
-    token: str | None = setting(
-        None, "Password of the service; DAMIAN_TOKEN of the environment, or made and printed, if not given."
+    instant: bool = setting(
+        False, "Whether a policy may advise whose UAVs were at their targets at once in training."
     )
-    uavs: list[str] = setting([], "IDs of the UAVs of a table; those in it if not given.")
-    journal: str | None = setting(None, "Folder of the journals; in the run folder if not given.")
 
     policies: ClassVar[tuple[str, ...]] = ("deterministic", "sampled", "script")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_token("token", self.token)
-
     def check_source(self) -> None:
         """Require exactly one source of reports."""
-        given = [name for name in ("reports", "port", "fit") if getattr(self, name) is not None]
-        problem = "is not the only one of reports=FILE, port=NUMBER, fit=FILE: give one"
-        checks.require(len(given) == 1, "reports", " and ".join(given) or "nothing", problem)
-        unread = self.journal and given[0] in ("reports", "fit")
-        self.refuse(unread, "journal", "is for a service: leave it out")
-
-
-def check_token(key: str, token: str | None) -> None:
-    """Require a password that nobody guesses and every header can carry, if there is one."""
-    good = token is None or (len(token) >= 16 and token.isascii() and token.isprintable())
-    checks.require(good, key, "it", "is not a password of at least 16 printable ASCII characters")
+        given = [name for name in ("table", "fit") if getattr(self, name) is not None]
+        problem = "is not the only one of table=FILE, fit=FILE: give one"
+        checks.require(len(given) == 1, "table", " and ".join(given) or "nothing", problem)
 
 
 @dataclass

@@ -4,11 +4,9 @@ damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]"
 damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
 """
 
-from dataclasses import fields
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -19,7 +17,6 @@ from tqdm import tqdm
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
-from damian.common.field_rules import FieldRules
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
@@ -30,11 +27,9 @@ from damian.show.geojson import origin_of, save_geojson
 from damian.show.replay_page import save_page
 
 from . import cli
-from .config import FILMS, AdviseConfig, FlyConfig, TrainConfig
+from .config import FILMS, FlyConfig
 from .evaluate import stored_actor
-from .known import key_of
-from .shared.runs import save_config, without
-from .shared.settings import check_components
+from .shared.runs import save_config
 
 
 def fly(config: FlyConfig) -> list[Episode]:
@@ -54,42 +49,23 @@ def fly(config: FlyConfig) -> list[Episode]:
     return record(rollout, env.uav_env, {**about, "overrides": list(config.overrides)})
 
 
-def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
-    """The settings by which the fleet of the journal was advised, unless others are given now."""
-    from damian.advice.journal import read_head  # noqa: PLC0415 (needs pydantic, which only advice does)
-
-    told = read_head(Path(str(config.journal))).about.overrides
-    of_advice = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
-    replaced = [*map(key_of, config.overrides), *of_advice, "checkpoint", "eval_episodes"]
-    overrides = [*without(cli.stored_words(told, "advise", "journal"), replaced), *config.overrides]
-    settings: FlyConfig = cli.checked(cli.composed("fly", overrides), "fly")
-    check_components(settings)
-    settings.overrides = overrides
-    return settings
-
-
 def episode_of_journal(config: FlyConfig) -> Episode:
     """The flight that the journal tells."""
-    from damian.advice.fleet import Fleet  # noqa: PLC0415 (needs pydantic, which only advice does)
-    from damian.advice.journal import read_head  # noqa: PLC0415
-    from damian.advice.node import Node, for_uavs  # noqa: PLC0415
-    from damian.advice.playback import episode_of  # noqa: PLC0415
+    from damian.field.journal import read_head  # noqa: PLC0415 (needs pydantic, which only reports do)
+    from damian.field.node import Node, for_uavs  # noqa: PLC0415
+    from damian.field.playback import episode_of  # noqa: PLC0415
 
     path = Path(str(config.journal))
     head = read_head(path)
 
     @cache
-    def parts(n_uavs: int) -> tuple[Node, TensorDictModuleBase]:
-        node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed, reward_terms=True)
-        return node, greedy_policy(node.env)
+    def node_of(n_uavs: int) -> Node:
+        return Node(for_uavs(config.eval_scenario, n_uavs), config.seed, reward_terms=True)
 
-    node, policy = parts(len(head.uavs))
-    rules: dict[str, Any] = head.rules
-    fleet = Fleet(node, head.uavs, policy, rules=FieldRules(**rules), parts=parts, mark=head.mark)
     span = None if config.span is None else (config.span[0], config.span[1])
     about = {"policy": head.about.policy, "checkpoint": head.about.checkpoint}
     about |= {"overrides": list(config.overrides), "fleet": head.fleet}
-    return episode_of(path, fleet, about, span, partial(tqdm, unit=" lines", delay=1))
+    return episode_of(path, head.uavs, node_of, about, span, partial(tqdm, unit=" lines", delay=1))
 
 
 def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:
@@ -134,7 +110,7 @@ def summary(name: str, episode: Episode) -> str:
 
 
 def fly_or_replay(config: FlyConfig, folder: Path) -> None:
-    """Replay or fly episodes, or take the flight of a journal with the settings by which it was advised."""
+    """Replay or fly episodes, or take the flight of a journal."""
     films = "mp4" not in config.formats or FFMpegWriter.isAvailable()
     checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
     if config.replay:
@@ -142,7 +118,7 @@ def fly_or_replay(config: FlyConfig, folder: Path) -> None:
         save_page([Episode.load(Path(file)) for file in config.replay], page)
         print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
     else:
-        show(config if config.journal is None else with_settings_of_journal(config), folder)
+        show(config, folder)
 
 
 def run() -> None:

@@ -10,13 +10,12 @@ import shlex
 import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
+from reports import write_journal as write_reports
 
 import damian
-from damian.advice.journal import About, Head
 
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -35,7 +34,6 @@ SHORTER = {
 """Settings that make the commands of a program short; they replace those of the document."""
 INSTEAD = {
     "seed=0,1,2": "seed=0",
-    "port=8000": "port=0",
     "span=[600,900]": "span=[10,20]",
     "experiment=delays": "experiment=usecases",
     "hydra/launcher=submitit_slurm": "hydra/launcher=submitit_local",
@@ -84,17 +82,6 @@ def call(words: list[str], folder: Path) -> str:
     return done.stdout
 
 
-def call_service(words: list[str], folder: Path, sign: str) -> None:
-    """Run a command that ends only when it is stopped, until it prints a line that begins with a sign."""
-    with subprocess.Popen([*PROGRAM, *words], cwd=folder, stdout=subprocess.PIPE, text=True) as process:
-        stop = threading.Timer(120, process.terminate)
-        stop.start()
-        found = any(line.startswith(sign) for line in process.stdout or ())
-        stop.cancel()
-        process.terminate()
-    assert found, (words, sign)
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
     """A trained run and the files that the documents name."""
@@ -107,7 +94,7 @@ def trained(tmp_path_factory) -> Path:
     shape = {"type": "Polygon", "coordinates": [PARK]}
     park = {"type": "Feature", "properties": {"name": "park"}, "geometry": shape}
     (folder / "park.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [park]}))
-    (folder / "table.csv").write_text(TABLE)
+    (folder / "reports.csv").write_text(TABLE)
     for file in (ROOT / "examples" / "extending").glob("*.py"):
         shutil.copy(file, folder)
     return folder
@@ -115,13 +102,12 @@ def trained(tmp_path_factory) -> Path:
 
 def write_journal(path: Path) -> None:
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    head = Head(fleet="north", uavs=["A", "B"], about=About(overrides=["region=llanbedr"]))
-    lines = [head.model_dump()]
+    lines: list[dict] = []
     for n in range(60):
         row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
     path.parent.mkdir(exist_ok=True)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    write_reports(path, *lines, uavs=["A", "B"])
 
 
 @pytest.mark.slow
@@ -130,10 +116,6 @@ def test_the_commands_of_a_document_run(name, trained, tmp_path):
     folder = tmp_path / "folder"
     shutil.copytree(trained, folder)
     for words in map(shortened, COMMANDS[name]):
-        sources = {word.split("=")[0] for word in words} & {"port", "folder"}
-        if sources:
-            call_service(words, folder, {"port": "listening", "folder": "watching"}[sources.pop()])
-            continue
         if any("journals/" in word for word in words):
             write_journal(folder / "journals" / "north.jsonl")
         call(words, folder)

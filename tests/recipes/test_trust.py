@@ -9,7 +9,6 @@ import pytest
 from omegaconf import OmegaConf
 
 import damian
-from damian.advice.journal import About, Head, Journal
 from damian.common.errors import InputError
 from damian.recipes import cli
 from damian.recipes.command import main
@@ -58,7 +57,7 @@ PROGRAMS = {
     "export": lambda: main(["export", "run"]),
     "evaluate": lambda: main(["evaluate", "checkpoint=run", "hydra.run.dir=new"]),
     "fly": lambda: main(["fly", "checkpoint=run", "formats=[]", "hydra.run.dir=new"]),
-    "advise": lambda: main(["advise", "checkpoint=run", "reports=table.csv", "hydra.run.dir=new"]),
+    "advise": lambda: main(["advise", "checkpoint=run", "table=table.csv", "hydra.run.dir=new"]),
     "train": lambda: main(["train", "checkpoint=run", "hydra.run.dir=new"]),
     "resume": lambda: main(["train", "resume=run", "frames=96"]),
 }
@@ -135,12 +134,11 @@ def test_no_stored_setting_is_run(store, key, capsys):
 
 
 def test_no_word_of_a_journal_is_run(store, capsys):
+    about = {"overrides": ["region=llanbedr", "learner=[evilmod:X]", "delay.obs={law: evilmod:X}"]}
+    head = {"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A"], "about": about}
+    Path("north.jsonl").write_text(json.dumps(head) + "\n", encoding="utf-8")
     fly = ["fly", "journal=north.jsonl", "formats=[]", "hydra.run.dir=new"]
-    for word in ("learner=[evilmod:X]", "delay.obs={law: evilmod:X}"):
-        Path("north.jsonl").unlink(missing_ok=True)
-        about = About(policy="script", overrides=["region=llanbedr", word, "hydra.searchpath=[file://evil]"])
-        Journal(Path("north.jsonl")).append(Head(fleet="north", uavs=["A"], about=about))
-        check_refuses(lambda: main(fly), capsys)
+    check_refuses(lambda: main(fly), capsys, "north.jsonl: the fleet never began")
 
 
 def test_comparisons_searches_and_tables_of_results_read_stored_runs_as_data(store, capsys):

@@ -1,0 +1,252 @@
+"""What the server node knows of a UAV: its reports in the order in which they were generated, as messages.
+
+Places in reports count as the landing points nearest to them.
+"""
+
+import bisect
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import zip_longest
+
+import numpy as np
+import shapely
+import torch
+from torch import Tensor
+
+from damian.common.counter_rng import number_of
+from damian.common.errors import InputError
+from damian.field.rows import DEGREES, METRES, Place, Report
+from damian.server.server import Server
+from damian.world.airspace import Airspace
+from damian.world.battery import observed
+from damian.world.messages import Messages
+from damian.world.regions.geodesy import to_latlon, to_local
+
+KEPT, KEPT_ANYWAY = 512, 16
+"""Most and fewest reports of a UAV that are kept: a late one changes what newer ones left open."""
+DIGITS = {DEGREES: 8, METRES: 3}
+"""Decimals of a place in answers: a millimetre."""
+
+
+class Ground:
+    """Landing points of a region, as answers and reports, up to ``reach`` [m] beside them, name places."""
+
+    def __init__(self, airspace: Airspace, reach: float) -> None:
+        self.region, self.reach = airspace.regions[0], reach
+        self.columns = METRES if self.region.origin is None else DEGREES
+        self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
+        self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
+        # Each place is looked up several times.
+        self.landing_point = lru_cache(10_000)(self._landing_point)
+        """Number of the landing point nearest to a place; ``InputError`` if it is farther than ``reach``."""
+        self.place = lru_cache(10_000)(self._place)
+        """Where a landing point is, in ``columns``."""
+        self.way = lru_cache(10_000)(self._way)
+        """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
+
+    @cached_property
+    def mark(self) -> str:
+        """A text that stands for the landing points."""
+        return str(number_of(str(self.points.round(2).tolist())))
+
+    def local(self, place: Place) -> tuple[float, float]:
+        """A place, east and north of the origin of the region [m]."""
+        first, second = place
+        if self.region.origin is None:
+            return first - self.region.offset[0], second - self.region.offset[1]
+        x, y = to_local(first, second, self.region.origin)
+        return float(x), float(y)
+
+    def _landing_point(self, place: Place) -> int:
+        x, y = self.local(place)
+        point = int(self._tree.nearest(shapely.Point(x, y)))
+        away = float(np.hypot(*(self.points[point] - (x, y))))
+        if away > self.reach:
+            where = f"{', '.join(self.columns)}: {place[0]:.10g}, {place[1]:.10g}"
+            raise InputError(f"{where} is {away:.0f} m away from the landing points of {self.region.name}")
+        return point
+
+    def _place(self, point: int) -> Place:
+        x, y = self.points[point]
+        if self.region.origin is None:
+            place = x + self.region.offset[0], y + self.region.offset[1]
+        else:
+            place = to_latlon(x, y, self.region.origin)
+        digits = DIGITS[self.columns]
+        return round(float(place[0]), digits), round(float(place[1]), digits)
+
+    def _way(self, origin: int, goal: int) -> tuple[float, float]:
+        east, north = (float(each) for each in self.points[goal] - self.points[origin])
+        heading = math.degrees(math.atan2(east, north)) % 360
+        return round(math.hypot(east, north), 2), round(heading, 2)
+
+
+@dataclass
+class FilledReport:
+    """A report with all that it leaves open filled in from the ones generated before it."""
+
+    report: Report
+    step: int
+    """Step in which it was generated."""
+    sent: tuple[int, int] | None
+    """Landing points from which and to which the UAV had last been sent by then, if it had."""
+    point: int = 0
+    """Landing point where the UAV is; in flight, where it took off."""
+    target: int = 0
+    """Landing point to which it flies."""
+    track: float = 0.0
+    """Heading of its latest flight [rad]."""
+    battery: float = 100.0
+    """Battery level [%]."""
+    battery_known: bool = False
+    """Whether the UAV has ever reported one."""
+    spotted: bool = False
+    """Whether it spots the source; a UAV in flight does not."""
+    detected: int | None = None
+    """Step of its latest detection; None if there was none."""
+    detected_at: int | None = None
+    """Landing point of that detection."""
+    motions: int = 0
+    """Decisions since its latest detection before."""
+    stops: tuple[tuple[int, int], ...] = ()
+    """Its latest landing points, newest first, each with the step of the landing, or -1 if it is unknown."""
+    readings: tuple[float, ...] = ()
+    """Readings of sensors of your own."""
+
+
+class UavLog:
+    """The reports of one UAV."""
+
+    def __init__(self, ground: Ground, n_stops: int, n_readings: int, kept_steps: int, dt: float) -> None:
+        self.ground, self.n_stops, self.n_readings, self.kept_steps = ground, n_stops, n_readings, kept_steps
+        self.dt = dt
+        self.reports: list[FilledReport] = []
+        self.known_from = -math.inf
+        """Time since which all reports are kept [s]."""
+
+    @property
+    def newest(self) -> FilledReport | None:
+        """The report that was generated last."""
+        return self.reports[-1] if self.reports else None
+
+    def check(self, report: Report) -> None:
+        """Require places near landing points, and as many readings as the sensors give."""
+        if report.columns != self.ground.columns:
+            own = ", ".join(self.ground.columns)
+            raise InputError(f"places in {self.ground.region.name} are {own}: give those of {report.id} so")
+        for place in (report.place(), report.place("source_"), report.place("target_")):
+            if place is not None:
+                self.ground.landing_point(place)
+        for place in report.previous or ():
+            self.ground.landing_point(place)
+        n = self.n_readings
+        if report.readings is not None and len(report.readings) != n:
+            raise InputError(f"readings: {len(report.readings)} numbers are not {n}, as in the training")
+
+    def has(self, time: float) -> bool:
+        """Has a report that was generated at this time come in before."""
+        at = self._place_of(time)
+        return at < len(self.reports) and self.reports[at].report.time == time
+
+    def _place_of(self, time: float) -> int:
+        """Number of reports that were generated before this time; mostly all."""
+        if not self.reports or self.reports[-1].report.time < time:
+            return len(self.reports)
+        return bisect.bisect_left(self.reports, time, key=lambda filled: filled.report.time)
+
+    def add(
+        self, report: Report, step: int, detected: int | None, sent: tuple[int, int] | None = None
+    ) -> FilledReport:
+        """Add a report, in its place by the time when it was generated; arguments as of ``FilledReport``."""
+        filled = FilledReport(report, step, sent, detected=detected)
+        at = self._place_of(report.time)
+        self.reports.insert(at, filled)
+        for i in range(at, len(self.reports)):
+            self._fill(self.reports[i], self.reports[i - 1] if i else None)
+        too_old = self.reports[-1].step - self.kept_steps
+        while len(self.reports) > KEPT or (
+            len(self.reports) > KEPT_ANYWAY and self.reports[0].step < too_old
+        ):
+            del self.reports[0]
+            self.known_from = self.reports[0].report.time
+        return filled
+
+    def _fill(self, filled: FilledReport, before: FilledReport | None) -> None:
+        """Fill in what a report leaves open."""
+        report, near = filled.report, self.ground.landing_point
+        here, target = report.place(), report.place("target_")
+        assert here is not None  # every report has it
+        filled.point = filled.target = near(here)
+        if report.flies and filled.sent:  # it is on its way, and took off from where it was sent
+            filled.point, filled.target = filled.sent
+        elif report.flies and before:
+            filled.point = filled.target = before.point
+        if target is not None:
+            filled.target = near(target)
+        track, battery, readings = 0.0, 100.0, (0.0,) * self.n_readings
+        if before:
+            track, battery, readings = before.track, before.battery, before.readings
+        filled.track = track if report.track is None else math.radians(report.track) % (2 * math.pi)
+        filled.battery = battery if report.battery is None else report.battery
+        filled.battery_known = report.battery is not None or (before is not None and before.battery_known)
+        filled.readings = readings if report.readings is None else report.readings
+        filled.spotted = report.source_spotted and not report.flies
+        place = report.place("source_")
+        if filled.spotted:
+            filled.detected, filled.detected_at = filled.step, filled.point
+        elif report.source_time is None:
+            if before is not None:
+                filled.detected, filled.detected_at = before.detected, before.detected_at
+        elif place is not None:
+            filled.detected_at = near(place)
+        else:
+            held = before and before.detected_at
+            filled.detected_at = filled.point if held is None else held
+        filled.motions = 0 if before is None or before.spotted else before.motions
+        filled.motions += before is not None
+        if report.motions is not None:
+            filled.motions = report.motions
+        filled.stops = self._stops(filled, before)
+
+    def _stops(self, filled: FilledReport, before: FilledReport | None) -> tuple[tuple[int, int], ...]:
+        """The latest stops of a UAV, as far as a report and the one before it tell."""
+        report, stops = filled.report, list(before.stops) if before else []
+        if not stops or stops[0][0] != filled.point:
+            stops = [(filled.point, filled.step), *stops]
+        if report.previous is not None:
+            points = [filled.point, *map(self.ground.landing_point, report.previous)]
+            same = [point == stop for point, (stop, _) in zip(points, stops, strict=False)]
+            steps = [step if known else -1 for known, (_, step) in zip(same, stops, strict=False)]
+            stops = [*zip_longest(points, steps, fillvalue=-1)]
+        if report.landed is not None:
+            ago = (round((report.time - time) / self.dt) for time in report.landed[: len(stops)])
+            points, steps = [point for point, _ in stops], [filled.step - n_steps for n_steps in ago]
+            stops = [*zip_longest(points, steps, fillvalue=-1)]
+        return tuple([*stops, *[(stops[-1][0], -1)] * self.n_stops][: self.n_stops])
+
+
+def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float) -> Messages:
+    """Messages [n] as the simulation would send them; landing points are [L, 2] and steps ``dt`` long [s]."""
+    steps = torch.tensor([each.step for each in reports])
+    detected = torch.tensor([-1 if each.detected is None else each.detected for each in reports])
+    battery = torch.tensor([each.battery for each in reports])
+    at = points[[each.detected_at or 0 for each in reports]]
+    stops = torch.tensor([each.stops for each in reports])  # [n, S, 2]
+    is_empty = server.battery.enabled and observed(battery, server.battery) <= 0
+    return Messages(
+        time=steps * dt,
+        position=points[[each.point for each in reports]],
+        target=points[[each.target for each in reports]],
+        track=torch.tensor([each.track for each in reports]),
+        battery=battery,
+        spotted=torch.tensor([each.spotted for each in reports]),
+        empty=torch.zeros_like(steps, dtype=torch.bool) | is_empty,
+        motions=torch.tensor([each.motions for each in reports]),
+        detected_time=torch.where(detected >= 0, detected * dt, -1.0),
+        detected_position=torch.where((detected >= 0).unsqueeze(-1), at, 0.0),
+        trail=stops[..., 0],
+        landed=torch.where(stops[..., 1] >= 0, stops[..., 1] * dt, -1.0),
+        readings=torch.tensor([each.readings for each in reports]).view(len(reports), -1),
+    )

@@ -1,0 +1,171 @@
+"""The server node of a fleet whose messages are reported from outside, instead of sent by a simulation.
+
+It takes steps as an environment does. So a policy observes the same, bit for bit, as in the simulation, if
+the same messages arrive at the same steps.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose
+
+from damian import keys
+from damian.common import checks
+from damian.common.tensors import tree_map
+from damian.envs.config import ScenarioConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import observation_transforms, remembering_transforms, uplink_transform
+from damian.envs.uav_env import Outputs, UavEnv
+from damian.field.known import Ground
+from damian.server.server import Features
+from damian.transforms import ObservationTimeline, StatefulTransform
+from damian.transforms.base import act, begin, observe
+from damian.transforms.server_node import Belief, ServerNode
+from damian.world.state import State
+
+REMEMBERED_STEPS = 32
+"""Steps that the belief looks back at least: real messages may be later than those of the training."""
+
+Memories = list[dict[str, Tensor]]
+"""The memory of each transform, in order."""
+
+
+class LateMessage(NamedTuple):
+    """A message that arrives in a later step than that in which it was sent."""
+
+    row: Tensor
+    """The packed message, [M]."""
+    uav: int
+    """Number of its UAV."""
+    lag: int
+    """Steps from when it was sent until it arrived, at least 1."""
+
+
+class Reported(NamedTuple):
+    """What the server node of N UAVs learns in a step."""
+
+    state: State
+    """The world as far as it is known, [1, N]; its ``sent`` are the messages that the server holds."""
+    age: Tensor
+    """Age of these messages [steps], [N]."""
+    on_time: Tensor
+    """Which of them arrived in the step in which they were sent, [N] bool."""
+    late: list[LateMessage]
+    """Messages that arrived in this step, and were sent in earlier ones."""
+
+
+class ReportedEnv(UavEnv):
+    """A single world that is known only by its messages; ``Node`` takes its steps."""
+
+    def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
+        extras = {"message", "reward_terms"} if reward_terms else {"message"}
+        super().__init__(scenario, 1, seed, extras=extras, messages_only=True)
+
+    def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
+        outputs = super()._outputs_at_reset(initial, features)
+        message = outputs[keys.MESSAGE]
+        age = torch.zeros_like(message[..., :1])
+        return outputs | {keys.RECEIVED: message.clone(), keys.AGE: age, keys.DELAY: age.long()}
+
+    def outputs_of(self, reported: Reported, first: bool = False) -> Outputs:
+        """The outputs of a step, before any transform; ``first``: of the step that begins an episode."""
+        state, on_time = reported.state, reported.on_time.unsqueeze(0)
+        held = state.sent.pack()
+        if first:
+            outputs = self._outputs_at_reset(state, self.server.features(state.sent, state.steps))
+        else:
+            outputs = self._state_outputs(state)
+        return outputs | {
+            keys.READY: torch.ones_like(on_time),
+            keys.MESSAGE: held,
+            keys.MESSAGE_SENT: on_time,
+            keys.RECEIVED: held.clone(),
+            keys.AGE: reported.age.view(1, -1, 1).float(),
+            keys.DELAY: torch.where(on_time | first, 0, -1).unsqueeze(-1),
+        }
+
+
+class Node:
+    """The server node of a fleet; several may share it, because memories are arguments and results."""
+
+    def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
+        scenario = scenario_of_reports(scenario)
+        self.worlds = ReportedEnv(scenario, seed, reward_terms)
+        self.scenario, self.dt = scenario, scenario.clock.dt
+        self.server, self.simulation = self.worlds.server, self.worlds.simulation
+        self.law_longest = uplink_transform(scenario, False, reads_delay=False).sampler.longest
+        longest = max(self.law_longest, REMEMBERED_STEPS)
+        transforms = [
+            *remembering_transforms(scenario, self.server, longest, delayed=True),
+            ServerNode(self.server, reward_terms=reward_terms),
+            *observation_transforms(scenario),
+        ]
+        self.env = DelayedEnv(self.worlds, Compose(*transforms))  # type: ignore[arg-type]
+        """The environment for which the policy is built; nobody steps it."""
+        self.env.reset()
+        self.ground = Ground(self.simulation.airspace, 2 * scenario.region.lattice_step + 50.0)
+        periods = [scenario.clock.steps(name) for name in ("agents", "server")]
+        self.settles = 2 + sum(periods)
+        """Steps after which all that has arrived is known to all, if nothing else arrives."""
+        self.held_back = 0 if periods == [1, 1] else self.settles
+        """Steps for which an observation may be held, which must be taken even if nothing arrives."""
+        self.diffuses = any(isinstance(each, Belief) for each in transforms)
+        """Whether something changes in every step, even if nothing arrives."""
+        self.transforms = cast(list[StatefulTransform], transforms)
+        self._unused = [transform.memory for transform in self.transforms]
+        self.blank = tree_map(lambda table: table[:1].clone(), self.simulation.initial)
+
+    @torch.no_grad()
+    def begin(self, reported: Reported) -> tuple[Memories, TensorDictBase]:
+        """Memories and outputs of the first step, of any number, when every UAV has sent a message."""
+        outputs = self.worlds.outputs_of(reported, first=True)
+        everywhere = torch.ones(1, 1, dtype=torch.bool)
+        memories, outputs = begin(self.transforms, _copies(self._unused), outputs, everywhere)
+        for transform, memory in zip(self.transforms, memories, strict=True):
+            if isinstance(transform, ServerNode):
+                memory["elapsed"] = reported.state.steps.clone()
+        return memories, self.worlds.to_tensordict(outputs)
+
+    @torch.no_grad()
+    def step(
+        self, memories: Memories, reported: Reported, action: Tensor, chosen: Tensor
+    ) -> tuple[Memories, TensorDictBase]:
+        """Memories and outputs after actions [1, N, ...] that the ``chosen`` UAVs took in the step before."""
+        memories = _copies(memories)
+        for i, transform in enumerate(self.transforms):
+            if isinstance(transform, Belief | ObservationTimeline):
+                for late in reported.late:
+                    memories[i] = transform.note_late(memories[i], *late)
+        memories, _ = act(self.transforms, memories, {keys.ACTION: action, keys.READY: chosen})
+        memories, outputs = observe(self.transforms, memories, self.worlds.outputs_of(reported), {})
+        return memories, self.worlds.to_tensordict(outputs)
+
+    def skip(self, memories: Memories, n_steps: int) -> Memories:
+        """The memories after steps in which nothing was reported and nobody chose; beliefs stay the same."""
+        pairs = zip(self.transforms, memories, strict=True)
+        return [transform.after_idle_steps(memory, n_steps) for transform, memory in pairs]
+
+
+def _copies(memories: Memories) -> Memories:
+    """Copies of memories, which steps may change in place."""
+    return [{name: value.clone() for name, value in memory.items()} for memory in memories]
+
+
+def scenario_of_reports(scenario: ScenarioConfig) -> ScenarioConfig:
+    """The scenario as reports tell it: own messages are known as late as others, and no step is skipped."""
+    problem = "is not server: reports are what the server node knows, not what links bring to a UAV"
+    checks.require(scenario.links.kind == "server", "links", scenario.links.kind, problem)
+    return replace(
+        scenario,
+        observation=replace(scenario.observation, own=False),
+        clock=replace(scenario.clock, skip=False, skip_discount=1.0),
+    )
+
+
+def for_uavs(scenario: ScenarioConfig, n_uavs: int) -> ScenarioConfig:
+    """The scenario of a fleet of another number of UAVs, which begin where they report to be."""
+    region = replace(scenario.region, start_positions=None, start_together=False)
+    return replace(scenario, agents=n_uavs, region=region)

@@ -1,0 +1,264 @@
+"""Rows of tables as pydantic models: reports that come in, and answers that go out, as CSV and JSON.
+
+Columns of a report may be written in any case, and with ``_`` for a space. ``NA``, an empty cell and null
+mean that the value is not known.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import from_json
+
+from damian.common.errors import InputError
+from damian.common.text_files import parse_table, read_text, show
+
+DEGREES, METRES = ("lat", "lon"), ("x", "y")
+"""Columns of a place: latitude and longitude [deg], or over a region without a place on Earth x and y [m]."""
+Place = tuple[float, float]
+"""A place in the columns that its row has."""
+
+UNKNOWN = ("", "na", "nan", "none", "null")
+"""Cells that mean that a value is not known."""
+LATEST = 4e9
+"""Latest time that is understood [s since 1970]."""
+CALENDAR = 1e8
+"""From this time on [s], times count from 1970 and are written as dates."""
+
+
+def _seconds(value: Any) -> Any:
+    """Seconds of ISO 8601, which is UTC if it names no zone; another value as it is."""
+    if not isinstance(value, str):
+        return value
+    try:  # digits alone are seconds, though ISO 8601 would read a date from eight of them
+        return float(value)
+    except ValueError:
+        time = datetime.fromisoformat(value.strip())
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+
+
+def _text_split_at(separator: str | None) -> BeforeValidator:
+    return BeforeValidator(lambda value: value.split(separator) if isinstance(value, str) else value)
+
+
+Number: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
+Time: TypeAlias = Annotated[float, Field(ge=0, le=LATEST), BeforeValidator(_seconds)]
+"""A time [s], as a number or as ISO 8601."""
+Count: TypeAlias = Annotated[int, Field(ge=0, le=2**31)]
+Flag: TypeAlias = Annotated[
+    bool, BeforeValidator(lambda value: value.removesuffix(".0") if isinstance(value, str) else value)
+]
+"""True or false; a table of numbers in which a cell is empty has 1.0 for 1."""
+Latitude: TypeAlias = Annotated[Number, Field(ge=-90, le=90)]
+Longitude: TypeAlias = Annotated[Number, Field(ge=-180, le=180)]
+Coordinate: TypeAlias = Annotated[Number, Field(ge=-2e7, le=2e7)]
+Pair: TypeAlias = Annotated[tuple[Coordinate, Coordinate], _text_split_at(None)]
+UavId: TypeAlias = Annotated[str, Field(pattern=r"^\w[\w .:/-]{0,63}$")]
+"""ID of a UAV; it begins with a letter, digit or ``_``, so that no spreadsheet takes it for a formula."""
+
+
+def _no_default(schema: dict[str, Any]) -> None:
+    """Leave a default out of a JSON schema, which has no NaN."""
+    del schema["default"]
+
+
+class Row(BaseModel):
+    """A row of a table: the names of its fields, with a space for ``_``, are the columns.
+
+    Other columns are kept in ``model_extra``, so that telemetry can be forwarded as it is.
+    """
+
+    model_config = ConfigDict(
+        str_strip_whitespace=True,
+        coerce_numbers_to_str=True,
+        extra="allow",
+        alias_generator=lambda name: name.replace("_", " "),
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _columns(cls, row: Any) -> Any:
+        """A row by its columns, without unknown values."""
+        if not isinstance(row, Mapping):
+            return row
+        return {column_of(str(name)): value for name, value in row.items() if not _is_unknown(value)}
+
+
+class Report(Row):
+    """What a UAV reports; None where it does not say. Journals keep the columns of tables."""
+
+    id: UavId
+    received: Time = Field(math.nan, alias="receive time", exclude=True, json_schema_extra=_no_default)
+    """When it came in [s]; a column of files only."""
+    aoi: Annotated[Number, Field(ge=0, le=LATEST)] = Field(0.0, exclude=True)
+    """Age of the observation when it came in [s], if there is no time."""
+    time: Time = Field(math.nan, json_schema_extra=_no_default)
+    """When the observation was generated [s]."""
+    lat: Latitude | None = None
+    lon: Longitude | None = None
+    x: Coordinate | None = None
+    y: Coordinate | None = None
+    source_spotted: Flag = False
+    """Whether the UAV spots the source."""
+    source_time: Time | None = None
+    """When it detected the source last [s]; its place is where it was then."""
+    source_lat: Latitude | None = None
+    source_lon: Longitude | None = None
+    source_x: Coordinate | None = None
+    source_y: Coordinate | None = None
+    track: Annotated[Number, Field(ge=-360, le=360)] | None = None
+    """Heading of its latest flight, clockwise from north [deg]."""
+    takeoff_landing_time: Time | None = None
+    """When it took off or landed last [s]."""
+    battery: Annotated[Number, Field(ge=0, le=100)] | None = None
+    """Battery level [%]."""
+    fla: Annotated[Number, Field(ge=-500, le=1e5)] | None = None
+    """Flight altitude [m]: above 0 in flight."""
+    target_lat: Latitude | None = None
+    """Landing point to which it flies."""
+    target_lon: Longitude | None = None
+    target_x: Coordinate | None = None
+    target_y: Coordinate | None = None
+    previous: Annotated[tuple[Pair, ...], Field(max_length=16), _text_split_at(";")] | None = None
+    """Landing points where it was before, newest first: [[53.1, -4.5]], or 53.1 -4.5; 53.2 -4.5."""
+    landed: Annotated[tuple[Time, ...], Field(max_length=17), _text_split_at(";")] | None = None
+    """Times at which it landed, or held, where it is and at the places of ``previous`` [s]."""
+    motions: Count | None = None
+    """Decisions (holding included) since it last detected the source before."""
+    readings: Annotated[tuple[Number, ...], Field(max_length=1000), _text_split_at(";")] | None = None
+    """Readings of sensors of your own."""
+    sequence: Count | None = None
+    """Number of the report, which grows by one."""
+
+    @property
+    def columns(self) -> tuple[str, str]:
+        """The columns of its places."""
+        return METRES if self.lat is None else DEGREES
+
+    @property
+    def flies(self) -> bool:
+        """Whether the UAV is in the air."""
+        return self.fla is not None and self.fla > 0
+
+    def place(self, prefix: str = "") -> Place | None:
+        """Where the UAV is; ``source_``: where it detected the source; ``target_``: where it flies."""
+        first, second = (getattr(self, prefix + name) for name in self.columns)
+        return None if first is None else (first, second)
+
+    def stamp(self, now: float, file: bool = False) -> None:
+        """Set the times that the report leaves open; only one from a ``file`` may say when it came in."""
+        said = self.model_fields_set
+        if "received" in said and not file:
+            raise InputError("receive time: only a table has it; the service looks at its own clock")
+        if "received" not in said:
+            self.received = self.time + self.aoi if file and "time" in said else now
+        if "time" not in said:
+            self.time = self.received - self.aoi
+
+    @model_validator(mode="after")
+    def _places_are_complete(self) -> "Report":
+        said, prefixes = self.model_fields_set, ("", "source_", "target_")
+        own, others = (DEGREES, METRES) if self.columns == DEGREES else (METRES, DEGREES)
+        pairs = [{f"{prefix}{name}" in said for name in own} for prefix in prefixes]
+        mixed = any(f"{prefix}{name}" in said for prefix in prefixes for name in others)
+        if mixed or pairs[0] != {True} or any(len(pair) > 1 for pair in pairs):
+            raise ValueError("places are pairs lat, lon [deg], or all of them x, y [m]; the UAV's is needed")
+        if True in pairs[1] and self.source_time is None and not self.source_spotted:
+            raise ValueError("source time: it is missing: when the source was detected at this place [s]")
+        return self
+
+
+class TimedReport(Report):
+    """A row of a log of which only the times count; its places need not be complete."""
+
+    @model_validator(mode="after")
+    def _places_are_complete(self) -> "TimedReport":
+        return self
+
+
+@lru_cache(1000)
+def column_of(name: str) -> str:
+    """A name of a column as ``Row`` has it: small letters, and spaces between words."""
+    return name.strip().lower().replace("_", " ").replace("-", " ")
+
+
+def _is_unknown(value: Any) -> bool:
+    return value is None or (isinstance(value, str) and value.strip().lower() in UNKNOWN)
+
+
+Found = list[tuple[str, Any]]
+"""Rows, each with its place in the text (``line 2``)."""
+Rows = list[tuple[str, Report]]
+
+
+def read_file(path: Path, kind: type[Report] = Report) -> Rows:
+    """Reports of a file: JSON if its name ends with ``.json``, or else CSV."""
+    text = read_text(path)
+    return reports_of(rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text), kind)
+
+
+def rows_of_csv(text: str) -> Found:
+    """Rows of a CSV table, of any kind."""
+    return [(f"line {row.line}", row.cells) for row in parse_table(text, [])]
+
+
+def rows_of_json(text: str | bytes) -> Found:
+    """Rows of JSON, an object or a list of objects, of any kind."""
+    found = parsed_json(text)
+    return [(f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)]
+
+
+def reports_of(found: Found, kind: type[Report] = Report) -> Rows:
+    """Rows as reports."""
+    if not found:
+        raise InputError("there are no rows")
+    return [(where, validated(kind, row, where)) for where, row in found]
+
+
+def parsed_json(text: str | bytes) -> Any:
+    """Parse JSON, without NaN and Infinity."""
+    try:
+        return from_json(text, allow_inf_nan=False)
+    except ValueError as error:
+        raise InputError(f"it is not JSON: {error}") from None
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validated(model: type[Model], value: Any, where: str = "") -> Model:
+    """A value as a model."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field, shown = ".".join(map(str, first["loc"])), show(first["input"])
+        parts = [where, field, shown if field and first["type"] != "missing" else "", first["msg"]]
+        raise InputError(": ".join(filter(None, parts))) from None
+
+
+def as_rows(answers: Sequence[BaseModel]) -> list[dict[str, Any]]:
+    """Answers as rows of JSON; only the columns of places that were not given are left out."""
+    return [answer.model_dump(exclude_unset=True) for answer in answers]
+
+
+def as_csv(answers: Sequence[BaseModel]) -> str:
+    """A CSV table of answers with the same columns; what is not known is ``NA``."""
+    text, rows = io.StringIO(), as_rows(answers)
+    writer = csv.DictWriter(text, list(rows[0]) if rows else ["ID"], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "NA" if cell is None else cell for name, cell in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def written(time: float) -> float | str:
+    """A time: as a date (ISO 8601, UTC), or in seconds if it does not count from 1970."""
+    if time < CALENDAR:
+        return round(time, 3)
+    return datetime.fromtimestamp(time, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,0 +1,116 @@
+"""Delays of real reports become the trace that made them."""
+
+import json
+import shlex
+
+import pytest
+
+from damian.delays.laws import Trace
+from damian.field.fitting import fit, read_log, summary, trace_rows
+from damian.recipes.cli import settings
+from damian.recipes.command import main
+
+DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
+"""Of the messages of a UAV [s]; None: lost."""
+
+
+def table(numbered: bool, period: float = 1.0, uavs: int = 2, start: float = 1.7e9) -> str:
+    """A table of reports in the order in which they came in, one of them twice."""
+    rows = []
+    for uav in range(uavs):
+        for i, delay in enumerate(DELAYS):
+            if delay is not None:
+                time = start + i * period
+                rows.append((time + delay, f"u{uav}", time, i if numbered else "NA"))
+    rows.append(rows[3])
+    lines = [f"{uav},{time},{received},53.1,-4.5,{number}" for received, uav, time, number in sorted(rows)]
+    return "\n".join(["ID,time,receive time,lat,lon,sequence", *lines])
+
+
+@pytest.fixture
+def log(tmp_path):
+    def written(text: str, name: str = "reports.csv"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return written
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+@pytest.mark.parametrize("period", [1.0, 0.25])
+def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, numbered, period):
+    fitted = fit(read_log(log(table(numbered, period))))
+    rows = trace_rows(fitted)
+    found = [None if row == "lost" else float(row.removesuffix("s")) for row in rows]
+    assert found == [None if d is None else pytest.approx(d, abs=1e-6) for d in DELAYS * 2]
+    assert fitted.losses == ("by their numbers" if numbered else f"by their period of {period:.3g} s")
+    assert summary(fitted).startswith(f"22 messages of 2 UAVs over {10 * period:.0f} s; lost: 6 (27.3%)")
+
+
+def test_a_law_reads_the_trace(log, tmp_path, capsys):
+    out = tmp_path / "run" / "trace.csv"
+    main(["advise", f"fit={log(table(True))}", f"hydra.run.dir={out.parent}"])
+    printed = capsys.readouterr().out.splitlines()
+    assert (out.parent / "delays.png").stat().st_size > 10_000
+    assert f'train with "delay.obs={{law: trace, path: {out}}}"' in printed
+    sampler = Trace(str(out)).sampler()
+    assert sampler.longest == 4
+    assert sampler.loses
+
+
+def test_a_journal_is_a_log(log):
+    head = {"journal": "damian-advice", "version": 3, "fleet": "x", "uavs": ["A"], "about": {}}
+    reports = [
+        {"received": i + 0.25, "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}]}
+        for i in range(4)
+    ]
+    lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]
+    path = log("".join(f"{json.dumps(line)}\n" for line in lines) + '{"cut', "x.jsonl")
+    assert trace_rows(fit(read_log(path))) == ["0.250000s"] * 4
+
+
+def test_a_uav_that_is_silent_in_flight_loses_nothing(log):
+    times = [t for start in range(0, 100, 20) for t in (*range(start, start + 12), start + 11.5)]
+    lines = [f"A,{t},{t + 0.1},53.1,-4.5,{60 if t % 20 == 11.5 else 0}" for t in times]
+    fitted = fit(read_log(log("\n".join(["ID,time,receive time,lat,lon,FLA", *lines]))))
+    assert fitted.losses == "by their period of 1 s"
+    assert "lost" not in trace_rows(fitted)
+
+
+def test_numbered_reports_of_one_second_are_different_messages_also_without_places(log):
+    numbers = [n for n in range(300) if n % 50 != 7]
+    lines = [f"A,{n // 5},{n // 5 + 0.9},{n}" for n in [*numbers, 100]]  # one of them twice
+    fitted = fit(read_log(log("\n".join(["ID,time,receive time,sequence", *lines]))))
+    assert summary(fitted).startswith("300 messages of 1 UAVs over 59 s; lost: 6 (2.0%), by their numbers")
+    assert trace_rows(fitted)[7] == "lost"
+
+
+@pytest.mark.parametrize(("shift", "said"), [(-2.0, "1.5 s before"), (3600.0, "3.6e+03 s after")])
+def test_clocks_that_differ_are_named_before_anything_is_written(log, tmp_path, capsys, shift, said):
+    lines = [f"{uav},{i},{i + 0.5 + own}" for i in range(10, 30) for uav, own in (("A", 0), ("B", shift))]
+    path = log("\n".join(["ID,time,receive time", *lines]))
+    with pytest.raises(SystemExit):
+        main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+    (line,) = capsys.readouterr().err.splitlines()
+    start = f"error: {path}: the clocks of B and of the receiver differ: receive times are in the median"
+    assert line.startswith(f"{start} {said} times; correct one of them")
+    assert not (tmp_path / "run" / "trace.csv").exists()
+
+
+def test_a_few_messages_that_came_in_before_their_time_are_named(log):
+    few = log("\n".join(["ID,time,receive time", "A,0,0.5", "A,1,0.8", "A,2,2.5"]))
+    told = "1 came in before their time, because clocks differ, and count as 0 s late; the earliest by 0.2 s"
+    assert summary(fit(read_log(few))).endswith(told)
+
+
+def test_the_law_of_the_delays_is_a_setting_and_bursts_are_named(log, tmp_path, capsys):
+    lines = [f"A,{i},{i + (5.5 if i % 25 < 5 else 0.5)},53.1,-4.5,{i}" for i in range(500) if i % 25]
+    path = log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))
+    main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+    *_, law, fits, bursts, bad, _ = capsys.readouterr().out.splitlines()
+    assert fits.endswith("autocorrelation of delays 0.72")
+    assert bursts.startswith("late messages come in bursts: no law without memory repeats them")
+    assert bad == "a bad fit: take the trace"  # bursts of the same length, in regular distances
+    delay = settings(*shlex.split(law.removeprefix("best law: "))).delay
+    assert (delay.obs["law"], delay.obs["good"], delay.obs["bad"]) == ("burst", 1, 6)

@@ -1,0 +1,210 @@
+"""The server node that follows UAVs by their reports knows what the simulation's one does, and no more."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from reports import LLANBEDR, START, Reporter, names_of, read_json
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from damian import keys
+from damian.baselines.greedy import greedy_policy
+from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
+from damian.envs.pipeline import make_env
+from damian.field.advice import next_landings
+from damian.field.node import Node
+from damian.field.rows import Report
+from damian.field.tracker import Tracker
+from damian.learners.config import MappoConfig, ModelConfig
+from damian.learners.recurrent import add_recurrent_state
+from damian.server.config import EpisodeConfig, ObservationConfig
+from damian.world.config import MotionConfig, RegionConfig, SourceConfig
+
+LATE = {"law": "uniform", "low": 0, "high": 4}
+WALK = SourceConfig(motion="dynamic", level_db=143.0, emission="per_step", emission_probability=0.6)
+FEATURES = ["source_distance", "source_bearing", "source_time", "source_drift", "agent_distances", "coverage"]
+SEEN = ObservationConfig(global_features=FEATURES, local_features=["spotted", "battery"], age=True)
+BELIEF = replace(SEEN, belief=["belief_gain", "belief_moments"])
+TASKS: dict[str, dict[str, Any]] = {
+    "on time": {"observation": SEEN},
+    "late": {"delay": DelayConfig(obs=LATE, loss=0.2), "observation": SEEN},
+    "the last to arrive": {"delay": DelayConfig(obs=LATE, loss=0.2, order="arrival"), "observation": SEEN},
+    "held back": {"delay": DelayConfig(obs=LATE, hold="max"), "observation": SEEN},
+    "messages": {"delay": DelayConfig(obs=LATE, loss=0.2, messages=5), "observation": SEEN},
+    "belief": {"delay": DelayConfig(obs=LATE, loss=0.2), "observation": BELIEF},
+    "clocks": {
+        "delay": DelayConfig(obs=LATE),
+        "observation": SEEN,
+        "clock": ClockConfig(agents="2s", server="4s"),
+    },
+    "flights": {  # no loss: a report in flight counts where the UAV reported last on the ground
+        "delay": DelayConfig(obs=2),
+        "observation": BELIEF,
+        "motion": MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0, sensing_time=2.0),
+    },
+    "timeline": {
+        "delay": DelayConfig(obs=LATE),
+        "motion": MotionConfig(kind="polynomial", max_speed=20.0, max_acceleration=10.0),
+        "observation": ObservationConfig(["place"], ["others"], timeline=6),
+    },
+    "a region of metres": {
+        "delay": DelayConfig(obs=LATE),
+        "observation": SEEN,
+        "region": RegionConfig(initial_conditions=1),
+    },
+}
+
+
+def scenario_of(**changed) -> ScenarioConfig:
+    endless = {"episode": EpisodeConfig(max_steps=None), "region": LLANBEDR, "source": WALK}
+    return ScenarioConfig(**{**endless, "agents": 3, **changed})
+
+
+def recurrent(env):
+    """A policy with random weights and hidden states, the same for every environment of a scenario."""
+    torch.manual_seed(7)
+    actor = MappoConfig().make_actor(env, ModelConfig(hidden=[16], rnn="gru"))
+    add_recurrent_state(env, actor)
+    return actor
+
+
+def take(tracker: Tracker, rows: list[dict[str, Any]], now: float) -> None:
+    """Let rows come in now."""
+    for _ in tracker.advance(now):
+        pass
+    for _, report in read_json(rows) if rows else ():
+        report.stamp(now)
+        tracker.report(report)
+
+
+@pytest.mark.sample(4)
+@pytest.mark.parametrize(
+    ("task", "fraction"), [*((task, 0.0) for task in TASKS), ("late", 0.7), ("flights", 0.7)]
+)
+def test_it_observes_what_the_simulation_does_bit_for_bit(task, fraction):
+    scenario = scenario_of(**TASKS[task])
+    env = make_env(scenario, 1, 3, extras=["message"])
+    node, policy, n_spotted = Node(scenario, 3), greedy_policy(env), 0
+    tracker, shown = Tracker(names_of(3), lambda _: node), env.reset()
+    reporter = Reporter(env, node.ground, fraction)
+    reporter.send(shown, 0, at_once=True)
+    for step in range(90 if task == "flights" else 40):
+        take(tracker, reporter.arriving(step), reporter.time_of(step) + 0.2 * reporter.dt)
+        read = tracker.observe()
+        for key in (keys.OBSERVATION, keys.TIMELINE, keys.BELIEF):
+            if key in shown.keys(True):
+                assert torch.equal(read[key], shown[key]), (step, key)
+        assert torch.equal(read[keys.RECEIVED], shown.get(keys.RECEIVED, shown[keys.MESSAGE])), step
+        n_spotted += sum(held.spotted for held in tracker.held.values())
+        shown = env.step(policy(shown))["next"]
+        reporter.send(shown, step + 1)
+    assert n_spotted > 0
+
+
+@pytest.mark.parametrize("policy_of", [greedy_policy, recurrent])
+def test_a_table_is_answered_as_the_policy_acts_in_the_simulation(policy_of):
+    scenario = scenario_of(observation=BELIEF)
+    env = make_env(scenario, 1, 3, extras=["message"])
+    node, policy, rows, n_moved = Node(scenario, 3), policy_of(env), [], 0
+    reporter, shown = Reporter(env, node.ground), env.reset()
+    reporter.send(shown, 0, at_once=True)
+    for step in range(12):
+        rows += [{**row, "receive time": row["time"] + 0.2} for row in reporter.arriving(step)[::-1]]
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            shown = policy(shown)
+        answers = next_landings(read_json(rows), node, policy_of(node.env), START)
+        goals = env.uav_env.simulation.decide(env.uav_env.state, shown[keys.ACTION], None).goal[0]
+        assert [(each.lat, each.lon) for each in answers] == [*map(node.ground.place, goals.tolist())]
+        n_moved += sum(each.state == "fly" for each in answers)
+        shown = env.step(shown)["next"]
+        reporter.send(shown, step + 1)
+    assert n_moved > 0
+
+
+def test_who_is_in_flight_is_not_advised():
+    node = Node(scenario_of(observation=SEEN), 3)
+    rows = [{"ID": uav, "AoI": 1} for uav in "abc"]
+    for row, point in zip(rows, (200, 300, 400), strict=True):
+        row["lat"], row["lon"] = node.ground.place(point)
+    rows[1]["FLA"] = 20
+    answers = next_landings(read_json(rows), node, greedy_policy(node.env), START)
+    assert [each.state == "in flight" for each in answers] == [False, True, False]
+    assert [each.lat is None for each in answers] == [False, True, False]
+    assert {each.age for each in answers} == {1.0}
+
+
+def tracker_of(node: Node | None = None, **changed) -> Tracker:
+    node = node or Node(scenario_of(**changed), 3)
+    return Tracker(["a", "b", "c"], lambda _: node)
+
+
+def tell(tracker: Tracker, uav: str, time: float, point: int, received: float | None = None, **more) -> None:
+    lat, lon = tracker.node.ground.place(point)
+    row = Report(**{"id": uav, "time": time, "lat": lat, "lon": lon, **more})
+    row.stamp(time + 0.1 if received is None else received)
+    for _ in tracker.advance(row.received):
+        pass
+    tracker.report(row)
+
+
+def begun(**changed) -> Tracker:
+    """One that has begun."""
+    tracker = tracker_of(**changed)
+    for i, uav in enumerate(tracker.uavs):
+        tell(tracker, uav, START, 200 + i)
+    return tracker
+
+
+@pytest.mark.parametrize("task", ["belief", "clocks", "held back"])
+def test_a_long_silence_is_skipped_without_a_difference(task, monkeypatch):
+    monkeypatch.setattr("damian.field.tracker.SILENT_STEPS", 40)
+    seen = []
+    for first in (10**9, 0):  # skipped, and step by step
+        tracker = begun(**TASKS[task])
+        tell(tracker, "b", START + 4, 30, START + 5.5, source_spotted=True)
+        assert len([*tracker.advance(START + 130, first)]) == (0 if first else 125)
+        tell(tracker, "a", START + 131.5, 17, source_spotted=True)
+        assert [*tracker.advance(START + 140)] == []
+        seen.append(tracker.observe())
+    for key in (keys.OBSERVATION, keys.RECEIVED):
+        assert torch.equal(seen[0][key], seen[1][key])
+
+
+def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
+    tracker = begun()
+    tell(tracker, "a", START + 5, 210)
+    tell(tracker, "a", START + 3, 205, START + 6, source_spotted=True)
+    tell(tracker, "a", START + 3, 100, START + 6)  # of the same time: it is known already
+    tell(tracker, "a", START - 3, 100, START + 6)  # before the start
+    assert [*tracker.advance(START + 7)] == []
+    held = tracker.held["a"]
+    assert (held.point, held.detected, held.detected_at) == (210, 3, 205)
+
+
+def test_uavs_leave_at_once_and_join_with_their_first_report():
+    tracker = Tracker(["a", "b", "c"], lambda n: Node(replace(scenario_of(), agents=n), 3))
+    for i, uav in enumerate(tracker.uavs):
+        tell(tracker, uav, START, 200 + i)
+    tracker.change_members(["d"], ["a"])
+    assert tracker.uavs == ["b", "c"]
+    tell(tracker, "d", START + 3, 7)
+    assert tracker.uavs == ["b", "c", "d"]
+    assert tracker.observe()[keys.RECEIVED].shape[1] == 3
+    assert [tracker.held[uav].point for uav in tracker.uavs] == [201, 202, 7]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"uav": "d"}, "ID: 'd' is not a UAV of this fleet: a, b, c"),
+        ({"time": START + 60}, "time: 1700000060 s is 60.0 s after it came in"),
+        ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
+    ],
+)
+def test_what_no_uav_can_say_is_refused(changed, message):
+    with pytest.raises(InputError) as error:
+        tell(tracker_of(), point=3, received=START, **{"uav": "a", "time": START, **changed})
+    assert str(error.value).startswith(message)
