@@ -8,9 +8,9 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.delays.laws import Law
 from damian.delays.samplers import MessageContext, Sampler
-from damian.transforms.base import Entries, Memory, as_rows, sibling_key
+from damian.transforms.base import Memory
+from damian.transforms.entries import Entries, as_rows, sibling_key
 
 
 class ContextReader:
@@ -24,7 +24,6 @@ class ContextReader:
 
     def __init__(
         self,
-        law: Law,
         sampler: Sampler,
         context_keys: Mapping[str, NestedKey] | None,
         dt: float,
@@ -35,7 +34,7 @@ class ContextReader:
         self.keys: dict[str, NestedKey] = {}
         """Keys of the entries that the law reads, by name."""
         for name in (*sampler.reads, *(name for name in sampler.optional_reads if name in known)):
-            should = f"has no key for {name}, which the law {type(law).__name__} reads"
+            should = f"has no key for {name}, which the delay law reads"
             checks.require(name in known, "context_keys", known, should)
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(known[name])))
         self._sees_context, self._dt = sampler.sees_context, dt

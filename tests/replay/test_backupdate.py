@@ -12,10 +12,10 @@ from torchrl.envs import StepCounter
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
+from damian.envs.recompute import CORRECTED, server_recompute
 from damian.envs.uav_env import EXTRAS
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import CORRECTED, server_recompute
 from damian.server.termination import EpisodeConfig
 
 LONGEST = 5

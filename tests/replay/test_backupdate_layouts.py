@@ -4,8 +4,7 @@ import pytest
 import torch
 from remote import (
     ENDS,
-    WORLDS,
-    Twin,
+    Case,
     both_layouts,
     key,
     make_env,
@@ -23,43 +22,13 @@ from damian.keys import next_key
 
 @both_layouts
 @pytest.mark.parametrize("order", ["generation", "arrival"])
-@pytest.mark.parametrize("parts", [1, 5])
-def test_stored_steps_become_what_a_slow_twin_says(group, order, parts):
-    collected = rollout(make_env(group, order=order), 60)
-    steps = collected.transpose(0, 1)
-    hindsight = key(group, "hindsight")
-    after = stored(make_storage(group, hindsight_key=hindsight), collected, parts)
-    named = {name: after[next_key(key(group, name))] for name in ("observation", "reward", "hindsight")}
-    before, replaced = after[key(group, "observation")], after[key(group, "backupdated")]
-    for world in range(WORLDS):
-        twin = Twin(steps, world, group)
-        for name, right in (("terminated", twin.terminated), ("truncated", twin.truncated)):
-            assert after["next", name][:, world, 0].tolist() == right
-        done = [a or b for a, b in zip(twin.terminated, twin.truncated, strict=True)]
-        assert after["next", "done"][:, world, 0].tolist() == done
-        assert after["valid"][:, world, 0].tolist() == twin.valid
-        for t in range(60):
-            for row in twin.senders:
-                at = (t, world, *row)
-                assert named["observation"][at].tolist() == pytest.approx(twin.observation(t, row))
-                assert before[at].tolist() == pytest.approx(twin.observation_before(t, row))
-                assert named["reward"][at].item() == pytest.approx(twin.reward(t, row))
-                assert named["hindsight"][at].tolist() == twin.message(t, row)
-                assert replaced[at].item() == twin.replaced(t, row)
-    assert after["reset_after"].equal(steps["next", "done"])
-    assert not after["valid"].all()
-    assert 0.2 < replaced.float().mean() < 0.9
-
-
-@both_layouts
-@pytest.mark.parametrize("order", ["generation", "arrival"])
 def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(group, order):
     reward, received = (next_key(key(group, name)) for name in ("reward", "received"))
 
     def recompute(_: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
         return {reward: (messages[..., 1:] > 0.3).float()}
 
-    collected = rollout(make_env(group, order=order), 60)
+    collected = rollout(make_env(group, Case(order=order)), 60)
     collected[reward] = recompute(collected, collected[received])[reward]
     storage = make_storage(group, recompute, hindsight_key=key(group, "hindsight"))
     buffer, known = ReplayBuffer(storage=storage), collected[reward].transpose(0, 1).clone()

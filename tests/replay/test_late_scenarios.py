@@ -15,10 +15,10 @@ from damian import keys
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.pipeline import make_env
+from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import CORRECTED, server_recompute
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
 
@@ -48,7 +48,7 @@ def backupdated(scenario: ScenarioConfig, actor: bool) -> tuple[TensorDictBase, 
     """Such steps as collected, and as corrected by all that has arrived after the last one, [T, B]."""
     env = training_env(scenario)
     corrected = ["reward", "critic", *["actor"] * actor]
-    late = has_message_delay(scenario)
+    late = scenario.delays.obs.late
     recompute = server_recompute(env.server, corrected, reward_terms=True) if late else None
     names = corrected if recompute else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in names])
@@ -104,11 +104,11 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     case, motion = CASES[name], "polynomial" if name in FLYING else "instant"
     scenario = everything(motion, episode=EpisodeConfig(max_steps=9), **case)
     on_time = replace(scenario, delay=replace(scenario.delay, obs=0, rew=0, order="generation"))
-    actor = scenario.links.kind == "server" and has_message_delay(scenario)
+    actor = scenario.links.kind == "server" and scenario.delays.obs.late
     rollouts = (*backupdated(scenario, actor), fly(training_env(on_time)))
     late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
     after = [keys.REWARD, keys.GLOBAL_OBSERVATION, *ENDS]
-    if has_message_delay(scenario):
+    if scenario.delays.obs.late:
         after += [(*keys.REWARD_TERMS, term) for term in scenario.reward.terms]
     corrected = [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]
     for key in corrected:
