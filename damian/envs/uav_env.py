@@ -318,10 +318,11 @@ class UavEnv(EnvBase):
         specs = make_composite_from_td(self.to_tensordict(found).select(*found), unsqueeze_null_shapes=False)
         for key, value in found.items():
             like: dict[str, Any] = {"shape": value.shape, "dtype": value.dtype, "device": self.device}
+            limits = (bounds or {}).get(key)
             if value.dtype == torch.bool:
                 specs[key] = Categorical(2, **like)
-            elif key in (bounds or {}):
-                specs[key] = Bounded(*(limit.expand(value.shape) for limit in (bounds or {})[key]), **like)
+            elif limits is not None:
+                specs[key] = Bounded(limits[0].expand(value.shape), limits[1].expand(value.shape), **like)
         return specs.to(self.device)
 
 

@@ -15,6 +15,7 @@ from damian.delays.line import BroadcastLine
 from damian.delays.samplers import MessageContext
 from damian.keys import STEPPED
 from damian.transforms.base import Change, Memory, StatefulTransform
+from damian.transforms.context import message_context
 from damian.transforms.entries import (
     Entries,
     add_spec,
@@ -222,16 +223,9 @@ class Channel(StatefulTransform):
         n, sender = self.agents[-1], memory["sender"]
         receiver = torch.arange(len(sender), device=sender.device) // n
         places = {"position": sender, "receiver_position": receiver}
-        clock = memory["clock"]
-        return MessageContext(
-            sender=sender % n,
-            receiver=receiver % n,
-            n_sending=sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n),
-            time=(clock - memory["reset_at"]) * self.dt,
-            uniform=counter_rng.uniform(memory["streams"], clock + 1),
-            dt=self.dt,
-            entries={} if position is None else {k: position.index_select(0, v) for k, v in places.items()},
-        )
+        read = {} if position is None else {k: position.index_select(0, v) for k, v in places.items()}
+        n_sending = sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n)
+        return message_context(memory, sender % n, receiver % n, n_sending, read, self.dt)
 
     def _may_send(self, memory: Memory, wants: Tensor) -> Tensor:
         """Draw who may send if not all may, [B, N] bool, among those who want to, [B, N] bool."""

@@ -53,17 +53,27 @@ class ContextReader:
         """The context of the messages ``sent`` [M] (None: all) in this step; None if the law sees none."""
         if not self._sees_context:
             return None
-        agents, streams, clock = memory["agents"], memory["streams"], memory["clock"]
+        agents, streams = memory["agents"], memory["streams"]
         n_sending = torch.full_like(streams, len(agents))
         if sent is not None:
             by_world = sent.view(-1, len(agents))
             n_sending = by_world.sum(-1, keepdim=True).expand_as(by_world).reshape(-1)
-        return MessageContext(
-            sender=agents.repeat(len(streams) // len(agents)),
-            receiver=torch.full_like(streams, -1),
-            n_sending=n_sending,
-            time=(clock + self._since_clock - memory["reset_at"]) * self._dt,
-            uniform=counter_rng.uniform(streams, clock + 1),
-            dt=self._dt,
-            entries={name: as_rows(entries[key], rows) for name, key in self.keys.items()},
-        )
+        sender, receiver = agents.repeat(len(streams) // len(agents)), torch.full_like(streams, -1)
+        read = {name: as_rows(entries[key], rows) for name, key in self.keys.items()}
+        return message_context(memory, sender, receiver, n_sending, read, self._dt, self._since_clock)
+
+
+def message_context(
+    memory: Memory,
+    sender: Tensor,
+    receiver: Tensor,
+    n_sending: Tensor,
+    entries: dict[str, Tensor],
+    dt: float,
+    since_clock: int = 0,
+) -> MessageContext:
+    """The context of M messages that are sent ``since_clock`` steps after the clock in a line's memory."""
+    clock = memory["clock"]
+    time = (clock + since_clock - memory["reset_at"]) * dt
+    uniform = counter_rng.uniform(memory["streams"], clock + 1)
+    return MessageContext(sender, receiver, n_sending, time, uniform, dt, entries)
