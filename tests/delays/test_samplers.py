@@ -8,7 +8,7 @@ from delay_twin import drawn
 from torch import Tensor
 
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Constant, Distance, Held, Lag, Law, Uniform
+from damian.delays.laws import Distance, Lag, Uniform
 from damian.delays.samplers import (
     ContextSampler,
     LinkSampler,
@@ -28,35 +28,6 @@ def require_share(found: Tensor, expected: float) -> None:
 
 
 # States.
-
-
-@pytest.mark.parametrize(
-    "law",
-    [
-        Burst(0.1, 0.2, good=1, bad=4),
-        Burst(0.1, 0.2, good=Uniform(0, 3), bad=2, good_loss=1.0, bad_loss=0.0),
-        Lag(Uniform(0, 3), "episode"),
-        Constant(2),
-    ],
-    ids=str,
-)
-def test_held_messages_are_as_late_as_the_longest_and_the_same_are_lost_from_the_first_draw_on(law: Law):
-    """From the state of the first draw, and after a reset in half of the rows, too."""
-    for loss in (0.0, 0.3):
-        free, held = law.sampler(loss=loss), Held(law).sampler(loss=loss)
-        assert (held.longest, held.loses) == (free.longest, free.loses)
-        assert held.constant_delay == (None if free.loses else free.longest)
-        streams, found = counter_rng.world_seeds(5, 500), []
-        for sampler in (free, held):
-            state = sampler.initial_state(streams)
-            for clock in range(1, 11):
-                if clock == 6:
-                    state = sampler.begin_episode(state, streams % 2 == 0)
-                delay, state = sampler(streams, torch.tensor(clock), state)
-                found.append((delay, state))
-        for (one, state), (other, held_state) in zip(found[:10], found[10:], strict=True):
-            assert other.equal(torch.where(one == free.lost, held.lost, held.longest))
-            assert held_state.equal(state)
 
 
 class Doubling(Sampler):

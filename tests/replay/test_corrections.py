@@ -1,10 +1,11 @@
-"""Back-updating with late rewards, sums of rewards and slow clocks, against a loop over a world's steps."""
+"""Back-updating in any environment, against a loop over a world's steps, and what a storage refuses."""
 
 import random
 
 import pytest
 import torch
 from remote import (
+    ENDS,
     GAMMA,
     LONGEST,
     WORLDS,
@@ -14,12 +15,14 @@ from remote import (
     key,
     make_env,
     make_storage,
+    recompute_of,
     rollout,
     stored,
 )
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.data import ReplayBuffer
-from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, GymEnv, MultiStepTransform, StepCounter, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.delays.laws import Uniform
@@ -143,3 +146,121 @@ def test_late_rewards_alone_are_credited_in_any_environment(window):
 def test_a_reward_delay_that_does_not_tell_its_delays_is_refused():
     with pytest.raises(InputError, match="RewardDelay: back-updating needs each delay"):
         corrections_of(Compose(ActionDelay(2), RewardDelay(2)), ["reward"])
+
+
+@both_layouts
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(group, order):
+    reward, received = (next_key(key(group, name)) for name in ("reward", "received"))
+
+    def recompute(_: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        return {reward: (messages[..., 1:] > 0.3).float()}
+
+    collected = rollout(make_env(group, Case(order=order)), 60)
+    collected[reward] = recompute(collected, collected[received])[reward]
+    storage = make_storage(group, recompute, hindsight_key=key(group, "hindsight"))
+    buffer, known = ReplayBuffer(storage=storage), collected[reward].transpose(0, 1).clone()
+    changed = torch.zeros_like(known, dtype=torch.bool)
+    for end in range(5, 65, 5):
+        buffer.extend(collected[:, end - 5 : end])
+        now = storage[storage.latest()]
+        changed[:end] |= now[reward] != known[:end]
+        known[:end] = now[reward]
+    assert now[key(group, "backupdated")].equal(changed)
+    replaced = (now[next_key(key(group, "hindsight"))] != now[received]).any(-1)
+    assert 0 < changed.float().mean() < 0.8 * replaced.float().mean()
+
+
+@both_layouts
+def test_what_was_known_at_the_time_stays_beside_hindsight(group):
+    collected = rollout(make_env(group), 40)
+    after = stored(make_storage(group, hindsight_key=key(group, "hindsight")), collected, 4)
+    names = {next_key(key(group, name)) for name in ("message", "received", "delay", "age")}
+    for name in names | set(ENDS) | {key(group, "received"), "action", "step_count", ("next", "step_count")}:
+        assert after[name].equal(collected[name].transpose(0, 1)), name
+    held, hindsight, sent = (
+        after[next_key(key(group, name))] for name in ("received", "hindsight", "message")
+    )
+    assert (hindsight == held).any()
+    assert (hindsight[..., 0] > held[..., 0]).any()  # numbers of messages grow
+    assert (hindsight[..., 0] >= held[..., 0]).all()
+    assert (hindsight[..., 0] <= sent[..., 0]).all()
+
+
+@both_layouts
+def test_the_ends_stay_if_recompute_returns_none(group):
+    reward = next_key(key(group, "reward"))
+
+    def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        return {reward: recompute_of(group)(steps, messages)[reward]}
+
+    collected = rollout(make_env(group), 40)
+    after, full = (stored(make_storage(group, f), collected, 4) for f in (recompute, None))
+    for name in ENDS:
+        assert after["next", name].equal(collected["next", name].transpose(0, 1))
+    assert after["valid"].all()
+    assert after["reset_after"].equal(after["next", "done"])
+    assert after[reward].equal(full[reward])
+    assert not after[reward].equal(collected[reward].transpose(0, 1))
+    name = key(group, "observation")
+    assert after[name].equal(collected[name].transpose(0, 1))
+
+
+# Mistakes.
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "message"),
+    [
+        ("message", "none", r"message_key: \('next', 'none'\) is not in the steps"),
+        ("step_count", "none", r"step_count_key: none is not in the steps: StepCounter\(\) writes it"),
+    ],
+)
+def test_a_missing_or_misshapen_entry_is_one_line(name, other, message):
+    with pytest.raises(InputError, match=message):
+        stored(make_storage((), **{f"{name}_key": other}), rollout(make_env(()), 8))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda entries: entries | {("next", "success"): entries["next", "reward"]},
+            "is not an entry after the steps",
+        ),
+        (lambda entries: {("next", "done"): entries["next", "done"]}, "are returned in part"),
+    ],
+)
+def test_a_mistake_in_recompute_is_one_line(change, message):
+    storage = make_storage((), lambda *arguments: change(recompute_of(())(*arguments)))
+    with pytest.raises(InputError, match=f"recompute: .*{message}"):
+        stored(storage, rollout(make_env(()), 8))
+
+
+def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused():
+    steps, storage = rollout(make_env(()), 8), make_storage(())
+    with pytest.raises(InputError, match="step_count grows from world to world"):
+        stored(make_storage(()), steps.transpose(0, 1))
+    stored(storage, steps)
+    for batch in (steps.transpose(0, 1), steps[:2]):
+        with pytest.raises(InputError, match=r"steps: a batch of shape \[.*\] is not one of 3 worlds: give"):
+            stored(storage, batch)
+    with pytest.raises(InputError, match=r"steps: a batch of shape \[24\] is not \[T, B\]"):
+        storage.set(range(24), steps.reshape(-1))
+    with pytest.raises(InputError, match="longest: -1 steps is not at least 0 steps"):
+        BackupdateStorage(10, recompute_of(()), -1)
+
+
+def test_a_storage_holds_a_batch_and_twice_the_longest_delay_or_is_refused():
+    steps, least = rollout(make_env(()), 8), 8 + 2 * LONGEST
+    names = {f"{name}_key": name for name in ("message", "received", "delay", "age")}
+    stored(BackupdateStorage(least * WORLDS, recompute_of(()), LONGEST, **names), steps)
+    with pytest.raises(InputError, match=f"{least} steps of {WORLDS} worlds need {least * WORLDS}"):
+        stored(BackupdateStorage((least - 1) * WORLDS, recompute_of(()), LONGEST, **names), steps)
+
+
+def test_steps_that_a_transform_has_joined_are_refused():
+    n_step = MultiStepTransform(n_steps=3, gamma=0.9)
+    buffer = ReplayBuffer(storage=make_storage(()), transform=n_step, batch_size=4)
+    with pytest.raises(InputError, match="MultiStepTransform joins steps before they are corrected"):
+        buffer.extend(rollout(make_env(()), 20))
