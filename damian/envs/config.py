@@ -32,7 +32,7 @@ class ClockConfig(Settings):
     )
     shortest: str | None = setting(None, "Shortest triggered period; ``trigger`` if not given.")
     longest: str | None = setting(None, "Longest triggered period; twice the first one if not given.")
-    skip: bool = setting(False, "Let a step last until some UAV can choose again .")
+    skip: bool = setting(False, "Let a step last until some UAV can choose again.")
     skip_discount: float = constant(
         1.0, "Discount within a step that ``skip`` makes longer; a training sets it.", low=0, high=1
     )
