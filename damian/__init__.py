@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from damian.delays.laws import Burst, Constant, Distance, Function, Geometric, Lag, Law, Trace, Uniform
     from damian.delays.samplers import ContextSampler, MessageContext, Sampler, TableSampler
     from damian.envs.config import ClockConfig, ScenarioConfig
+    from damian.envs.nodes import ServerNode
     from damian.envs.pipeline import make_env
     from damian.envs.uav_env import UavEnv
     from damian.learners.config import LearnerConfig, LearningSetup
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
         delay_trajectories,
         set_seed,
     )
-    from damian.transforms.server_node import ServerNode
     from damian.world.sensors import sensor
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
@@ -76,7 +76,7 @@ _MODULES = {
         "delay_trajectories",
         "set_seed",
     ],
-    "damian.transforms.server_node": ["ServerNode"],
+    "damian.envs.nodes": ["ServerNode"],
     "damian.world.sensors": ["sensor"],
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -16,7 +16,7 @@ from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError, naming_errors
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.pipeline import make_env
 from damian.learners.recurrent import add_recurrent_state
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, save_results
@@ -129,7 +129,7 @@ def report(
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
     succeeds = config.episode.success_share is not None
-    table = save_results(rows, folder, succeeds, has_message_delay(config), MEANING)
+    table = save_results(rows, folder, succeeds, config.delays.obs.late, MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
     return rows
 

@@ -21,12 +21,11 @@ from damian.common import checks
 from damian.common.errors import RunError
 from damian.common.fields import leaves
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import has_message_delay
+from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.learners.base import Learner, divergence
 from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import CORRECTED, server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt, end_interrupted
 from damian.runs.loggers import make_loggers
@@ -45,7 +44,6 @@ from .shared.settings import (
     backupdates,
     check_learning,
     learning_setup,
-    longest_delay,
     measures_hindsight,
 )
 
@@ -140,7 +138,7 @@ def corrected_storage(
     config: TrainConfig, env: DelayedEnv, corrected: Collection[str], size: int, worlds: int
 ) -> BackupdateStorage:
     """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct steps."""
-    late_messages = has_message_delay(config)
+    late_messages = config.delays.obs.late
     corrected = corrected if late_messages else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
     # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
@@ -149,7 +147,7 @@ def corrected_storage(
     return BackupdateStorage(
         size + sum(correction.lookback for correction in corrections) * worlds,
         server_recompute(env.server, corrected) if late_messages else None,
-        longest_delay(config),
+        config.delays.longest,
         corrections=corrections,
         hindsight_key=keys.HINDSIGHT if hindsight else None,
         device=config.device,
@@ -161,7 +159,7 @@ def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns 
     if not measures_hindsight(config):
         return None
     worlds = min(config.worlds, HindsightReturns.WORLDS)
-    size = (learning_setup(config).longest_period + 2 * longest_delay(config)) * worlds
+    size = (learning_setup(config).longest_period + 2 * config.delays.longest) * worlds
     return HindsightReturns(corrected_storage(config, env, ["reward"], size, worlds), worlds)
 
 

@@ -1,16 +1,19 @@
-"""The cases on which the contract of the transforms is checked, and an environment that passes gradients."""
+"""The transforms and environments on which the contract is checked, and an environment of moving points."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import pytest
 import torch
-from environments import KINDS
+from environments import KINDS, Kind
 from helpers import square, walking
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
+from damian.delays.laws import Uniform
+from damian.envs.nodes import Belief, ServerNode
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
 from damian.transforms import (
@@ -22,11 +25,11 @@ from damian.transforms import (
     ObservationTimeline,
     RewardDelay,
     SampleAndHold,
+    StatefulTransform,
     set_seed,
 )
-from damian.transforms.server_node import Belief, ServerNode
 
-LATE = {"law": "uniform", "low": 1, "high": 3}
+LATE = Uniform(1, 3)
 ACTION, OBSERVATION, REWARD = ("agents", "action"), ("agents", "observation"), ("agents", "reward")
 
 
@@ -112,7 +115,6 @@ def _server_node() -> Transform:
 
 CASES = {
     "Belief": Case(uavs, _belief),
-    "ActionDelay, one world": Case(cartpole, lambda: ActionDelay(LATE)),
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
     "ActionDelay, two entries": Case(Servos, lambda: ActionDelay(LATE, ["place", "gear"], loss=0.2)),
     "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
@@ -121,12 +123,10 @@ CASES = {
     "ActionHistory, agents": Case(
         uavs, lambda: ActionHistory(2, ACTION, append_to=OBSERVATION, recorded_key="ready")
     ),
-    "SampleAndHold, one world": Case(cartpole, lambda: SampleAndHold(3)),
     "SampleAndHold, worlds": Case(Drift, lambda: SampleAndHold(2, in_keys_inv=["action"])),
     "SampleAndHold, agents": Case(
         uavs, lambda: SampleAndHold("2s", [OBSERVATION], [ACTION], ready_key=("agents", "ready"))
     ),
-    "CumulativeReward, one world": Case(cartpole, lambda: CumulativeReward(3)),
     "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
     "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),
     "ObservationTimeline, one world": Case(cartpole, lambda: ObservationTimeline(3)),
@@ -177,3 +177,51 @@ def begun(env: EnvBase, n_steps: int = 5, seed: int = 0) -> TensorDictBase:
 def memory(transform: Transform) -> list[Tensor]:
     """All tensors that a transform remembers."""
     return [value for value in transform.state_dict().values() if value is not None]
+
+
+# Every transform on every kind of environment.
+
+GROUPS = {name: kind for name, kind in KINDS.items() if isinstance(kind.observation, tuple)}
+"""Kinds whose observations are those of a group of agents, for ``Channel``."""
+
+
+def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
+    return ObservationDelay(law, kind.observation, fresh_key="fresh", delay_key="delay", **options)
+
+
+TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
+    "ObservationDelay": observation_delay,
+    "ActionDelay": lambda kind, law, **options: ActionDelay(law, kind.action, **options),
+    "RewardDelay": lambda kind, law, **options: RewardDelay(
+        law, kind.reward, delay_key="reward_delay", earned_key="earned_reward", **options
+    ),
+    "CumulativeReward": lambda kind, law, **options: CumulativeReward(3, 0.5, kind.reward, **options),
+    "ActionHistory": lambda kind, law, **options: ActionHistory(3, kind.action, **options),
+    "SampleAndHold": lambda kind, law, **options: SampleAndHold(2, kind.observation, **options),
+}
+every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+def channel(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
+    """A channel between the agents of a group; it works only where there is one."""
+    return Channel(law, kind.observation, loss=0.1, **options)
+
+
+PAIRS = {f"{name} on {kind}": (KINDS[kind], make) for kind in KINDS for name, make in TRANSFORMS.items()} | {
+    f"Channel on {name}": (kind, channel) for name, kind in GROUPS.items()
+}
+"""Every kind of environment with every transform, and with a channel where that works."""
+DRAWING = {name: pair for name, pair in PAIRS.items() if name.partition("Delay")[1] or pair[1] is channel}
+drawing = pytest.mark.parametrize(("kind", "make"), DRAWING.values(), ids=DRAWING)
+
+
+def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> list[TensorDictBase]:
+    """Outputs of every step and every reset, with actions drawn from torch's generator."""
+    if seed is not None:
+        torch.manual_seed(seed)
+        set_seed(env, seed)
+    td, outputs = env.reset(), []
+    for _ in range(n_steps):
+        after, td = env.step_and_maybe_reset(env.rand_action(td))
+        outputs += [after["next"].clone(), td.clone()]
+    return outputs

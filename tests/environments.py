@@ -81,12 +81,12 @@ def vmas(num_envs: int = 2, n_agents: int = 2, max_steps: int = 4, **options: An
     return VmasEnv("navigation", seed=0, **sizes, **options)
 
 
-def petting_zoo() -> EnvBase:
+def petting_zoo(n_agents: int = 2) -> EnvBase:
     """A PettingZoo environment without batch dimensions, with a state at the root and flags in the group."""
     spread = pytest.importorskip("mpe2.simple_spread_v3")
     from torchrl.envs.libs.pettingzoo import PettingZooWrapper  # noqa: PLC0415
 
-    options = {"N": 2, "max_cycles": 4, "continuous_actions": True}
+    options = {"N": n_agents, "max_cycles": 4, "continuous_actions": True}
     return PettingZooWrapper(spread.parallel_env(**options), return_state=True, seed=0)
 
 

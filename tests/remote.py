@@ -2,7 +2,7 @@
 slow twin of back-updating."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -14,9 +14,10 @@ from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEn
 from damian.delays.laws import Uniform
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage
-from damian.transforms import ObservationDelay
+from damian.transforms import CumulativeReward, ObservationDelay, RewardDelay, SampleAndHold
 
 LONGEST, WORLDS, AGENTS, LIMIT = 5, 3, 2, 12
+GAMMA = 0.7
 GROUPS = [(), ("agents",)]
 ENDS = ("done", "terminated", "truncated")
 both_layouts = pytest.mark.parametrize("group", GROUPS, ids=["root", "group"])
@@ -102,11 +103,29 @@ class Receiver(Transform):
         return next_tensordict
 
 
-def make_env(group: tuple[str, ...], loss: float = 0.1, order: str = "generation") -> TransformedEnv:
-    sent, received = key(group, "message"), key(group, "received")
-    law = Uniform(0, LONGEST)
-    delay = ObservationDelay(law, [sent], [received], loss=loss, order=order, delay_key="delay", seed=3)
-    return TransformedEnv(Remote(group), Compose(delay, StepCounter(), Receiver(group)))
+class Case(NamedTuple):
+    """How late rewards are, how many are summed, and how slow the receiver's clock is."""
+
+    latest: int | None = None
+    window: int = 1
+    period: int = 1
+    loss: float = 0.1
+    order: str = "generation"
+
+
+def make_env(group: tuple[str, ...], case: Case = Case()) -> TransformedEnv:  # noqa: B008 (never changed)
+    """The environment with late messages and what a case says."""
+    message, received, reward = (key(group, name) for name in ("message", "received", "reward"))
+    told = {"loss": case.loss, "order": case.order, "delay_key": "delay", "seed": 3}
+    transforms = [ObservationDelay(Uniform(0, LONGEST), [message], [received], **told)]
+    transforms += [StepCounter(), Receiver(group)]
+    if case.latest is not None:
+        transforms.append(RewardDelay(Uniform(0, case.latest), reward, delay_key="reward_delay", seed=4))
+    if case.window > 1:
+        transforms.append(CumulativeReward(case.window, GAMMA, reward))
+    if case.period > 1:
+        transforms.append(SampleAndHold(case.period, [key(group, "observation")]))
+    return TransformedEnv(Remote(group), Compose(*transforms))
 
 
 def rollout(env: TransformedEnv, n_steps: int) -> TensorDictBase:
@@ -139,8 +158,8 @@ def stored(storage: BackupdateStorage, steps: TensorDictBase, parts: int = 1) ->
 class Twin:
     """What a receiver knows of the stored steps [T, B] of one world after the last of them, step by step."""
 
-    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...]) -> None:
-        self.steps, self.group, self.T = steps[:, world], group, len(steps)
+    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...], case: Case) -> None:
+        self.steps, self.group, self.T, self.case = steps[:, world], group, len(steps), case
         self.senders = [(i,) for i in range(AGENTS)] if group else [()]
         self.start = [t - int(self.steps["step_count"][t]) for t in range(self.T)]
         self.newest = [[self._newest(t, row) for row in self.senders] for t in range(self.T)]
@@ -172,14 +191,34 @@ class Twin:
         number, draw = self.message(t, row)
         return [3 * number, 3 * draw, number]
 
-    def observation_before(self, t: int, row: tuple[int, ...]) -> list[float]:
-        if t == self.start[t]:
-            return self.steps[key(self.group, "observation")][(t, *row)].tolist()
-        return self.observation(t - 1, row)
-
     def reward(self, t: int, row: tuple[int, ...]) -> float:
         return self.message(t, row)[1] + t - self.start[t] + 1
 
-    def replaced(self, t: int, row: tuple[int, ...]) -> bool:
-        age = int(self.steps[next_key(key(self.group, "age"))][(t, *row)])
-        return self.newest[t][self.senders.index(row)] > t - age
+    def paid(self, t: int, row: tuple[int, ...]) -> bool:
+        """Has the reward that step t earned been received by the last step."""
+        if self.case.latest is None:
+            return True
+        delay = int(self.steps[next_key(key(self.group, "reward_delay"))][(t, *row)])
+        for later in range(t, self.T):
+            if self.start[later] != self.start[t]:
+                return False
+            if later - t >= delay or self.steps["next", "done"][later]:
+                return True
+        return False
+
+    def summed(self, t: int, row: tuple[int, ...]) -> float:
+        """The reward after the step: eq. 4 of the rewards that have been received."""
+        latest = range(max(self.start[t], t - self.case.window + 1), t + 1)
+        return sum(GAMMA ** (t - g) * self.reward(g, row) for g in latest if self.paid(g, row))
+
+    def held(self, t: int, row: tuple[int, ...]) -> list[float]:
+        """The observation after the step: that of the latest tick, or of the reset."""
+        tick = t - (t - self.start[t] + 1) % self.case.period
+        if tick < self.start[t]:
+            return self.steps[key(self.group, "observation")][(self.start[t], *row)].tolist()
+        return self.observation(tick, row)
+
+    def held_before(self, t: int, row: tuple[int, ...]) -> list[float]:
+        if t == self.start[t]:
+            return self.steps[key(self.group, "observation")][(t, *row)].tolist()
+        return self.held(t - 1, row)

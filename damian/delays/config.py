@@ -10,7 +10,7 @@ from damian.common.fields import Settings, setting
 
 LONGEST = 10_000
 """Longest delay allowed [steps], because every message in transit takes memory."""
-LAWS = "{law: uniform, low: 3s, high: 7s}"
+_EXAMPLE = "{law: uniform, low: 3s, high: 7s}"
 
 
 @dataclass
@@ -24,7 +24,7 @@ class DelayConfig(Settings):
 
     section: ClassVar[str] = "delay"
 
-    obs: Any = setting(0, f"Delay of messages to the server: 3 (steps), 3s, or {LAWS}.")
+    obs: Any = setting(0, f"Delay of messages to the server: 3 (steps), 3s, or {_EXAMPLE}.")
     act: Any = setting(0, "Delay of actions, written as ``obs``; a UAV holds until the first one arrives.")
     rew: Any = setting(0, "Delay of rewards, written as ``obs``; none may be lost.")
     loss: float = setting(0.0, "Probability that a message to the server node is lost.", low=0, high=1)
@@ -83,7 +83,7 @@ class LinkConfig(Settings):
         both = self.range is not None and self.hears is not None
         self.refuse(both, "range", "does not go with links.hears: leave out one of them")
 
-    def check(self, n_agents: int) -> None:
+    def check_pairs(self, n_agents: int) -> None:
         """Check what is given for each pair of UAVs."""
         self.refuse(self.hears is not None and not is_matrix(self.hears), "hears", "is not a list")
         for name in ("delay", "loss", "hears"):

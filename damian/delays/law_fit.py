@@ -1,12 +1,13 @@
 """Which delay law repeats recorded delays best: maximum likelihood, compared by BIC (Schwarz, 1978)."""
 
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from damian.delays.laws import sampler_of
+from damian.delays.samplers import TableSampler
 
 LOST_STEPS, NO_MESSAGE = -1, -2
 """Marks among delays: a message that never arrives, and none, after the end of a sequence."""
@@ -76,7 +77,8 @@ def _memoryless(counts: Integers) -> LawFit:
         laws = [({"law": "uniform", "low": low, "high": high}, 2), ({"law": "uniform", **late}, 3)]
         laws.append(({"law": "geometric", "mean": round(float(mean), 5), "longest": high}, 2))
     for law, k in laws:
-        table, chances = sampler_of(law, loss=loss).chances[0].numpy(), np.zeros(len(counts))
+        sampler, chances = cast(TableSampler, sampler_of(law, loss=loss)), np.zeros(len(counts))
+        table = sampler.chances[0].numpy()
         chances[: len(table) - 1], chances[-1] = table[:-1], table[-1]
         fits.append(LawFit(law, chances, _likelihood(counts, chances), k + (0 < loss < 1), n, round(loss, 5)))
     return min(fits, key=attrgetter("bic"))

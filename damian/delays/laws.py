@@ -1,5 +1,6 @@
 """Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"133ms"``)."""
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -52,8 +53,14 @@ class Law(ABC):
 
 
 def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-    """Build the sampler of a law, or of what ``law_of`` takes; the arguments are those of ``Law.sampler``."""
+    """Build the sampler of a law, or of what ``law_of`` takes; the arguments are those of ``Law.sampler``.
+
+    A sampler is copied: transforms share none, because each may move to a device of its own.
+    """
     checks.above("dt", dt, 0.0, "s")
+    if isinstance(written, Sampler):
+        checks.require(loss == 0, "loss", loss, "does not go with a sampler, which has the losses of its own")
+        return copy.deepcopy(written)
     law = law_of(written, key)
     for name, rule in rules(type(law)).items():
         value = getattr(law, name)
@@ -381,7 +388,8 @@ def law_of(written: Any, key: str = "delay") -> Law:
 def _memoryless(written: Any, dt: float, loss: float, key: str) -> list[float]:
     """Probabilities of the delays 0, 1, ... of a law from which another law draws."""
     inner = sampler_of(written, dt, loss, key)
-    checks.require(inner.memoryless, key, written, "is not a memoryless law")
+    if not isinstance(inner, TableSampler) or len(inner.chances) > 1:
+        raise InputError(f"{key}: {written} is not a memoryless law")
     return inner.chances[0].tolist()[:-1]
 
 
@@ -407,7 +415,7 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     ``delay[receiver][sender]`` is the law of a link; the diagonal is not used.
     """
     n = same_size({key: delay, "loss": loss})
-    if n is None:
+    if n is None or isinstance(delay, Sampler):
         return sampler_of(delay, dt, loss, key)
     by_link = is_matrix(delay)
     distinct: list[Law] = []

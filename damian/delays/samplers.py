@@ -1,5 +1,6 @@
 """Samplers draw one delay per message: pure functions of random streams, clocks and contexts."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
@@ -52,10 +53,6 @@ class Sampler(nn.Module, ABC):
     """Names of the entries that the context contains where the transform has a key for them."""
     same_draws_for_all_agents: bool = False
     """Whether all agents of a world draw the same numbers."""
-    memoryless: bool = False
-    """Whether all delays are drawn independently by the same probabilities, ``chances``."""
-    chances: Tensor
-    """Probabilities of the delays 0, 1, ... and, last, of a loss, [S, longest + 2]; not of every sampler."""
     constant_delay: int | None = None
     """The delay [steps] if it is always the same and no message is lost, else None."""
 
@@ -67,6 +64,11 @@ class Sampler(nn.Module, ABC):
         """Delay value that marks a message that never arrives."""
         self.loses = loses or loss > 0
         """Whether messages can be lost."""
+
+    @property
+    def late(self) -> bool:
+        """Whether a message can be late or lost."""
+        return self.constant_delay != 0
 
     def initial_state(self, streams: Tensor) -> Tensor:
         """The state of each sender before its first message [M, ...], from its random stream [M]."""
@@ -107,6 +109,8 @@ class TableSampler(Sampler):
         loss: probability that a message is lost, whatever its delay.
     """
 
+    chances: Tensor
+    """Probabilities of the delays 0, 1, ... and, last, of a loss, [S, longest + 2]."""
     _boundaries: Tensor
 
     def __init_subclass__(cls) -> None:
@@ -125,7 +129,6 @@ class TableSampler(Sampler):
         chances = torch.cat([arrive, rest.where(rest > _ROUNDING, 0.0)], -1)
         self.register_buffer("chances", chances, persistent=False)
         self.loses = bool((chances[:, -1] > 0).any())
-        self.memoryless = len(states) == 1
         likeliest = int(chances[0, :-1].argmax())
         if bool((chances[:, likeliest] == 1).all()):
             self.constant_delay = likeliest
@@ -189,14 +192,10 @@ class HeldSampler(Sampler):
 
     def __init__(self, drawn: Sampler) -> None:
         super().__init__(drawn.longest, drawn.loses)
-        self.drawn, self.memoryless = drawn, drawn.memoryless
-        self.sees_context, self.reads = drawn.sees_context, drawn.reads
+        self.drawn, self.sees_context, self.reads = drawn, drawn.sees_context, drawn.reads
         self.optional_reads = drawn.optional_reads
         self.same_draws_for_all_agents = drawn.same_draws_for_all_agents
         self.constant_delay = None if self.loses else self.longest
-        if self.memoryless:
-            lost = drawn.chances[:, -1]
-            self.chances = torch.stack([torch.zeros_like(lost)] * self.longest + [1 - lost, lost], -1)
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return self.drawn.initial_state(streams)
@@ -321,7 +320,7 @@ class LinkSampler(Sampler):
     def __init__(self, samplers: Sequence[Sampler], law_index: Tensor, loss: Tensor) -> None:
         loses = any(sampler.loses for sampler in samplers) or bool((loss > 0).any())
         super().__init__(max(sampler.longest for sampler in samplers), loses)
-        self.samplers = nn.ModuleList(samplers)
+        self.n_agents, self.samplers = math.isqrt(len(law_index)), nn.ModuleList(samplers)
         self.sees_context = any(sampler.sees_context for sampler in samplers)
         self.reads = tuple(dict.fromkeys(name for sampler in samplers for name in sampler.reads))
         self._loses_on_links = bool((loss > 0).any())

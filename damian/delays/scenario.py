@@ -1,47 +1,57 @@
-"""The delay laws of a scenario and of its links, as the settings say."""
+"""The delays of a scenario as one object, whose laws are resolved once from the settings."""
 
 from damian import keys
 from damian.common import checks
-from damian.delays.config import DelayConfig, LinkConfig, is_matrix
-from damian.delays.laws import LOSES, Held, Law, law_of, sampler_of
-from damian.delays.samplers import Sampler
+from damian.delays.config import DelayConfig, LinkConfig
+from damian.delays.laws import LOSES, link_sampler, sampler_of
+from damian.delays.samplers import HeldSampler, Sampler
 
 CONTEXT_KEYS = {"position": keys.POSITION}
 """TensorDict keys of the entries that a delay law of a scenario may read, by the name in ``reads``."""
-DELAYED = ("obs", "act", "rew")
-"""What a scenario delays: messages, actions, rewards."""
 
 
-def delay_law(delay: DelayConfig, name: str) -> Law:
-    """The law of ``act``, of ``rew``, or of ``obs`` with ``hold`` applied."""
-    law = law_of(getattr(delay, name), f"delay.{name}")
-    return Held(law) if name == "obs" and delay.hold == "max" else law
+class ScenarioDelays:
+    """The samplers of all that can be late in a scenario; ``ScenarioConfig.delays`` makes it once.
+
+    Raises ``InputError`` if a law is wrong, reads what no message carries, or loses rewards.
+    """
+
+    def __init__(self, delay: DelayConfig, links: LinkConfig, dt: float) -> None:
+        obs = sampler_of(delay.obs, dt, delay.loss, "delay.obs")
+        self.obs: Sampler = HeldSampler(obs) if delay.hold == "max" else obs
+        """Of the messages to the server, with their losses, and as the server holds them back."""
+        self.act, self.rew = (sampler_of(getattr(delay, n), dt, key=f"delay.{n}") for n in ("act", "rew"))
+        """Of the actions, and of the rewards, of which none is lost."""
+        self.links = link_sampler(links.delay, links.loss, dt, "links.delay")
+        """Of what the UAVs receive from the server (updown), or from each other (matrix)."""
+        checks.require(not self.rew.loses, "delay.rew", delay.rew, LOSES)
+        laws = {
+            "delay.obs": self.obs,
+            "delay.act": self.act,
+            "delay.rew": self.rew,
+            "links.delay": self.links,
+        }
+        for key, sampler in laws.items():
+            known = [
+                *CONTEXT_KEYS,
+                *["receiver_position"] * (key == "links.delay" and links.kind == "matrix"),
+            ]
+            for name in sampler.reads:
+                problem = f"reads {name}, but a law can read only {', '.join(known)}"
+                checks.require(name in known, key, type(sampler).__name__, problem)
+        self.reads_positions = links.range is not None or any(sampler.reads for sampler in laws.values())
+        """Whether a law, or the range of the links, needs to know where the UAVs are."""
+
+    @property
+    def longest(self) -> int:
+        """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
+        return max(self.obs.longest, self.rew.longest)
 
 
-def delay_sampler(delay: DelayConfig, name: str, dt: float) -> Sampler:
-    """The sampler of this law for steps of ``dt`` seconds, without the losses of ``loss``."""
-    return sampler_of(delay_law(delay, name), dt, key=f"delay.{name}")
-
-
-def delay_reads(delay: DelayConfig, dt: float) -> set[str]:
-    """Names of the entries that the laws read in the contexts of messages."""
-    return {read for name in DELAYED for read in delay_sampler(delay, name, dt).reads}
-
-
-def check_laws(delay: DelayConfig, dt: float) -> None:
-    """Check that every law is valid for steps of ``dt`` seconds."""
-    for name in DELAYED:
-        for read in delay_sampler(delay, name, dt).reads:
-            problem = f"reads {read}, but a law can read only {', '.join(CONTEXT_KEYS)}"
-            checks.require(read in CONTEXT_KEYS, f"delay.{name}", getattr(delay, name), problem)
-    checks.require(not delay_sampler(delay, "rew", dt).loses, "delay.rew", delay.rew, LOSES)
-
-
-def link_reads(links: LinkConfig, dt: float) -> set[str]:
-    """Names of the entries that the links read: what their laws do, and positions for a range."""
-    written = {"links.delay": links.delay}
-    if is_matrix(links.delay):
-        rows = [enumerate(row) for row in links.delay]
-        written = {f"links.delay[{i}][{j}]": law for i, row in enumerate(rows) for j, law in row}
-    read = {name for key, law in written.items() for name in sampler_of(law, dt, key=key).reads}
-    return read | ({"position"} if links.range is not None else set())
+def delays_of(delay: DelayConfig, links: LinkConfig, dt: float) -> ScenarioDelays:
+    """The delays of these settings, which ``delay`` keeps for as long as none of them changes."""
+    kept, written = vars(delay).setdefault("_delays", {}), repr((delay, links, dt))
+    if written not in kept:
+        kept.clear()
+        kept[written] = ScenarioDelays(delay, links, dt)
+    return kept[written]

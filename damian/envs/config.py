@@ -3,13 +3,16 @@
 import itertools
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import WorldConfig
+
+if TYPE_CHECKING:
+    from damian.delays.scenario import ScenarioDelays
 
 
 @dataclass
@@ -29,7 +32,7 @@ class ClockConfig(Settings):
     )
     shortest: str | None = setting(None, "Shortest triggered period; ``trigger`` if not given.")
     longest: str | None = setting(None, "Longest triggered period; twice the first one if not given.")
-    skip: bool = setting(False, "Let a step last until some UAV can choose again (``SkipUntilReady``).")
+    skip: bool = setting(False, "Let a step last until some UAV can choose again.")
     skip_discount: float = constant(
         1.0, "Discount within a step that ``skip`` makes longer; a training sets it.", low=0, high=1
     )
@@ -84,7 +87,7 @@ class ScenarioConfig(WorldConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.links.check(self.agents)
+        self.links.check_pairs(self.agents)
         links, observation, episode = self.links.kind, self.observation, self.episode
         problem = "does not go with clock.server: between two broadcasts no observation changes"
         self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)
@@ -107,6 +110,13 @@ class ScenarioConfig(WorldConfig):
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
         problem = "needs source.motion=dynamic and source.after_walk=stop"
         self.refuse(episode.end_with_source and not stops, "episode.end_with_source", problem)
+
+    @property
+    def delays(self) -> "ScenarioDelays":
+        """The samplers of all delays; laws are resolved at the first use, and again if settings change."""
+        from damian.delays.scenario import delays_of  # noqa: PLC0415 (settings load without torch)
+
+        return delays_of(self.delay, self.links, self.clock.dt)
 
     @property
     def seeks_source(self) -> bool:

@@ -1,11 +1,11 @@
 """A transformed environment that steps with its transforms as one compiled graph."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from typing import Any, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform, TransformedEnv
 
@@ -13,21 +13,57 @@ from damian import keys
 from damian.common import devices
 from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask, tree_where
+from damian.envs.nodes import WorldTransform
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
-from damian.transforms.base import Entries, Memory, StatefulTransform, act, begin, observe, select_entries
-from damian.transforms.hold import SkipUntilReady
+from damian.transforms.base import Memory, StatefulTransform
+from damian.transforms.entries import Entries, select_entries
 from damian.world.state import PackedState
 
 _BASE = "base_env."
 """Begin of the keys of the base environment in a ``state_dict``."""
 
 
+class Skip(NamedTuple):
+    """A step lasts until some agent can choose an action again, or the episode ends (``clock.skip``).
+
+    The outputs equal, bit for bit, those of stepping until then with actions that no agent executes. Only the
+    rewards ``reward_keys`` are the sums of gamma^k r_k over the merged steps k = 0, 1, ..., and ``duration``
+    is the number of these steps, as in a semi-Markov decision process (Sutton, Precup and Singh, 1999).
+    """
+
+    gamma: float
+    reward_keys: Sequence[NestedKey]
+
+    def skipped_worlds(self, outputs: Outputs) -> Tensor:
+        """Worlds in which no agent is ready after a step and the episode goes on, [B] bool."""
+        return ~(outputs[keys.READY].flatten(1).any(-1) | outputs[keys.DONE].view(-1))
+
+    def merged(self, outputs: Outputs, later: Outputs, stepped: Tensor) -> Outputs:
+        """The outputs with those of a later step in the worlds ``stepped`` [B] that took it."""
+        duration = outputs[keys.DURATION]
+        weight = (self.gamma**duration).view(-1)
+        sums = {k: outputs[k] + expand_mask(weight, later[k]) * later[k] for k in self.reward_keys}
+        later = later | sums | {keys.DURATION: duration + 1}
+        return {key: torch.where(expand_mask(stepped, new), new, outputs[key]) for key, new in later.items()}
+
+
 class DelayedEnv(TransformedEnv):
-    """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function, with equal results."""
+    """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function, with equal results.
+
+    ``step_fn`` and ``reset_fn`` are that function: pure, of the worlds and of the transforms' memories. All
+    leading transforms of damian's step in it; those after them, and steps of some worlds only (TorchRL's
+    ``_step``), go through TorchRL's hooks. With ``skip``, whose ``UavEnv`` outputs the extra ``duration``,
+    transforms that are appended later see only the merged steps: ``StepCounter`` then counts decisions.
+    """
 
     _compiled: CompiledMethods | None = None
     """The compiled methods; None if nothing is compiled."""
+
+    def __init__(self, env: UavEnv, transform: Compose, skip: Skip | None = None) -> None:
+        n_transforms = len(transform)
+        super().__init__(env, transform)
+        self.skip, self._n_skipping = skip, n_transforms
 
     @property
     def uav_env(self) -> UavEnv:
@@ -39,19 +75,19 @@ class DelayedEnv(TransformedEnv):
         """The server node that environment, transforms, replay storage and evaluation share."""
         return self.uav_env.server
 
+    # Seeds, checkpoints and compiling.
+
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed the worlds and the transforms, all from one seed."""
-        for module in self.transform.modules():
-            if isinstance(module, StatefulTransform):
-                module.set_seed(seed)
+        for module in self._stateful_modules():
+            module.set_seed(seed)
         return super().set_seed(seed, static_seed)
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world [B] its own random streams: it evolves the same alone as among others."""
         self.uav_env.seed_worlds(seeds)
-        for module in self.transform.modules():
-            if isinstance(module, StatefulTransform):
-                module.seed_worlds(seeds)
+        for module in self._stateful_modules():
+            module.seed_worlds(seeds)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
         """The state of the transforms and of the environment under them; an equal one continues with it."""
@@ -65,10 +101,12 @@ class DelayedEnv(TransformedEnv):
         others = OrderedDict((k, value) for k, value in state_dict.items() if not k.startswith(_BASE))
         if base:
             self.base_env.load_state_dict(base, **kwargs)
-            for module in self.transform.modules():
-                if isinstance(module, StatefulTransform):
-                    module.leave_episode()
+            for module in self._stateful_modules():
+                module.leave_episode()
         super().load_state_dict(others, **kwargs)
+
+    def _stateful_modules(self) -> list[StatefulTransform]:
+        return [module for module in self.transform.modules() if isinstance(module, StatefulTransform)]
 
     def compile(self, **options: Any) -> "DelayedEnv":
         """Compile a step with its transforms as one graph; ``options`` are for ``torch.compile``."""
@@ -83,153 +121,158 @@ class DelayedEnv(TransformedEnv):
             tensordict.set(key, self.full_action_spec[key].rand())
         return tensordict
 
-    def _method(self, name: str, *variant: Any) -> Callable[..., Any]:
-        """The method of this name, compiled if ``compile`` was called: a graph for each variant."""
-        method = getattr(self, name)
-        return method if self._compiled is None else self._compiled.get(method, *variant)
+    # Pure functions of worlds and memories, which can be compiled.
 
+    def step_fn(
+        self, worlds: PackedState, memories: list[Memory], entries: Entries, stepped: Tensor | None = None
+    ) -> tuple[PackedState, list[Memory], Outputs]:
+        """One step, in the worlds ``stepped`` [B] or all.
+
+        Inputs pass the transforms backwards, outputs forwards. ``entries`` are those that a policy has
+        written, and those that it has read.
+        """
+        transforms, changed = self._fused(), list(memories)
+        extra: Entries = {} if stepped is None else {keys.STEPPED: stepped}
+        entries = entries | extra
+        for i, transform in reversed([*enumerate(transforms)]):
+            changed[i], written = transform.on_action(changed[i], entries)
+            entries = entries | written
+        worlds, outputs = self.uav_env.step_fn(worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID))
+        for i, transform in enumerate(transforms):
+            changed[i], written = transform.on_step(changed[i], outputs | extra)
+            outputs = outputs | written
+        return worlds, changed, _without_dropped(outputs, transforms)
+
+    def reset_fn(
+        self, worlds: PackedState, memories: list[Memory], mask: Tensor
+    ) -> tuple[PackedState, list[Memory], Outputs]:
+        """Begin new episodes in the worlds of the mask [B] bool."""
+        transforms, changed = self._fused(), list(memories)
+        worlds, outputs = self.uav_env.reset_fn(worlds, mask)
+        for i, transform in enumerate(transforms):
+            changed[i], written = transform.on_reset(changed[i], outputs, transform.expand_worlds(mask))
+            outputs = outputs | written
+        return worlds, changed, _without_dropped(outputs, transforms)
+
+    def step_and_reset_fn(
+        self, worlds: PackedState, memories: list[Memory], entries: Entries
+    ) -> tuple[PackedState, list[Memory], Outputs, Outputs]:
+        """One step, and a reset of the worlds that it ends: also the outputs that begin the next step."""
+        worlds, memories, outputs = self.step_fn(worlds, memories, entries)
+        following = {key: value for key, value in outputs.items() if key != keys.REWARD}
+        done = outputs[keys.DONE]
+        if torch.compiler.is_compiling() or not devices.data_dependent(done.device) or done.any():
+            mask = done.view(-1)
+            worlds, memories, first = self.reset_fn(worlds, memories, mask)
+            following |= {
+                k: torch.where(expand_mask(mask, new), new, following[k]) for k, new in first.items()
+            }
+        return worlds, memories, outputs, following
+
+    def further_step_fn(
+        self, worlds: PackedState, memories: list[Memory], entries: Entries, outputs: Outputs, stepped: Tensor
+    ) -> tuple[PackedState, list[Memory], Outputs]:
+        """One more step of the worlds of the mask ``stepped`` [B], which have no ready agent; others stay."""
+        # Flags such as ``ready`` are those after the latest step.
+        entries = entries | {key: outputs[key] for key in entries if key in outputs}
+        new_worlds, new_memories, new_outputs = self.step_fn(worlds, memories, entries, stepped)
+        triples = zip(self._fused(), memories, new_memories, strict=True)
+        memories = [transform.merge_worlds(old, new, stepped) for transform, old, new in triples]
+        outputs = cast(Skip, self.skip).merged(outputs, new_outputs, stepped)
+        return tree_where(stepped, new_worlds, worlds), memories, outputs
+
+    def _fused(self) -> list[StatefulTransform]:
+        return self._split_transforms()[0]
+
+    def _split_transforms(self) -> tuple[list[StatefulTransform], list[Transform]]:
+        """The leading stateful transforms that step in one function, and every transform after them."""
+        transforms: list[Any] = [*cast(Compose, self.transform)]
+        most = self._n_skipping if self.skip else len(transforms)
+        n = next((i for i, t in enumerate(transforms) if not isinstance(t, StatefulTransform)), most)
+        return transforms[: min(n, most)], transforms[min(n, most) :]
+
+    # Methods that TorchRL calls.
+
+    @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if "_step" in tensordict or "next" in tensordict:
+            if self.skip:
+                raise RuntimeError("clock.skip: all worlds step together, so '_step' and 'next' mean nothing")
             return super()._step(tensordict)
-        stateful, others = self._split_transforms()
+        fused, others = self._split_transforms()
         if others:
             tensordict = tensordict.clone(False)
             for transform in reversed(others):
                 tensordict = transform._inv_call(tensordict)
-        result = self._step_stateful(stateful, tensordict)
+        memories, entries = self._step_inputs(fused, tensordict)
+        worlds, memories, outputs = self._compiled_fn("step_fn", *entries)(
+            self.uav_env.worlds, memories, entries
+        )
+        while self.skip is not None and (skipped := self.skip.skipped_worlds(outputs)).any():
+            step = self._compiled_fn("further_step_fn", *entries)
+            worlds, memories, outputs = step(worlds, memories, entries, outputs, skipped)
+        self._store(fused, worlds, memories)
+        result = self.uav_env.to_tensordict(outputs)
         for transform in others:
             result = transform._step(tensordict, result)
         return result
 
     @torch.no_grad()
-    def _step_stateful(self, stateful: list[StatefulTransform], tensordict: TensorDictBase) -> TensorDictBase:
-        """Step the worlds and the leading stateful transforms."""
-        env, (memories, entries) = self.uav_env, self._step_inputs(stateful, tensordict)
-        step = self._method("_whole_step", *stateful, *entries)
-        worlds, memories, outputs = step(env.worlds, memories, entries)
-        skipping = next((each for each in stateful if isinstance(each, SkipUntilReady)), None)
-        while skipping is not None and (skipped := skipping.skipped_worlds(outputs)).any():
-            step = self._method("_further_step", *stateful, *entries)
-            worlds, memories, outputs = step(skipping, worlds, memories, entries, outputs, skipped)
-        self._store(stateful, worlds, memories)
-        return env.to_tensordict(outputs)
-
-    def _step_inputs(
-        self, stateful: list[StatefulTransform], tensordict: TensorDictBase
-    ) -> tuple[list[Memory], Entries]:
-        """The memories of the transforms, and the entries that they and the worlds read before a step."""
-        memories, entries = [], select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
-        for transform in stateful:
-            transform.check()
-            entries |= select_entries(tensordict, transform.action_keys)
-            memories.append(transform.memory)
-        return memories, entries
-
-    def _store(self, stateful: list[StatefulTransform], worlds: PackedState, memories: list[Memory]) -> None:
-        self.uav_env.worlds = worlds
-        for transform, memory in zip(stateful, memories, strict=True):
-            transform.set_memory(memory)
-
-    def _whole_step(
-        self, worlds: PackedState, memories: list[Memory], entries: Entries, stepped: Tensor | None = None
-    ) -> tuple[PackedState, list[Memory], Outputs]:
-        """One step, in the worlds ``stepped`` [B] or all, of worlds and stateful transforms; pure."""
-        stateful, _ = self._split_transforms()
-        mask: Entries = {} if stepped is None else {keys.STEPPED: stepped}
-        memories, entries = act(stateful, memories, entries | mask)
-        worlds, outputs = self.uav_env.step_fn(worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID))
-        return worlds, *observe(stateful, memories, outputs, mask)
-
-    def _further_step(
-        self,
-        skipping: SkipUntilReady,
-        worlds: PackedState,
-        memories: list[Memory],
-        entries: Entries,
-        outputs: Outputs,
-        stepped: Tensor,
-    ) -> tuple[PackedState, list[Memory], Outputs]:
-        """One more step of the worlds of the mask ``stepped`` [B], which have no ready agent; others stay."""
-        stateful, _ = self._split_transforms()
-        # Flags such as ``ready`` are those after the latest step.
-        entries = entries | {key: outputs[key] for key in entries if key in outputs}
-        new_worlds, new_memories, new_outputs = self._whole_step(worlds, memories, entries, stepped)
-        memories = [
-            transform.merge_worlds(old, new, stepped)
-            for transform, old, new in zip(stateful, memories, new_memories, strict=True)
-        ]
-        merged = skipping.merge_steps(outputs, new_outputs, stepped)
-        return tree_where(stepped, new_worlds, worlds), memories, merged
-
-    @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
-        stateful, others = self._split_transforms()
+        fused, others = self._split_transforms()
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None or not all(transform.has_memory for transform in stateful):
+        if mask is None or not all(transform.has_memory for transform in fused):
             return super()._reset(tensordict, **options)
-        env, memories = self.uav_env, [transform.memory for transform in stateful]
-        reset = self._method("_whole_reset", *stateful)
-        worlds, memories, outputs = reset(env.worlds, memories, mask)
-        self._store(stateful, worlds, memories)
-        result = env.to_tensordict(outputs)
+        memories = [transform.memory for transform in fused]
+        reset = self._compiled_fn("reset_fn")
+        worlds, memories, outputs = reset(self.uav_env.worlds, memories, mask.view(-1))
+        self._store(fused, worlds, memories)
+        result = self.uav_env.to_tensordict(outputs)
         for transform in others:
             result = transform._reset(tensordict, result)
         return result
 
-    def _whole_reset(
-        self, worlds: PackedState, memories: list[Memory], mask: Tensor
-    ) -> tuple[PackedState, list[Memory], Outputs]:
-        """Reset the worlds of the mask [B, 1] and the leading stateful transforms; a pure function."""
-        stateful, _ = self._split_transforms()
-        worlds, outputs = self.uav_env.reset_fn(worlds, mask.view(-1))
-        return worlds, *begin(stateful, memories, outputs, mask)
-
     @torch.no_grad()
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """As TorchRL's, in one graph; what a policy has written stays after a reset."""
-        stateful, others = self._split_transforms()
+        fused, others = self._split_transforms()
         partial = "_step" in tensordict or "next" in tensordict or tensordict.device != self.device
-        if others or partial or _may_skip(stateful):
+        if others or partial or self.skip:
             return super()._step_and_maybe_reset(tensordict)
         self._assert_tensordict_shape(tensordict)
-        env, (memories, entries) = self.uav_env, self._step_inputs(stateful, tensordict)
-        step = self._method("_whole_step_and_reset", *stateful, *entries)
-        worlds, memories, outputs, begin = step(env.worlds, memories, entries)
-        self._store(stateful, worlds, memories)
-        following = _keep_others(tensordict, env.to_tensordict(begin))
-        tensordict.set("next", env.to_tensordict(outputs))
-        return tensordict, following
+        env, (memories, entries) = self.uav_env, self._step_inputs(fused, tensordict)
+        step = self._compiled_fn("step_and_reset_fn", *entries)
+        worlds, memories, outputs, following = step(env.worlds, memories, entries)
+        self._store(fused, worlds, memories)
+        begins = _keep_others(tensordict, env.to_tensordict(following))
+        return tensordict.set("next", env.to_tensordict(outputs)), begins
 
-    def _whole_step_and_reset(
-        self, worlds: PackedState, memories: list[Memory], entries: Entries
-    ) -> tuple[PackedState, list[Memory], Outputs, Outputs]:
-        """One step, and a reset of the worlds that it ends: also the outputs that begin the next step."""
-        worlds, memories, outputs = self._whole_step(worlds, memories, entries)
-        begin = {key: value for key, value in outputs.items() if key != keys.REWARD}
-        done = outputs[keys.DONE]
-        if torch.compiler.is_compiling() or not devices.data_dependent(done.device) or done.any():
-            worlds, memories, first = self._whole_reset(worlds, memories, done)
-            mask = done.view(-1)
-            begin |= {key: torch.where(expand_mask(mask, new), new, begin[key]) for key, new in first.items()}
-        return worlds, memories, outputs, begin
+    def _compiled_fn(self, name: str, *variant: Any) -> Callable[..., Any]:
+        """The pure function of this name, compiled if ``compile`` was called: a graph for each variant."""
+        function = getattr(self, name)
+        return function if self._compiled is None else self._compiled.get(function, *self._fused(), *variant)
 
-    def _split_transforms(self) -> tuple[list[StatefulTransform], list[Transform]]:
-        """The leading stateful transforms that step in one function, and every transform after them."""
-        transform = self.transform
-        transforms: list[Any] = [*transform] if isinstance(transform, Compose) else [transform]
-        n = next(
-            (i for i, t in enumerate(transforms) if not isinstance(t, StatefulTransform)), len(transforms)
-        )
-        stateful, others = transforms[:n], transforms[n:]
-        if _may_skip(stateful):
-            n = next((i for i, t in enumerate(stateful) if t.sees_merged_steps_only), len(stateful))
-            stateful, others = stateful[:n], [*stateful[n:], *others]
-        return stateful, others
+    def _step_inputs(
+        self, fused: list[StatefulTransform], tensordict: TensorDictBase
+    ) -> tuple[list[Memory], Entries]:
+        """The memories of the transforms, and the entries that they and the worlds read before a step."""
+        memories, entries = [], select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
+        for transform in fused:
+            transform.require_memory()
+            entries |= select_entries(tensordict, transform.action_keys)
+            memories.append(transform.memory)
+        return memories, entries
+
+    def _store(self, fused: list[StatefulTransform], worlds: PackedState, memories: list[Memory]) -> None:
+        self.uav_env.worlds = worlds
+        for transform, memory in zip(fused, memories, strict=True):
+            transform.set_memory(memory)
 
 
-def _may_skip(transforms: list[StatefulTransform]) -> bool:
-    """Does any of the transforms make a step last longer in some worlds?"""
-    return any(isinstance(each, SkipUntilReady) for each in transforms)
+def _without_dropped(outputs: Outputs, transforms: Sequence[StatefulTransform]) -> Outputs:
+    """The outputs without those that a transform drops."""
+    dropped = {key for each in transforms if isinstance(each, WorldTransform) for key in each.dropped_keys}
+    return {key: value for key, value in outputs.items() if key not in dropped} if dropped else outputs
 
 
 def _keep_others(before: TensorDictBase, after: TensorDictBase) -> TensorDictBase:

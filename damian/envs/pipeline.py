@@ -9,7 +9,7 @@ What a step passes, in this order (a transform is there only if the scenario ask
     reward -> RewardDelay -> CumulativeReward
     observation -> SampleAndHold (server) -> ObservationDelay (broadcast) -> SampleAndHold (agents)
                 -> ActionHistory -> policy
-    SkipUntilReady repeats all of it until a UAV can choose again
+    With clock.skip, DelayedEnv repeats all of it until a UAV can choose again.
 """
 
 from collections.abc import Collection
@@ -21,10 +21,10 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
-from damian.delays.laws import law_of, sampler_of
-from damian.delays.scenario import CONTEXT_KEYS, check_laws, delay_law, delay_reads, delay_sampler, link_reads
+from damian.delays.scenario import CONTEXT_KEYS
 from damian.envs.config import ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv
+from damian.envs.delayed_env import DelayedEnv, Skip
+from damian.envs.nodes import Belief, OnboardNode, ServerNode
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv, make_server, make_simulation
 from damian.server.server import Server
 from damian.transforms import (
@@ -37,8 +37,6 @@ from damian.transforms import (
     RewardDelay,
     SampleAndHold,
 )
-from damian.transforms.hold import SkipUntilReady
-from damian.transforms.server_node import Belief, OnboardNode, ServerNode
 from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
@@ -62,10 +60,9 @@ def make_env(
     extras = checks.names("extras", extras, ALL_EXTRAS)
     problem = "skips steps, but back-updating and evaluation need the messages of every step"
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
-    remote, dt = has_server_node(scenario), scenario.clock.dt
+    remote, skips = has_server_node(scenario), scenario.clock.skip
     needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
-    needed |= {"position"} if delay_reads(scenario.delay, dt) | link_reads(scenario.links, dt) else set()
-    check_laws(scenario.delay, scenario.clock.dt)
+    needed |= {*["position"] * scenario.delays.reads_positions, *["duration"] * skips}
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
     env = UavEnv(
@@ -78,7 +75,10 @@ def make_env(
         server=server,
         messages_only=remote,
     )
-    pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
+    names = scenario.reward.terms if "reward_terms" in extras else []
+    rewards = [keys.REWARD, *((*keys.REWARD_TERMS, name) for name in names)]
+    skip = Skip(scenario.clock.skip_discount, rewards) if skips else None
+    pipeline = DelayedEnv(env, make_transforms(scenario, server, extras), skip)
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
     pipeline.set_seed(seed)
@@ -94,20 +94,16 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
     ]
-    if scenario.clock.skip:
-        names = scenario.reward.terms if "reward_terms" in extras else []
-        rewards = [keys.REWARD, *((*keys.REWARD_TERMS, name) for name in names)]
-        transforms.append(SkipUntilReady(scenario.clock.skip_discount, rewards))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
 def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
     """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not sent."""
-    delay, clock = scenario.delay, scenario.clock
-    if not has_delay(scenario, "act") and clock.steps("agents") == 1:
+    clock, act = scenario.clock, scenario.delays.act
+    if not act.late and clock.steps("agents") == 1:
         return []
     late = ActionDelay(
-        delay_law(delay, "act"),
+        act,
         keys.ACTION,
         default=hold_action(scenario.actions),
         dt=clock.dt,
@@ -120,20 +116,18 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
 
 def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
     """The message delay (paper, section 3.4), and the server node, which uses the arrived messages."""
-    output_messages, delayed = "message" in extras, has_message_delay(scenario)
+    output_messages, delayed = "message" in extras, scenario.delays.obs.late
     remembers = server.grid is not None or scenario.delay.messages > 0
     transforms: list[Transform] = []
-    longest = 0
     if delayed:
-        uplink = uplink_transform(scenario, output_messages, reads_delay=remembers)
-        longest = uplink.sampler.longest
-        transforms.append(uplink)
+        transforms.append(uplink_transform(scenario, output_messages, reads_delay=remembers))
+    longest = scenario.delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
     dropped = []
     if not output_messages:  # the server node drops what only it and the transforms before it read
-        written = [key for each in transforms for key in each.out_keys if key != keys.TIMELINE]
-        sent = [] if scenario.links.kind == "matrix" else _SENT
-        dropped = [*sent, *written, *[keys.DELAY] * (delayed and remembers)]
+        kept = (keys.TIMELINE, keys.AGE)  # which an action history reads
+        written = [key for each in transforms for key in each.out_keys if key not in kept]
+        dropped = [*([] if scenario.links.kind == "matrix" else _SENT), *written]
     held = keys.RECEIVED if delayed else keys.MESSAGE
     return [
         *transforms,
@@ -143,13 +137,11 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
 
 def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:
     """The delay of the messages to the server; ``reads_delay``: a later transform reads that delay."""
-    delay = scenario.delay
     return ObservationDelay(
-        delay_law(delay, "obs"),
+        scenario.delays.obs,
         keys.MESSAGE,
         keys.RECEIVED,
-        loss=delay.loss,
-        order=delay.order,
+        order=scenario.delay.order,
         dt=scenario.clock.dt,
         sent_key=keys.MESSAGE_SENT,
         age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
@@ -191,19 +183,18 @@ def scaled_messages(server: Server, rows: Tensor) -> Tensor:
 
 def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
     """The links over which UAVs hear each other, and the nodes that compute observations on board."""
-    links, dt = scenario.links, scenario.clock.dt
+    links, delays = scenario.links, scenario.delays
     channel = Channel(
-        links.delay,
+        delays.links,
         keys.MESSAGE,
         keys.LINKED,
-        loss=links.loss,
         hears=links.hears,
         comm_range=links.range,
-        position_key=keys.POSITION if link_reads(links, dt) else None,
+        position_key=keys.POSITION if delays.links.reads or links.range is not None else None,
         limit=links.limit,
         sent_key=keys.MESSAGE_SENT,
         known_at_reset=True,
-        dt=dt,
+        dt=scenario.clock.dt,
         age_key=None,
         mask_key=None,
     )
@@ -213,15 +204,15 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
 
 def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
     """The reward delay, and the discounted sum of the latest rewards (paper, section 3.5, eq. 4)."""
-    delay, dt, reported = scenario.delay, scenario.clock.dt, "message" in extras
+    delay, delays, reported = scenario.delay, scenario.delays, "message" in extras
     transforms: list[Transform] = []
-    if has_delay(scenario, "rew"):
+    if delays.rew.late:
         # With a message delay the server computes in hindsight what was earned.
-        earned_key = keys.EARNED_REWARD if reported and not has_message_delay(scenario) else None
+        earned_key = keys.EARNED_REWARD if reported and not delays.obs.late else None
         late = RewardDelay(
-            delay_law(delay, "rew"),
+            delays.rew,
             keys.REWARD,
-            dt=dt,
+            dt=scenario.clock.dt,
             context_keys=CONTEXT_KEYS,
             delay_key=keys.REWARD_DELAY if reported else None,
             earned_key=earned_key,
@@ -239,12 +230,10 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     broadcast = [keys.OBSERVATION, *[keys.TIMELINE] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
         transforms.append(SampleAndHold(clock.steps("server"), [*broadcast, keys.GLOBAL_OBSERVATION]))
-    updown, law = links.kind == "updown", links.delay
-    if updown and (links.loss or sampler_of(law, clock.dt, key="links.delay").constant_delay != 0):
+    if links.kind == "updown" and scenario.delays.links.late:
         downlink = ObservationDelay(
-            law_of(law, "links.delay"),
+            scenario.delays.links,
             keys.OBSERVATION,
-            loss=links.loss,
             order=scenario.delay.order,
             dt=clock.dt,
             age_key=None,
@@ -274,26 +263,16 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
 
     Not where a UAV cannot tell which are newer (slow clocks, delayed actions), or knows its own message.
     """
-    delay, clock = scenario.delay, scenario.clock
+    delays, clock = scenario.delays, scenario.clock
     slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"
-    immediate = not (slow or has_delay(scenario, "act"))
-    return delay.history > 0 and not scenario.observation.own and immediate and has_message_delay(scenario)
+    tells = scenario.delay.history > 0 and not scenario.observation.own and not slow
+    return tells and delays.obs.late and not delays.act.late
 
 
 def has_server_node(scenario: ScenarioConfig) -> bool:
     """Whether a ``ServerNode`` computes observations and rewards, instead of ``UavEnv``."""
     remembers = bool(scenario.observation.belief) or scenario.delay.messages > 0
-    return has_message_delay(scenario) or remembers
-
-
-def has_message_delay(scenario: ScenarioConfig) -> bool:
-    """Whether the server may hold an older message of a UAV than the one that the UAV sent in this step."""
-    return scenario.delay.loss > 0 or has_delay(scenario, "obs")
-
-
-def has_delay(scenario: ScenarioConfig, name: str) -> bool:
-    """Whether the delay ``obs``, ``act`` or ``rew`` of a scenario ever delays anything."""
-    return delay_sampler(scenario.delay, name, scenario.clock.dt).constant_delay != 0
+    return scenario.delays.obs.late or remembers
 
 
 def hold_action(actions: ActionConfig) -> int:

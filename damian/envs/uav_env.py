@@ -7,9 +7,10 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import make_composite_from_td
 
 from damian import keys
 from damian.common import checks, counter_rng, devices
@@ -31,7 +32,7 @@ Bounds = dict[NestedKey, tuple[Tensor, Tensor]]
 EXTRAS = ("message", "state", "reward_terms")
 """Default optional outputs."""
 
-ALL_EXTRAS = (*EXTRAS, "position", "privileged")
+ALL_EXTRAS = (*EXTRAS, "position", "privileged", "duration")
 """All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments only."""
 
 
@@ -60,7 +61,8 @@ class UavEnv(EnvBase):
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
     At the root lie ``state`` (the simulator's truth, never for an actor), ``success``, and TorchRL's
-    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over``. A step
+    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over``, and as an
+    extra the ``duration`` of a step in simulation steps, 1 or after a reset 0, [B, 1]. A step
     also reads the flag ``("agents", "action_valid")`` [B, N], if it exists: a UAV with a false flag does not
     act; and TorchRL's ``_step`` [B].
 
@@ -69,8 +71,8 @@ class UavEnv(EnvBase):
         num_worlds: number of parallel environments, B.
         seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
         device: of all tensors.
-        extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and (reference experiments
-            only) ``privileged`` are output; each costs time. Delays need ``message``.
+        extras: which of ``message``, ``state``, ``reward_terms``, ``position``, ``duration`` and (reference
+            experiments only) ``privileged`` are output; each costs time. Delays need ``message``.
         simulation, server: the physics and the server node; built from the scenario if not given.
         messages_only: a step outputs no observation, reward or end: a ``ServerNode`` computes them.
     """
@@ -243,6 +245,8 @@ class UavEnv(EnvBase):
             outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, features)
         if self.scenario.episode.end_with_source:
             outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
+        if "duration" in self.extras:
+            outputs[keys.DURATION] = torch.ones_like(state.steps).view(-1, 1)
         if "state" in self.extras:
             _, emits, _ = self.simulation.source_now(state)
             outputs[keys.STATE] = Truth(state.position, state.battery, emits, state.source).pack()
@@ -263,6 +267,8 @@ class UavEnv(EnvBase):
         if "reward_terms" in self.extras:
             zero = torch.zeros_like(initial.track)
             outputs |= {(*keys.REWARD_TERMS, name): zero for name in self.scenario.reward.terms}
+        if "duration" in self.extras:
+            outputs[keys.DURATION] = torch.zeros_like(initial.steps).view(-1, 1)
         false = torch.zeros_like(initial.source_over).unsqueeze(-1)
         return outputs | dict.fromkeys((*keys.ENDS, keys.SUCCESS), false)
 
@@ -308,24 +314,16 @@ class UavEnv(EnvBase):
 
     def _specs_of(self, tables: Outputs, bounds: Bounds | None = None) -> Composite:
         """Specs of outputs, derived from examples with any number of rows and the bounds of observations."""
-        shape = torch.Size((*self.batch_size, self.n_agents))
-        limits = bounds or {}
-        levels = _levels({key: self._spec_of(table, limits.get(key)) for key, table in tables.items()})
-        root, agents = levels.pop((), {}), levels.pop((keys.AGENTS,), {})
-        for path, level in levels.items():
-            agents[path[-1]] = Composite(level, shape=shape, device=self.device)
-        if agents:
-            root[keys.AGENTS] = Composite(agents, shape=shape, device=self.device)
-        return Composite(root, shape=self.batch_size, device=self.device)
-
-    def _spec_of(self, table: Tensor, bounds: tuple[Tensor, Tensor] | None) -> TensorSpec:
-        shape = torch.Size((*self.batch_size, *table.shape[1:]))
-        if table.dtype == torch.bool:
-            return Categorical(2, shape=shape, dtype=torch.bool, device=self.device)
-        if bounds is not None:
-            low, high = (limit.expand(shape) for limit in bounds)
-            return Bounded(low, high, shape=shape, dtype=table.dtype, device=self.device)
-        return Unbounded(shape, dtype=table.dtype, device=self.device)
+        found = {k: table[:1].expand(*self.batch_size, *table.shape[1:]) for k, table in tables.items()}
+        specs = make_composite_from_td(self.to_tensordict(found).select(*found), unsqueeze_null_shapes=False)
+        for key, value in found.items():
+            like: dict[str, Any] = {"shape": value.shape, "dtype": value.dtype, "device": self.device}
+            limits = (bounds or {}).get(key)
+            if value.dtype == torch.bool:
+                specs[key] = Categorical(2, **like)
+            elif limits is not None:
+                specs[key] = Bounded(limits[0].expand(value.shape), limits[1].expand(value.shape), **like)
+        return specs.to(self.device)
 
 
 def _levels(entries: dict[NestedKey, Any]) -> dict[tuple[str, ...], dict[str, Any]]:

@@ -5,7 +5,7 @@ the same messages arrive at the same steps.
 """
 
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -17,14 +17,15 @@ from damian.common import checks
 from damian.common.tensors import tree_map
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import observation_transforms, remembering_transforms, uplink_transform
+from damian.envs.memories import after_idle_steps, note_late
+from damian.envs.nodes import Belief, ServerNode
+from damian.envs.pipeline import observation_transforms, remembering_transforms
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.field.known import Ground
 from damian.server.server import Features
-from damian.transforms import ObservationTimeline, StatefulTransform
-from damian.transforms.base import act, begin, observe
-from damian.transforms.server_node import Belief, ServerNode
-from damian.world.state import State
+from damian.transforms import StatefulTransform
+from damian.transforms.entries import Entries
+from damian.world.state import PackedState, State
 
 REMEMBERED_STEPS = 32
 """Steps that the belief looks back at least: real messages may be later than those of the training."""
@@ -70,6 +71,16 @@ class ReportedEnv(UavEnv):
         age = torch.zeros_like(message[..., :1])
         return outputs | {keys.RECEIVED: message.clone(), keys.AGE: age, keys.DELAY: age.long()}
 
+    def step_fn(self, worlds: Any, action: Tensor, valid: Tensor | None = None) -> tuple[Any, Outputs]:
+        """The outputs after a step, of what is ``Reported`` instead of the worlds of a simulation."""
+        return worlds, self.outputs_of(worlds)
+
+    def reset_fn(self, worlds: Any, mask: Tensor) -> tuple[Any, Outputs]:
+        """The outputs of the step that begins an episode; of worlds, before there are any reports."""
+        if isinstance(worlds, PackedState):
+            return super().reset_fn(worlds, mask)
+        return worlds, self.outputs_of(worlds, first=True)
+
     def outputs_of(self, reported: Reported, first: bool = False) -> Outputs:
         """The outputs of a step, before any transform; ``first``: of the step that begins an episode."""
         state, on_time = reported.state, reported.on_time.unsqueeze(0)
@@ -96,7 +107,7 @@ class Node:
         self.worlds = ReportedEnv(scenario, seed, reward_terms)
         self.scenario, self.dt = scenario, scenario.clock.dt
         self.server, self.simulation = self.worlds.server, self.worlds.simulation
-        self.law_longest = uplink_transform(scenario, False, reads_delay=False).sampler.longest
+        self.law_longest = scenario.delays.obs.longest
         longest = max(self.law_longest, REMEMBERED_STEPS)
         transforms = [
             *remembering_transforms(scenario, self.server, longest, delayed=True),
@@ -121,9 +132,8 @@ class Node:
     @torch.no_grad()
     def begin(self, reported: Reported) -> tuple[Memories, TensorDictBase]:
         """Memories and outputs of the first step, of any number, when every UAV has sent a message."""
-        outputs = self.worlds.outputs_of(reported, first=True)
-        everywhere = torch.ones(1, 1, dtype=torch.bool)
-        memories, outputs = begin(self.transforms, _copies(self._unused), outputs, everywhere)
+        everywhere = torch.ones(1, dtype=torch.bool)
+        _, memories, outputs = self.env.reset_fn(cast(Any, reported), _copies(self._unused), everywhere)
         for transform, memory in zip(self.transforms, memories, strict=True):
             if isinstance(transform, ServerNode):
                 memory["elapsed"] = reported.state.steps.clone()
@@ -136,17 +146,16 @@ class Node:
         """Memories and outputs after actions [1, N, ...] that the ``chosen`` UAVs took in the step before."""
         memories = _copies(memories)
         for i, transform in enumerate(self.transforms):
-            if isinstance(transform, Belief | ObservationTimeline):
-                for late in reported.late:
-                    memories[i] = transform.note_late(memories[i], *late)
-        memories, _ = act(self.transforms, memories, {keys.ACTION: action, keys.READY: chosen})
-        memories, outputs = observe(self.transforms, memories, self.worlds.outputs_of(reported), {})
+            for late in reported.late:
+                memories[i] = note_late(transform, memories[i], *late)
+        entries: Entries = {keys.ACTION: action, keys.READY: chosen}
+        _, memories, outputs = self.env.step_fn(cast(Any, reported), memories, entries)
         return memories, self.worlds.to_tensordict(outputs)
 
     def skip(self, memories: Memories, n_steps: int) -> Memories:
         """The memories after steps in which nothing was reported and nobody chose; beliefs stay the same."""
         pairs = zip(self.transforms, memories, strict=True)
-        return [transform.after_idle_steps(memory, n_steps) for transform, memory in pairs]
+        return [after_idle_steps(transform, memory, n_steps) for transform, memory in pairs]
 
 
 def _copies(memories: Memories) -> Memories:

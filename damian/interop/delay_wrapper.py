@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sp
 
 from damian.common import counter_rng
 from damian.common.errors import InputError
-from damian.delays.laws import law_of, sampler_of
+from damian.delays.laws import sampler_of
 from damian.delays.line import DelayLine, Memory
 from damian.transforms.context import ContextReader
 
@@ -72,11 +72,10 @@ class _Link:
     """One link: a ``DelayLine`` delays the times at which things were sent, so that they may be anything."""
 
     def __init__(self, name: str, delay: Any, loss: float, dt: float, before_step: bool = False) -> None:
-        law = law_of(delay, name)
-        sampler = sampler_of(law, dt, loss, name)
-        self.late = sampler.constant_delay != 0
+        sampler = sampler_of(delay, dt, loss, name)
+        self.late = sampler.late
         self._line, self._name = DelayLine(sampler, "generation"), name
-        self._contexts = ContextReader(law, sampler, None, dt, name, before_step)
+        self._contexts = ContextReader(sampler, None, dt, name, before_step)
         self._memory: Memory | None = None
         self._sent: dict[int, Any] = {}
 

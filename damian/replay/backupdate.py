@@ -15,7 +15,8 @@ from damian.common.tensors import expand_mask
 from damian.keys import next_key
 from damian.replay.hindsight import ended_before, latest_arrived
 from damian.replay.time_storage import TimeStorage
-from damian.transforms.base import Correction, Entries, StatefulTransform, leaf_transforms, sibling_key
+from damian.transforms.base import Correction, StatefulTransform, leaf_transforms
+from damian.transforms.entries import Entries, sibling_key
 
 Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
 """Function from steps [T, B], and the newest message that the receiver can hold after each of them, to new
@@ -115,11 +116,11 @@ class BackupdateStorage(TimeStorage):
             raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
         should = "joins steps before they are corrected: leave it out, and join the steps that are read"
         checks.require("steps_to_next_obs" not in data, "transform", "MultiStepTransform", should)
-        self._check(data)
+        self._require_entries(data)
         super().set(cursor, self._with_added_entries(data), set_cursor=set_cursor)
         self.backupdate(len(data) + self.longest)
 
-    def _check(self, data: TensorDictBase) -> None:
+    def _require_entries(self, data: TensorDictBase) -> None:
         """Require that steps [T, B] have the entries that the storage reads, and fit into it."""
         late, present = self._late_rewards, data.keys(True)
         needed = [("step_count_key", self._count, "StepCounter()"), ("done", ENDS[0], "every environment")]

@@ -11,10 +11,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.recompute import beliefs_in_hindsight
 from damian.keys import next_key
 from damian.learners.recurrent import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage
-from damian.replay.recompute import beliefs_in_hindsight
 from damian.runs.checkpoint import to_tensordict
 from damian.server.server import Server
 

@@ -1,7 +1,4 @@
-"""Delays, action histories and slow clocks as TorchRL transforms, on any TorchRL environment.
-
-Transforms that need a ``UavEnv`` are in ``damian.transforms.server_node``, and ``hold.SkipUntilReady``.
-"""
+"""Delays, action histories and slow clocks as TorchRL transforms, on any TorchRL environment."""
 
 from damian.transforms.action import ActionDelay
 from damian.transforms.base import StatefulTransform, check_order, set_seed

@@ -1,6 +1,7 @@
 """A transform that delays actions (paper, section 3.3), and what transforms that remember actions share."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -11,21 +12,11 @@ from torchrl.envs import EnvBase
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.delays.laws import law_of, sampler_of
+from damian.delays.laws import sampler_of
 from damian.delays.line import DelayLine
-from damian.transforms.base import (
-    Change,
-    Entries,
-    Memory,
-    StatefulTransform,
-    as_rows,
-    existing,
-    from_rows,
-    path_of,
-    sibling_key,
-    spec_rows,
-)
+from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
+from damian.transforms.entries import Entries, existing, path_of, sibling_key, spec_rows
 
 
 class ActionSpecs(NamedTuple):
@@ -106,13 +97,11 @@ class ActionTransform(StatefulTransform):
         """A value of ``actions`` for each of the M rows, [M, ...]."""
         return self.as_rows_of_spec(value, self.env.full_action_spec, self.action_key)
 
-    @property
+    @cached_property
     def all_actions(self) -> list[ActionSpecs]:
-        """Shape, range and default of each of the actions, read from the environment's specs once."""
-        if "_actions" not in self.__dict__:
-            pairs = zip(self.in_keys_inv, self.defaults, strict=True)
-            self.__dict__["_actions"] = [read_action_specs(self.env, key, each) for key, each in pairs]
-        return self.__dict__["_actions"]
+        """Shape, range and default of each of the actions, by the environment's specs."""
+        pairs = zip(self.in_keys_inv, self.defaults, strict=True)
+        return [read_action_specs(self.env, key, default) for key, default in pairs]
 
     @property
     def actions(self) -> ActionSpecs:
@@ -121,11 +110,7 @@ class ActionTransform(StatefulTransform):
 
     def empty_cache(self) -> None:
         super().empty_cache()
-        self.__dict__.pop("_actions", None)
-
-    def reset_parent(self) -> None:
-        super().reset_parent()
-        self.__dict__.pop("_actions", None)
+        self.forget_specs()
 
 
 class ActionDelay(ActionTransform):
@@ -140,8 +125,8 @@ class ActionDelay(ActionTransform):
     begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
-            (``Function``). A delay is drawn for each world, each agent (under a nested key) and each step.
+        delay, dt, context_keys, seed: as in ``ObservationDelay``; the policy's input and the outputs of a
+            reset must have the entries that the law reads.
         in_keys_inv: keys of the entries of an action that the environment executes, all of them beside each
             other, or one key. A bare name for another key means an entry beside the first one.
         out_keys_inv: keys under which the policy writes what it chooses; if not given, ``in_keys_inv``.
@@ -149,14 +134,10 @@ class ActionDelay(ActionTransform):
             action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0. Of
             several entries, a list with one for each, which may be None.
         loss: probability that an action never arrives.
-        dt: length of a step [s], for delays given as times.
         sent_key: key of a flag in the policy's input, [...] bool: which actions are sent; if not given, all.
         valid_key: key of a flag that is written for the environment, [...] bool: true if the action is
             executed for the first time, or is the default. A ``ParallelEnv`` passes it on only if its specs
             name it.
-        context_keys: keys of the entries that the law may read, by name (``ContextSampler``); the policy's
-            input and the outputs of a reset must have them.
-        seed: as in ``StatefulTransform``.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))
@@ -182,11 +163,10 @@ class ActionDelay(ActionTransform):
         checks.require(same, "out_keys_inv", out_keys_inv, "does not have one key for each of in_keys_inv")
         problem = "are not beside each other: delay actions of several groups by a transform for each"
         checks.require(len(paths) == 1, "in_keys_inv", in_keys_inv, problem)
-        law = law_of(delay)
-        self.draw_from(sampler_of(law, dt, loss))
+        self.sampler = sampler_of(delay, dt, loss)
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
-        self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
+        self.contexts = ContextReader(self.sampler, context_keys, dt, self.action_key, before_step=True)
         self.action_keys = existing([*self.out_keys_inv, self.sent_key, *self.contexts.keys.values()])
 
     @property
@@ -199,7 +179,7 @@ class ActionDelay(ActionTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         initial = [self.action_rows(actions.initial) for actions in self.all_actions]
-        streams = self.streams(tensordict.batch_size, initial[0].device)
+        streams = self.streams(tensordict.batch_size, initial[0].device, self.sampler)
         memory = self.line.init_memory(initial, streams)
         memory |= {f"initial_{i}": each for i, each in enumerate(initial)}
         return self.contexts.init_memory(memory, tensordict, self.rows)
@@ -212,14 +192,14 @@ class ActionDelay(ActionTransform):
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         # A distribution may draw one-hot actions as floats, where the specs have integers.
         chosen = [
-            as_rows(entries[key], self.rows).to(memory[f"initial_{i}"].dtype)
+            self.to_rows(entries[key]).to(memory[f"initial_{i}"].dtype)
             for i, key in enumerate(self.out_keys_inv)
         ]
         sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
         memory, delivery = self.line.step(memory, chosen, sent, context)
         executed: Entries = {
-            key: from_rows(held, self.rows).clone()
+            key: self.from_rows(held).clone()
             for key, held in zip(self.in_keys_inv, delivery.held, strict=True)
         }
         if self.valid_key:

@@ -3,13 +3,14 @@
 import itertools
 import multiprocessing
 import warnings
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple, NoReturn, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Composite
 from torchrl.envs import (
     Compose,
     ConditionalSkip,
@@ -25,18 +26,21 @@ from torchrl.envs import (
 from damian.common import counter_rng
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
-from damian.common.text_files import listed
-from damian.delays.samplers import Sampler
-from damian.keys import DONE, STEPPED, last_part
+from damian.delays.line import Memory
+from damian.delays.samplers import Sampler, streams_for
+from damian.keys import STEPPED
+from damian.transforms.entries import (
+    Entries,
+    as_rows,
+    path_of,
+    require_keys,
+    reset_rows,
+    select_entries,
+    spec_rows,
+)
 
 STAGES = ("server", "delay", "history")
 """The order of damian's transforms that share a key, from the environment outwards."""
-
-Memory = dict[str, Tensor]
-"""The memory of a transform: its buffers by name."""
-
-Entries = dict[NestedKey, Tensor]
-"""Entries of a TensorDict, by key."""
 
 Change = tuple[Memory, Entries]
 """The new memory of a transform, and the entries that it writes."""
@@ -65,13 +69,12 @@ class StatefulTransform(Transform):
     some are written in place.
 
     A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before the
-    environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform; ``act``,
-    ``observe`` and ``begin`` below for several, which compile into one graph. No gradient flows through the
-    memory.
+    environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform; ``DelayedEnv``
+    calls them for several, which compile into one graph. No gradient flows through the memory.
 
     Args:
-        in_keys, out_keys, in_keys_inv, out_keys_inv: as in TorchRL's ``Transform``; the last two are of
-            actions.
+        in_keys, in_keys_inv: keys of entries, and of actions, that the transform changes or sends.
+        out_keys, out_keys_inv: keys of the entries that it writes, and under which the policy writes actions.
         seed: of all draws, until ``damian.set_seed`` gives another; if not given, it is drawn from torch's
             global generator at the first reset.
     """
@@ -84,20 +87,8 @@ class StatefulTransform(Transform):
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_reset`` and ``on_step``; see ``required_keys``."""
-    extra_keys: Sequence[NestedKey] = ()
-    """Keys of the entries that are written beside ``out_keys``."""
-    dropped_keys: Sequence[NestedKey] = ()
-    """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
     """Key of the flag that says which rows send a message in this step; None if all do."""
-    per_world: bool = False
-    """Whether the memory has a row for each world, whatever entries ``in_keys`` name."""
-    sees_merged_steps_only: bool = False
-    """Whether the transform sees only the merged steps of ``SkipUntilReady``, as TorchRL's transforms do."""
-    draws: bool = False
-    """Whether the transform draws random numbers."""
-    same_draws_for_all_agents: bool = False
-    """Whether all agents of a world draw the same numbers."""
     _rows: torch.Size | None = None
     _seed: int | None = None
     _world_seeds: Tensor | None = None
@@ -131,10 +122,6 @@ class StatefulTransform(Transform):
         """Change the outputs ``step_keys`` of a step; the memory is that after ``on_action``."""
         return memory, {}
 
-    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
-        """The memory after steps in which no message arrived and no agent chose an action."""
-        return memory
-
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
         """How stored entries are corrected where this transform changed any of ``keys``; else None.
 
@@ -156,7 +143,7 @@ class StatefulTransform(Transform):
     @property
     def row_key(self) -> NestedKey:
         """Key of an entry whose innermost TensorDict has one element for each row."""
-        return DONE if self.per_world else [*self.in_keys, *self.in_keys_inv][0]
+        return [*self.in_keys, *self.in_keys_inv][0]
 
     @property
     def row_dims(self) -> dict[str, int]:
@@ -166,14 +153,7 @@ class StatefulTransform(Transform):
     @property
     def created_keys(self) -> Sequence[NestedKey]:
         """Keys of the entries that the transform adds to the outputs of the environment."""
-        if self.stage == "server":  # it writes what the environment has written, anew
-            return []
-        return [*(key for key in self.out_keys if key not in self.in_keys), *self.extra_keys]
-
-    def draw_from(self, sampler: Sampler) -> None:
-        """Let a sampler draw the delays."""
-        self.sampler, self.draws = sampler, sampler.constant_delay is None
-        self.same_draws_for_all_agents = sampler.same_draws_for_all_agents
+        return [key for key in self.out_keys if key not in self.in_keys]
 
     # The memory.
 
@@ -203,7 +183,15 @@ class StatefulTransform(Transform):
     def as_rows_of_spec(self, value: Tensor, specs: Composite, key: NestedKey) -> Tensor:
         """A value in the shape of the spec under a key, for each of the M rows, [M, ...]."""
         inner = value.shape[len(spec_rows(specs, key)) :]
-        return as_rows(value.expand((*self.rows, *inner)), self.rows).clone()
+        return self.to_rows(value.expand((*self.rows, *inner))).clone()
+
+    def to_rows(self, value: Tensor) -> Tensor:
+        """An entry [*rows, ...] as [M, ...]."""
+        return as_rows(value, self.rows)
+
+    def from_rows(self, value: Tensor) -> Tensor:
+        """The entry [*rows, ...] of [M, ...]."""
+        return value.view((*self.rows, *value.shape[1:]))
 
     @property
     def memory(self) -> Memory:
@@ -251,7 +239,7 @@ class StatefulTransform(Transform):
             self._init(tensordict_reset)
         outputs = tensordict_reset.detach() if mask is None else None
         # TorchRL restores the entries of the worlds without a reset.
-        written = self._write(tensordict_reset, self._begin(tensordict_reset, mask))
+        written = self._write(tensordict_reset, self._change_at_reset(tensordict_reset, mask))
         self._first, self._in_episode = outputs, True
         return written
 
@@ -265,7 +253,7 @@ class StatefulTransform(Transform):
         with torch.inference_mode(False):  # else the buffers could be written only in inference mode
             self.set_memory(self.init_memory(outputs))
 
-    def _begin(self, outputs: TensorDictBase, mask: Tensor | None) -> Change:
+    def _change_at_reset(self, outputs: TensorDictBase, mask: Tensor | None) -> Change:
         """Begin new episodes in the rows of the mask [M], or in all, given the outputs of the reset."""
         memory = self.memory
         if mask is None:
@@ -276,7 +264,7 @@ class StatefulTransform(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self.action_keys:
             return tensordict
-        self.check()
+        self.require_memory()
         entries = select_entries(tensordict, [*self.action_keys, STEPPED])
         change = self.on_action(self.memory, entries)
         if STEPPED in entries:
@@ -284,13 +272,13 @@ class StatefulTransform(Transform):
         return self._write(tensordict, change)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.check()
+        self.require_memory()
         entries = select_entries(next_tensordict, self.step_keys)
         stepped = tensordict.get(STEPPED, None)
-        if stepped is None:
-            return self._write(next_tensordict, self.on_step(self.memory, entries))
-        change = self.on_step(self.memory, entries | {STEPPED: stepped})
-        return self._write(next_tensordict, self._only_stepped(change, stepped, tensordict, next_tensordict))
+        change = self.on_step(self.memory, entries if stepped is None else entries | {STEPPED: stepped})
+        if stepped is not None:
+            change = self._only_stepped(change, stepped, tensordict, next_tensordict)
+        return self._write(next_tensordict, change)
 
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
@@ -306,8 +294,8 @@ class StatefulTransform(Transform):
             found = (td.get(key, None) for td in (before, after))
             same_shape = (value for value in found if value is not None and value.shape == new.shape)
             old = next(same_shape, torch.zeros_like(new))
-            mask, shape = expand_mask(rows, as_rows(new, self.rows)), self.rows
-            merged[key] = from_rows(torch.where(mask, as_rows(new, shape), as_rows(old, shape)), shape)
+            new_rows, old_rows = self.to_rows(new), self.to_rows(old)
+            merged[key] = self.from_rows(torch.where(expand_mask(rows, new_rows), new_rows, old_rows))
         return memory, merged
 
     def _reset_on_native_autoreset(
@@ -320,15 +308,7 @@ class StatefulTransform(Transform):
         self.set_memory(memory)
         for key, value in entries.items():
             tensordict.set(key, value)
-        for key in self.dropped_keys:
-            tensordict.pop(key, None)
         return tensordict
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        """The spec of the observations without ``dropped_keys``."""
-        for key in self.dropped_keys:
-            del observation_spec[key]
-        return observation_spec
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         """The specs with those of what the transform writes; all keys are checked."""
@@ -349,12 +329,12 @@ class StatefulTransform(Transform):
             self._refuse()
         return parent
 
-    def check(self) -> None:
+    def require_memory(self) -> None:
         """Refuse a step before the first reset."""
         if not self.has_memory and self._first is not None:  # it was seeded after the reset
             outputs = self._first
             self._init(outputs)
-            self.set_memory(self._begin(outputs, None)[0])
+            self.set_memory(self._change_at_reset(outputs, None)[0])
         if not self.has_memory:
             self._refuse()
 
@@ -388,7 +368,13 @@ class StatefulTransform(Transform):
 
     def reset_parent(self) -> None:
         super().reset_parent()
+        self.forget_specs()
         self.leave_episode()
+
+    def forget_specs(self) -> None:
+        """Forget what has been read from the environment's specs, which ``cached_property`` keeps."""
+        for name in [n for n in self.__dict__ if isinstance(getattr(type(self), n, None), cached_property)]:
+            del self.__dict__[name]
 
     def leave_episode(self) -> None:
         """Let ``load_state_dict`` replace the whole memory, because the worlds are replaced, too."""
@@ -424,7 +410,7 @@ class StatefulTransform(Transform):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         if first is not None and not errors:
             if self.has_memory:
-                self.set_memory(self._begin(first, None)[0])
+                self.set_memory(self._change_at_reset(first, None)[0])
             self._first = first
 
     # Random streams.
@@ -439,11 +425,16 @@ class StatefulTransform(Transform):
         self._seed, self._world_seeds = None, seeds.to(torch.long)
         self.clear_memory()
 
-    def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
-        """A random stream (a key of the counter-based generator) for each row, [M] int64."""
+    def streams(
+        self, batch: torch.Size, device: torch.device, sampler: Sampler, draws_more: bool = False
+    ) -> Tensor:
+        """A random stream (a key of the counter-based generator) for each row, [M] int64, for a sampler.
+
+        They are 0 where neither the sampler draws nor, with ``draws_more``, the transform itself.
+        """
         n_worlds = batch.numel()
         n_agents = self.rows.numel() // n_worlds
-        if not self.draws:
+        if sampler.constant_delay is not None and not draws_more:
             return torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
         if self._world_seeds is not None:
             worlds = self._world_seeds.to(device)
@@ -451,47 +442,8 @@ class StatefulTransform(Transform):
             seed = _unseeded() if self._seed is None else self._seed
             worlds = counter_rng.world_seeds(seed, n_worlds, device)
         name = torch.tensor(counter_rng.number_of(stream_name(self)), device=device)
-        agents = torch.arange(n_agents, device=device)
-        agents = torch.zeros_like(agents) if self.same_draws_for_all_agents else agents
-        return counter_rng.bits64(worlds.view(-1, 1), name, agents).flatten()
-
-
-# A step of several transforms, in the order in which they process outputs; pure functions. ``DelayedEnv``
-# compiles them with the worlds.
-
-
-def act(
-    transforms: Sequence[StatefulTransform], memories: Sequence[Memory], entries: Entries
-) -> tuple[list[Memory], Entries]:
-    """Pass the inputs of a step through the transforms, from the last to the first."""
-    changed_memories = list(memories)
-    for i, transform in reversed(list(enumerate(transforms))):
-        changed_memories[i], changed = transform.on_action(changed_memories[i], entries)
-        entries = entries | changed
-    return changed_memories, entries
-
-
-def observe(
-    transforms: Sequence[StatefulTransform], memories: Sequence[Memory], outputs: Entries, extra: Entries
-) -> tuple[list[Memory], Entries]:
-    """Pass the outputs of a step through the transforms, which also read ``extra``, after ``act``."""
-    changed_memories = list(memories)
-    for i, transform in enumerate(transforms):
-        changed_memories[i], changed = transform.on_step(changed_memories[i], outputs | extra)
-        outputs = drop_keys(outputs | changed, transform.dropped_keys)
-    return changed_memories, outputs
-
-
-def begin(
-    transforms: Sequence[StatefulTransform], memories: Sequence[Memory], outputs: Entries, mask: Tensor
-) -> tuple[list[Memory], Entries]:
-    """Begin new episodes in the worlds of the mask [B] bool, given the outputs of the reset."""
-    changed_memories = list(memories)
-    for i, transform in enumerate(transforms):
-        rows = transform.expand_worlds(mask)
-        changed_memories[i], changed = transform.on_reset(changed_memories[i], outputs, rows)
-        outputs = drop_keys(outputs | changed, transform.dropped_keys)
-    return changed_memories, outputs
+        streams = counter_rng.bits64(worlds.view(-1, 1), name, torch.arange(n_agents, device=device))
+        return streams_for(sampler, streams.flatten(), n_agents)
 
 
 # The order of transforms.
@@ -576,109 +528,3 @@ def set_seed(env: EnvBase, seed: int) -> int | None:
         if isinstance(transform, StatefulTransform):
             transform.set_seed(seed)
     return env.set_seed(seed)
-
-
-# Entries of TensorDicts, viewed as M rows: one for each world, or for each agent of each world.
-
-
-def path_of(key: NestedKey) -> tuple[str, ...]:
-    """The path of the TensorDict that directly contains an entry."""
-    return cast(tuple[str, ...], key[:-1]) if isinstance(key, tuple) else ()
-
-
-def spec_rows(specs: Composite, key: NestedKey) -> torch.Size:
-    """The shape of the specs that directly contain that of an entry."""
-    path = path_of(key)
-    return (specs[path] if path else specs).shape
-
-
-def as_rows(value: Tensor, rows: torch.Size) -> Tensor:
-    """Reshape an entry [*rows, ...] to [M, ...], where M is the number of rows."""
-    return value.reshape(rows.numel(), *value.shape[len(rows) :])
-
-
-def from_rows(value: Tensor, rows: torch.Size) -> Tensor:
-    """Reshape [M, ...] to an entry [*rows, ...]."""
-    return value.view((*rows, *value.shape[1:]))
-
-
-def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
-    """The entries with these keys, as far as they exist, without their autograd graph."""
-    found = {}
-    for key in keys:
-        value = tensordict.get(key, None)
-        if value is not None:
-            found[key] = value.detach() if value.requires_grad else value
-    return found
-
-
-def drop_keys(entries: Entries, keys: Sequence[NestedKey]) -> Entries:
-    """The entries without those of these keys."""
-    return {key: value for key, value in entries.items() if key not in keys}
-
-
-def sibling_key(key: NestedKey, name: NestedKey | None) -> NestedKey | None:
-    """The key of the bare ``name`` beside the entry ``key``; a nested key, or None, is returned as it is."""
-    if name is None or not isinstance(name, str) or isinstance(key, str):
-        return name
-    return (*key[:-1], name)
-
-
-def existing(keys: Iterable[NestedKey | None]) -> list[NestedKey]:
-    """The keys that are not None."""
-    return [key for key in keys if key is not None]
-
-
-def add_spec(
-    specs: Composite, key: NestedKey | None, shape: Sequence[int], dtype: torch.dtype = torch.float32
-) -> None:
-    """Add the spec of an entry without bounds; nothing if the key is None."""
-    if key is not None:
-        size, kind = torch.Size(shape), Binary if dtype == torch.bool else Unbounded
-        specs[key] = kind(shape=size, dtype=dtype, device=specs.device)
-
-
-def require_keys(transform: str, keys: Sequence[NestedKey], present: Iterable[NestedKey]) -> None:
-    """Require that the entries that a transform reads exist; else raise an ``InputError``."""
-    known = list(present)
-    missing = next((key for key in keys if key not in known), None)
-    if missing is not None:
-        raise InputError(
-            f"{transform}: {missing} is not among the keys of the environment: {listed(map(str, known))}"
-        )
-
-
-def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[NestedKey]:
-    """The keys among ``present`` of the flags of this name that apply to an entry, the outermost first.
-
-    These are the flags in the TensorDict of the entry and in those around it; if there are none, all flags
-    within the innermost TensorDict around the entry that contains any: TorchRL aggregates flags in this way.
-    """
-    path = path_of(key)
-    flags = [flag for flag in present if last_part(flag) == name]
-    around = [flag for flag in flags if path[: len(path_of(flag))] == path_of(flag)]
-    if around:
-        return sorted(around, key=lambda flag: len(path_of(flag)))
-    within = ([f for f in flags if path_of(f)[:depth] == path[:depth]] for depth in range(len(path), -1, -1))
-    return next((found for found in within if found), [])
-
-
-def reset_rows(tensordict: TensorDictBase, key: NestedKey, rows: torch.Size) -> Tensor | None:
-    """The rows that are reset, [M] bool, by the outermost flag ``_reset``; None if there is none."""
-    keys = flag_keys("_reset", key, list(tensordict.keys(True, True)))
-    if not keys:
-        return None
-    around = path_of(key)[: len(path_of(keys[0]))] == path_of(keys[0])
-    return any_flag([tensordict.get(flag) for flag in (keys[:1] if around else keys)], rows)
-
-
-def any_flag(flags: Sequence[Tensor], rows: torch.Size) -> Tensor:
-    """Whether any of some flags of worlds [*B, 1], or of their agents [*B, N, 1], is true for a row, [M]."""
-    found = torch.zeros(rows, dtype=torch.bool, device=flags[0].device)
-    for flag in flags:
-        shape = flag.shape[:-1]
-        if len(shape) > len(rows):
-            found = found | flag.flatten(len(rows)).any(-1)
-        else:
-            found = found | expand_mask(flag.squeeze(-1), found)
-    return found.reshape(-1)

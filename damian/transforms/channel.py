@@ -12,13 +12,12 @@ from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
 from damian.delays.laws import link_sampler, same_size
 from damian.delays.line import BroadcastLine
-from damian.delays.samplers import MessageContext, streams_for
+from damian.delays.samplers import MessageContext
 from damian.keys import STEPPED
-from damian.transforms.base import (
-    Change,
+from damian.transforms.base import Change, Memory, StatefulTransform
+from damian.transforms.context import message_context
+from damian.transforms.entries import (
     Entries,
-    Memory,
-    StatefulTransform,
     add_spec,
     as_rows,
     existing,
@@ -45,10 +44,9 @@ class Channel(StatefulTransform):
     t = 0, of age 3.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
-            (``Function``); or an N x N nested list of them, ``delay[receiver][sender]``, whose diagonal is
-            not used. A delay is drawn for each receiver and message. With a ``position_key``, a law may read
-            ``position`` and ``receiver_position``.
+        delay, dt, seed: as in ``ObservationDelay``, but drawn for each receiver and message; or an N x N
+            nested list of delays, ``delay[receiver][sender]``, whose diagonal is not used. With a
+            ``position_key``, a law may read ``position`` and ``receiver_position``.
         in_keys: keys of the entries [*B, N, ...] of a group of agents that every agent sends together; if
             neither this nor ``action_key`` is given, ``("agents", "observation")``. A bare name for another
             key means an entry beside these.
@@ -64,13 +62,11 @@ class Channel(StatefulTransform):
         action_key: key of an action [*B, N, message_size] in [-1, 1], which the transform adds to the specs.
         message_size: how many numbers ``action_key`` has.
         known_at_reset: everyone knows everyone's first message, whatever the delay and the links.
-        dt: length of a step [s], for delays given as times.
         age_key: key for the age of the held messages [steps], [*B, N, N] float; before one has arrived,
             steps since the reset; or None.
         mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; or None.
         delay_key: key for the delays of the messages sent in this step [steps], [*B, N, N] long (receiver,
             sender), -1 if they never arrive; or None. An actor must not observe it.
-        seed: as in ``StatefulTransform``.
 
     Examples:
         >>> env = VmasEnv("navigation", num_envs=32, n_agents=3)
@@ -119,19 +115,18 @@ class Channel(StatefulTransform):
         self.age_key, self.mask_key, self.delay_key, self.sent_key, self.position_key = (
             sibling_key(self._beside, key) for key in (age_key, mask_key, delay_key, sent_key, position_key)
         )
-        self.extra_keys = existing([self.age_key, self.mask_key, self.delay_key])
+        self.out_keys += existing([self.age_key, self.mask_key, self.delay_key])
         self.message_size, self.known_at_reset, self.dt = message_size, known_at_reset, dt
         self.comm_range, self.limit = comm_range, limit
         self.hears = None if hears is None else torch.as_tensor(hears, dtype=torch.bool).flatten().tolist()
-        links = {"delay": delay, "loss": loss} | ({} if hears is None else {"hears": hears})
-        self.n_agents = same_size(links)
-        """The number of agents for which links are given one by one, if any are."""
         self.sampler = link_sampler(delay, loss, dt)
+        links = {"delay": delay, "loss": loss} | ({} if hears is None else {"hears": hears})
+        self.n_agents = same_size(links) or getattr(self.sampler, "n_agents", None)
+        """The number of agents for which links are given one by one, if any are."""
         for name in self.sampler.reads:
             given = placed and name in ("position", "receiver_position")
             checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
         self.line = BroadcastLine(self.sampler)
-        self.draws = self.sampler.constant_delay is None or limit is not None
         self.action_keys = existing([self.action_key])
         self.step_keys = existing([*self.in_keys, self.position_key, self.sent_key])
 
@@ -156,10 +151,10 @@ class Channel(StatefulTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         entries = select_entries(tensordict, self.step_keys)
         contents = self._contents(entries, next(iter(tensordict.values(True, True))).device)
-        n, streams = self.agents[-1], self.streams(tensordict.batch_size, contents[0].device)
+        n, draws = self.agents[-1], self.limit is not None
+        streams = self.streams(tensordict.batch_size, contents[0].device, self.sampler, draws)
         links = torch.arange(len(streams), device=streams.device)
         receiver, sender = links // n, links % n
-        streams = streams_for(self.sampler, streams, n**2)
         memory = self.line.init_memory(contents, streams, receiver // n * n + sender)
         hears = receiver % n != sender
         if self.hears is not None:
@@ -228,16 +223,9 @@ class Channel(StatefulTransform):
         n, sender = self.agents[-1], memory["sender"]
         receiver = torch.arange(len(sender), device=sender.device) // n
         places = {"position": sender, "receiver_position": receiver}
-        clock = memory["clock"]
-        return MessageContext(
-            sender=sender % n,
-            receiver=receiver % n,
-            n_sending=sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n),
-            time=(clock - memory["reset_at"]) * self.dt,
-            uniform=counter_rng.uniform(memory["streams"], clock + 1),
-            dt=self.dt,
-            entries={} if position is None else {k: position.index_select(0, v) for k, v in places.items()},
-        )
+        read = {} if position is None else {k: position.index_select(0, v) for k, v in places.items()}
+        n_sending = sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n)
+        return message_context(memory, sender % n, receiver % n, n_sending, read, self.dt)
 
     def _may_send(self, memory: Memory, wants: Tensor) -> Tensor:
         """Draw who may send if not all may, [B, N] bool, among those who want to, [B, N] bool."""
@@ -261,7 +249,7 @@ class Channel(StatefulTransform):
         own_time = now.masked_fill(now == 1, 0) if self.action_key else now  # nothing is chosen at a reset
         time = torch.where(is_own, own_time, time)
         entries: Entries = {}
-        pairs = zip(self.out_keys, self.line.newest(memory), self.line.held(memory), strict=True)
+        pairs = zip(self.out_keys, self.line.newest(memory), self.line.held(memory), strict=False)
         for key, new, old in pairs:
             held = old.view(-1, n, *old.shape[1:])
             value = torch.where(expand_mask(is_own, held), new.unsqueeze(1), held)
@@ -295,7 +283,7 @@ class Channel(StatefulTransform):
         sent = [observation_spec[key] for key in self.in_keys]
         kinds = [(spec.shape[len(agents) :], spec.dtype) for spec in sent]
         kinds += [((self.message_size,), torch.float32)] if self.message_size else []
-        for key, (size, dtype) in zip(self.out_keys, kinds, strict=True):
+        for key, (size, dtype) in zip(self.out_keys, kinds, strict=False):
             add_spec(observation_spec, key, (*pairs, *size), dtype)
         add_spec(observation_spec, self.age_key, pairs)
         add_spec(observation_spec, self.mask_key, pairs, torch.bool)

@@ -8,9 +8,9 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.delays.laws import Law
 from damian.delays.samplers import MessageContext, Sampler
-from damian.transforms.base import Entries, Memory, as_rows, sibling_key
+from damian.transforms.base import Memory
+from damian.transforms.entries import Entries, as_rows, sibling_key
 
 
 class ContextReader:
@@ -24,7 +24,6 @@ class ContextReader:
 
     def __init__(
         self,
-        law: Law,
         sampler: Sampler,
         context_keys: Mapping[str, NestedKey] | None,
         dt: float,
@@ -35,7 +34,7 @@ class ContextReader:
         self.keys: dict[str, NestedKey] = {}
         """Keys of the entries that the law reads, by name."""
         for name in (*sampler.reads, *(name for name in sampler.optional_reads if name in known)):
-            should = f"has no key for {name}, which the law {type(law).__name__} reads"
+            should = f"has no key for {name}, which the delay law reads"
             checks.require(name in known, "context_keys", known, should)
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(known[name])))
         self._sees_context, self._dt = sampler.sees_context, dt
@@ -54,17 +53,27 @@ class ContextReader:
         """The context of the messages ``sent`` [M] (None: all) in this step; None if the law sees none."""
         if not self._sees_context:
             return None
-        agents, streams, clock = memory["agents"], memory["streams"], memory["clock"]
+        agents, streams = memory["agents"], memory["streams"]
         n_sending = torch.full_like(streams, len(agents))
         if sent is not None:
             by_world = sent.view(-1, len(agents))
             n_sending = by_world.sum(-1, keepdim=True).expand_as(by_world).reshape(-1)
-        return MessageContext(
-            sender=agents.repeat(len(streams) // len(agents)),
-            receiver=torch.full_like(streams, -1),
-            n_sending=n_sending,
-            time=(clock + self._since_clock - memory["reset_at"]) * self._dt,
-            uniform=counter_rng.uniform(streams, clock + 1),
-            dt=self._dt,
-            entries={name: as_rows(entries[key], rows) for name, key in self.keys.items()},
-        )
+        sender, receiver = agents.repeat(len(streams) // len(agents)), torch.full_like(streams, -1)
+        read = {name: as_rows(entries[key], rows) for name, key in self.keys.items()}
+        return message_context(memory, sender, receiver, n_sending, read, self._dt, self._since_clock)
+
+
+def message_context(
+    memory: Memory,
+    sender: Tensor,
+    receiver: Tensor,
+    n_sending: Tensor,
+    entries: dict[str, Tensor],
+    dt: float,
+    since_clock: int = 0,
+) -> MessageContext:
+    """The context of M messages that are sent ``since_clock`` steps after the clock in a line's memory."""
+    clock = memory["clock"]
+    time = (clock + since_clock - memory["reset_at"]) * dt
+    uniform = counter_rng.uniform(memory["streams"], clock + 1)
+    return MessageContext(sender, receiver, n_sending, time, uniform, dt, entries)

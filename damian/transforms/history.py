@@ -12,17 +12,8 @@ from damian.common import checks
 from damian.common.tensors import expand_mask, gather_rows
 from damian.keys import next_key
 from damian.transforms.action import ActionTransform
-from damian.transforms.base import (
-    Change,
-    Correction,
-    Entries,
-    Memory,
-    add_spec,
-    as_rows,
-    existing,
-    from_rows,
-    sibling_key,
-)
+from damian.transforms.base import Change, Correction, Memory
+from damian.transforms.entries import Entries, add_spec, existing, sibling_key
 
 
 class ActionHistory(ActionTransform):
@@ -103,7 +94,7 @@ class ActionHistory(ActionTransform):
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         recent = memory["recent"]
-        latest = self._encode(memory, as_rows(entries[self.action_key], self.rows))
+        latest = self._encode(memory, self.to_rows(entries[self.action_key]))
         changed = {"recent": torch.cat([recent[:, latest.shape[-1] :], latest], -1)}
         unchanged = {"recent": recent}
         if self.age_key:
@@ -123,13 +114,10 @@ class ActionHistory(ActionTransform):
             not_reflected = since_chosen < self.reflected_after
             width = recent.shape[-1] // self.steps
             recent = torch.where(not_reflected.repeat_interleave(width, -1), recent, memory["first"])
-        history = from_rows(recent, self.rows)
+        history = self.from_rows(recent)
         if key not in entries:
             return memory, {key: history.clone()}  # others may change it in place, but not the memory
         return memory, {key: torch.cat([entries[key], history.to(entries[key].dtype)], -1)}
-
-    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
-        return memory | {"since": memory["since"] + n_steps} if self.age_key else memory
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
         """Keeps the stored past actions, as the last columns of an entry that is computed again."""

@@ -1,30 +1,17 @@
-"""Transforms for clocks that are slower than the environment's (paper, section 3.6), and skipped steps."""
+"""A transform for clocks that are slower than the environment's (paper, section 3.6)."""
 
 from collections.abc import Collection, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
 
-from damian import keys
 from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
 from damian.keys import next_key
-from damian.transforms.base import (
-    Change,
-    Correction,
-    Entries,
-    Memory,
-    StatefulTransform,
-    add_spec,
-    as_rows,
-    existing,
-    from_rows,
-    select_entries,
-    sibling_key,
-)
+from damian.transforms.base import Change, Correction, Memory, StatefulTransform
+from damian.transforms.entries import Entries, existing, select_entries, sibling_key
 
 
 class SampleAndHold(StatefulTransform):
@@ -75,12 +62,12 @@ class SampleAndHold(StatefulTransform):
         first = select_entries(tensordict, self.in_keys)
         device = next((value.device for value in first.values()), self.env.device)
         memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}  # since a tick
-        memory |= {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
+        memory |= {f"held_{i}": self.to_rows(value) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
         for i, key in enumerate(self.in_keys_inv):
             memory[f"action_at_tick_{i}"] = self.as_rows_of_spec(specs[key].zero(), specs, key)
         if self.age_key:
-            memory["age"] = as_rows(tensordict.get(self.age_key), self.rows)
+            memory["age"] = self.to_rows(tensordict.get(self.age_key))
         return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
@@ -101,17 +88,13 @@ class SampleAndHold(StatefulTransform):
             held[self.ready_key] = ready & ticks.view_as(ready)
         return memory, held
 
-    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
-        aged = {"age": memory["age"] + n_steps} if self.age_key else {}
-        return memory | {"elapsed": (memory["elapsed"] + n_steps) % self.period} | aged
-
     def _hold_entries(self, memory: Memory, entries: Entries, sampled: Tensor, n_steps: int) -> Change:
         """Hold the entries ``in_keys``; where they are not sampled, their age grows by ``n_steps``."""
         memory, held = self._hold(memory, entries, self.in_keys, "held", sampled)
         if self.age_key:
-            new = as_rows(entries[self.age_key], self.rows)
+            new = self.to_rows(entries[self.age_key])
             age = torch.where(expand_mask(sampled, new), new, memory["age"] + n_steps)
-            memory, held[self.age_key] = memory | {"age": age}, from_rows(age, self.rows).clone()
+            memory, held[self.age_key] = memory | {"age": age}, self.from_rows(age).clone()
         return memory, held
 
     def _hold(
@@ -120,10 +103,10 @@ class SampleAndHold(StatefulTransform):
         """Sample the entries where the mask [M] is true, and output the held values everywhere."""
         outputs: Entries = {}
         for i, key in enumerate(keys):
-            new, old = as_rows(entries[key], self.rows), memory[f"{name}_{i}"]
+            new, old = self.to_rows(entries[key]), memory[f"{name}_{i}"]
             held = torch.where(expand_mask(sampled, new), new, old)
             memory = memory | {f"{name}_{i}": held}
-            outputs[key] = from_rows(held, self.rows).clone()  # the memory keeps the held values
+            outputs[key] = self.from_rows(held).clone()  # the memory keeps the held values
         return memory, outputs
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
@@ -146,53 +129,3 @@ class SampleAndHold(StatefulTransform):
             return corrected
 
         return Correction(hold_again, lookback=self.period - 1)
-
-
-class SkipUntilReady(StatefulTransform):
-    """Steps each world until some agent can choose an action again, or the episode ends (``clock.skip``).
-
-    The outputs equal, bit for bit, those of stepping until then with actions that no agent executes. Only the
-    rewards ``reward_keys`` are the sums of gamma^k r_k over the merged steps k = 0, 1, ..., and ``duration``,
-    [B, 1] long, is the number of these steps (0 after a reset), as in a semi-Markov decision process (Sutton,
-    Precup and Singh, 1999).
-
-    It works only in a ``DelayedEnv`` on a ``UavEnv``, before all transforms that are not damian's. Transforms
-    of TorchRL that come later process only the merged steps: ``StepCounter`` counts decisions.
-    """
-
-    per_world = True
-
-    def __init__(self, gamma: float = 1.0, reward_keys: Sequence[NestedKey] = (keys.REWARD,)) -> None:
-        checks.in_range("gamma", gamma, 0.0, 1.0)
-        super().__init__(out_keys=[keys.DURATION])
-        self.gamma, self.reward_keys = gamma, list(reward_keys)
-        self.step_keys = [keys.DONE]
-
-    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        return memory, {keys.DURATION: torch.zeros_like(entries[keys.DONE], dtype=torch.long)}
-
-    def on_step(self, memory: Memory, entries: Entries) -> Change:
-        return memory, {keys.DURATION: torch.ones_like(entries[keys.DONE], dtype=torch.long)}
-
-    def skipped_worlds(self, entries: Entries) -> Tensor:
-        """Worlds in which no agent is ready after a step and the episode goes on, [B] bool."""
-        ready, done = entries[keys.READY], entries[keys.DONE]
-        return ~(ready.flatten(1).any(-1) | done.view(-1))
-
-    def merge_steps(self, entries: Entries, later: Entries, stepped: Tensor) -> Entries:
-        """Merge the outputs of a later step into ``entries`` in the worlds ``stepped`` [B] that took it."""
-        duration = entries[keys.DURATION]
-        weight = (self.gamma**duration).view(-1)
-        sums = {k: entries[k] + expand_mask(weight, later[k]) * later[k] for k in self.reward_keys}
-        later = later | sums | {keys.DURATION: duration + 1}
-        return {key: torch.where(expand_mask(stepped, new), new, entries[key]) for key, new in later.items()}
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        raise RuntimeError(
-            "SkipUntilReady works only in a DelayedEnv on a UavEnv, before all transforms that are not "
-            "damian's, and only if all worlds step: the TensorDict must contain neither '_step' nor 'next'"
-        )
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        add_spec(observation_spec, keys.DURATION, (*observation_spec.shape, 1), torch.long)
-        return observation_spec

@@ -9,22 +9,11 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from damian.common import checks
-from damian.delays.laws import law_of, sampler_of
+from damian.delays.laws import sampler_of
 from damian.delays.line import ORDERS, DelayLine, Delivery
-from damian.transforms.base import (
-    Change,
-    Entries,
-    Memory,
-    StatefulTransform,
-    add_spec,
-    as_rows,
-    existing,
-    from_rows,
-    select_entries,
-    sibling_key,
-    spec_rows,
-)
+from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
+from damian.transforms.entries import Entries, add_spec, existing, select_entries, sibling_key, spec_rows
 
 
 class ObservationDelay(StatefulTransform):
@@ -39,8 +28,9 @@ class ObservationDelay(StatefulTransform):
     t = 4 shows observation 1, of age 3.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
-            (``Function``). A delay is drawn for each world, each agent (under a nested key) and each step.
+        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), a function
+            (``Function``), or a ``Sampler``. A delay is drawn for each world, each agent (under a nested
+            key) and each step.
         in_keys: keys of the entries that are sent together, or one key. A bare name for another key means an
             entry beside the first one.
         out_keys: keys under which the received entries are written; if not given, ``in_keys``.
@@ -79,14 +69,13 @@ class ObservationDelay(StatefulTransform):
     ) -> None:
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed)
-        law = law_of(delay)
-        self.draw_from(sampler_of(law, dt, loss))
+        self.sampler = sampler_of(delay, dt, loss)
         self.line = DelayLine(self.sampler, order)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
-        self.extra_keys = existing([self.age_key, self.fresh_key, self.delay_key])
-        self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.row_key)
+        self.out_keys = [*self.out_keys, *existing([self.age_key, self.fresh_key, self.delay_key])]
+        self.contexts = ContextReader(self.sampler, context_keys, dt, self.row_key)
         self.step_keys = existing([*self.in_keys, self.sent_key, *self.contexts.keys.values()])
 
     @property
@@ -95,7 +84,8 @@ class ObservationDelay(StatefulTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
-        memory = self.line.init_memory(values, self.streams(tensordict.batch_size, values[0].device))
+        streams = self.streams(tensordict.batch_size, values[0].device, self.sampler)
+        memory = self.line.init_memory(values, streams)
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
@@ -109,13 +99,13 @@ class ObservationDelay(StatefulTransform):
         return memory, self._outputs(delivery)
 
     def _values(self, entries: Entries) -> list[Tensor]:
-        return [as_rows(entries[key], self.rows) for key in self.in_keys]
+        return [self.to_rows(entries[key]) for key in self.in_keys]
 
     def _outputs(self, delivery: Delivery) -> Entries:
-        # A copy, because the line keeps what it holds.
+        # A copy, because the line keeps what it holds; the other ``out_keys`` follow.
         entries = {
-            key: from_rows(value.clone(), self.rows)
-            for key, value in zip(self.out_keys, delivery.held, strict=True)
+            key: self.from_rows(value.clone())
+            for key, value in zip(self.out_keys, delivery.held, strict=False)
         }
         if self.age_key:
             entries[self.age_key] = delivery.age.to(torch.float32).view(*self.rows, 1)
@@ -127,7 +117,7 @@ class ObservationDelay(StatefulTransform):
         return entries
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+        for key, out_key in zip(self.in_keys, self.out_keys, strict=False):
             if out_key != key:
                 observation_spec[out_key] = observation_spec[key].clone()
         shape = (*spec_rows(observation_spec, self.row_key), 1)

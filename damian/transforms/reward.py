@@ -1,6 +1,7 @@
-"""Transforms that delay rewards and sum them: the latest ones, or an episode's (paper, section 3.5)."""
+"""Transforms that delay rewards, and sum the latest ones (paper, section 3.5)."""
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -12,25 +13,12 @@ from damian import keys
 from damian.common import checks, devices
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask, next_true
-from damian.delays.laws import LOSES, law_of, sampler_of
+from damian.delays.laws import LOSES, sampler_of
 from damian.delays.line import advance_slot, slot_rows
 from damian.keys import next_key
-from damian.transforms.base import (
-    Change,
-    Correction,
-    Entries,
-    Memory,
-    StatefulTransform,
-    add_spec,
-    any_flag,
-    as_rows,
-    existing,
-    flag_keys,
-    from_rows,
-    sibling_key,
-    spec_rows,
-)
+from damian.transforms.base import Change, Correction, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
+from damian.transforms.entries import Entries, add_spec, any_flag, existing, flag_keys, sibling_key, spec_rows
 
 
 class RewardTransform(StatefulTransform):
@@ -83,18 +71,13 @@ class RewardDelay(RewardTransform):
     place.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
-            (``Function``), that loses nothing. A delay is drawn for each world, each agent (under a nested
-            key) and each step.
+        delay, dt, context_keys, seed: as in ``ObservationDelay``; the law must lose nothing.
         reward_key: key of the reward.
-        dt: length of a step [s], for delays given as times.
-        context_keys: keys of the entries that the law may read, by name (``ContextSampler``).
         delay_key: key for the delay of the reward earned in this step [steps], [..., 1] long, 0 after a
             reset. A bare name, here and below, means an entry beside the reward. An actor must not observe
             either.
         earned_key: key for the reward earned in this step, whenever it is received; 0 after a reset.
             Back-updating needs it if no messages tell the reward.
-        seed: as in ``StatefulTransform``.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(Uniform(0, 4)))
@@ -118,27 +101,20 @@ class RewardDelay(RewardTransform):
         self.delay_key, self.earned_key = (
             sibling_key(self.reward_key, key) for key in (delay_key, earned_key)
         )
-        self.extra_keys = existing([self.delay_key, self.earned_key])
-        law = law_of(delay)
-        self.draw_from(sampler_of(law, dt))
+        self.out_keys = [self.reward_key, *existing([self.delay_key, self.earned_key])]
+        self.sampler = sampler_of(delay, dt)
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_slots = self.sampler.longest + 1
-        self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
+        self.contexts = ContextReader(self.sampler, context_keys, dt, self.reward_key)
 
     @property
     def step_keys(self) -> Sequence[NestedKey]:
         return [self.reward_key, *self.done_keys, *self.contexts.keys.values()]
 
-    @property
+    @cached_property
     def done_keys(self) -> list[NestedKey]:
-        """Keys of the flags that end an episode of the reward, read from the environment's specs once."""
-        if "_done_keys" not in self.__dict__:
-            self.__dict__["_done_keys"] = flag_keys("done", self.reward_key, self.env.done_keys)
-        return self.__dict__["_done_keys"]
-
-    def reset_parent(self) -> None:
-        super().reset_parent()
-        self.__dict__.pop("_done_keys", None)
+        """Keys of the flags that end an episode of the reward, by the environment's specs."""
+        return flag_keys("done", self.reward_key, self.env.done_keys)
 
     @property
     def row_dims(self) -> dict[str, int]:
@@ -146,7 +122,7 @@ class RewardDelay(RewardTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)
-        streams = self.streams(tensordict.batch_size, memory["past"].device)
+        streams = self.streams(tensordict.batch_size, memory["past"].device, self.sampler)
         state = self.sampler.initial_state(streams)
         zero = torch.zeros_like(streams)
         memory |= {"clock": zero, "slot": zero.clone(), "streams": streams, "state": state}
@@ -160,11 +136,11 @@ class RewardDelay(RewardTransform):
         if self.sampler.sees_context:
             memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
         memory["time"] = memory["time"] + self.n_slots * mask
-        return memory, self._report(torch.zeros_like(memory["clock"]), torch.zeros_like(memory["past"][0]))
+        return memory, self._told(torch.zeros_like(memory["clock"]), torch.zeros_like(memory["past"][0]))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock = memory["clock"] + 1
-        reward = as_rows(entries[self.reward_key], self.rows)
+        reward = self.to_rows(entries[self.reward_key])
         context = self.contexts.read(memory, entries, None, self.rows)
         delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
         slot = advance_slot(memory["slot"], 1, self.n_slots)
@@ -183,7 +159,7 @@ class RewardDelay(RewardTransform):
             in_transit = late.sum(0, dtype=precise).to(past.dtype)
             received = torch.where(expand_mask(ended, received), received + in_transit, received)
             memory["time"] = memory["time"] + self.n_slots * ended
-        return memory, {self.reward_key: from_rows(received, self.rows)} | self._report(delay, reward)
+        return memory, {self.reward_key: self.from_rows(received)} | self._told(delay, reward)
 
     def _send(self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None) -> Tensor:
         """The slots [K, M, ...] with rewards [M, ...] that arrive after delays [M], in rows that step."""
@@ -201,13 +177,13 @@ class RewardDelay(RewardTransform):
         flat.index_copy_(0, row, added)
         return past
 
-    def _report(self, delay: Tensor, earned: Tensor) -> Entries:
+    def _told(self, delay: Tensor, earned: Tensor) -> Entries:
         """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards [M, ...]."""
         entries: Entries = {}
         if self.delay_key is not None:
-            entries[self.delay_key] = from_rows(delay.unsqueeze(-1).clone(), self.rows)
+            entries[self.delay_key] = self.from_rows(delay.unsqueeze(-1).clone())
         if self.earned_key is not None:
-            entries[self.earned_key] = from_rows(earned.clone(), self.rows)
+            entries[self.earned_key] = self.from_rows(earned.clone())
         return entries
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
@@ -272,10 +248,10 @@ class CumulativeReward(RewardTransform):
         self.n_slots, self.gamma = steps, gamma
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        reward = as_rows(entries[self.reward_key], self.rows)
+        reward = self.to_rows(entries[self.reward_key])
         past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
         total = discounted_sum(past, self.gamma)
-        return memory | {"past": past}, {self.reward_key: from_rows(total, self.rows)}
+        return memory | {"past": past}, {self.reward_key: self.from_rows(total)}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
         old = reward_spec[self.reward_key]
@@ -307,37 +283,3 @@ def discounted_sum(past: Tensor, gamma: float) -> Tensor:
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
     weighted = weights.view(-1, *[1] * (past.dim() - 1)) * past
     return weighted.sum(0, dtype=torch.float64).to(dtype)
-
-
-class EpisodeTotals(StatefulTransform):
-    """Writes each episode's sum of rewards and number of steps, within the step of a ``DelayedEnv``."""
-
-    stage = "history"
-    sees_merged_steps_only = True
-    per_world = True
-
-    def __init__(self) -> None:
-        super().__init__(keys.REWARD, [keys.EPISODE_REWARD, keys.STEP_COUNT])
-        self.step_keys = self.in_keys
-
-    def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        reward = self.env.full_reward_spec[keys.REWARD].zero()
-        return {"total": reward, "count": torch.zeros(len(reward), 1, dtype=torch.long, device=reward.device)}
-
-    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory = {name: old.masked_fill(expand_mask(mask, old), 0) for name, old in memory.items()}
-        return memory, self._outputs(memory)
-
-    def on_step(self, memory: Memory, entries: Entries) -> Change:
-        memory = {"total": memory["total"] + entries[keys.REWARD], "count": memory["count"] + 1}
-        return memory, self._outputs(memory)
-
-    def _outputs(self, memory: Memory) -> Entries:
-        # Copies, because others may change what a step outputs in place.
-        return {keys.EPISODE_REWARD: memory["total"].clone(), keys.STEP_COUNT: memory["count"].clone()}
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        reward = self.env.full_reward_spec[keys.REWARD]
-        add_spec(observation_spec, keys.EPISODE_REWARD, reward.shape, reward.dtype)
-        add_spec(observation_spec, keys.STEP_COUNT, (*observation_spec.shape, 1), torch.long)
-        return observation_spec

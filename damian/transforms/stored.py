@@ -6,8 +6,9 @@ from typing import Any, cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import make_composite_from_td
 
 from damian.common.errors import InputError
 from damian.keys import ENDS, last_part
@@ -147,12 +148,5 @@ def _read_action_specs(
 
 def _specs_of(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Composite:
     """Specs without bounds of the entries of these keys."""
-    specs = Composite(shape=tensordict.batch_size, device=tensordict.device)
-    for key, value in tensordict.select(*keys).items():
-        if isinstance(value, TensorDictBase):
-            specs[key] = _specs_of(value, _leaves(value))
-        elif value.dtype == torch.bool:
-            specs[key] = Binary(shape=value.shape, dtype=torch.bool, device=value.device)
-        else:
-            specs[key] = Unbounded(value.shape, dtype=value.dtype, device=value.device)
-    return specs
+    specs = make_composite_from_td(tensordict.select(*keys), unsqueeze_null_shapes=False)
+    return specs.to(tensordict.device) if tensordict.device else specs

@@ -10,17 +10,8 @@ from torchrl.data import Composite
 from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.keys import next_key
-from damian.transforms.base import (
-    Change,
-    Correction,
-    Entries,
-    Memory,
-    StatefulTransform,
-    add_spec,
-    existing,
-    sibling_key,
-    spec_rows,
-)
+from damian.transforms.base import Change, Correction, Memory, StatefulTransform
+from damian.transforms.entries import Entries, add_spec, existing, sibling_key, spec_rows
 
 _NEVER = 2**31
 """Steps until the arrival of a message that never arrives."""
@@ -102,23 +93,13 @@ class ObservationTimeline(StatefulTransform):
         memory = self._added(memory, self._sent(entries.__getitem__))
         return memory, self._written(memory)
 
-    def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """Note the message [...] of an agent that arrives in the next step, ``lag`` >= 1 steps late."""
-        if lag > self.slots:
-            return memory
-        row = {"kept": self._encoded(message.view(1, 1, -1)).view(-1), "due": 1, "sent": True}
-        memory = memory | {name: memory[name].clone() for name in row}
-        for name, value in row.items():
-            memory[name][agent, lag - 1] = value
-        return memory
-
     def _sent(self, entry: Callable[[NestedKey], Tensor]) -> dict[str, Tensor]:
         """The messages of a step, or of many, by the names of the memory; ``entry`` returns an entry.
 
         ``kept`` [..., D], the steps until they are ``due`` at each of R receivers [..., R], whether one was
         ``sent`` [...], and the ``position`` of the observer [..., P].
         """
-        kept = self._encoded(entry(self.row_key))
+        kept = self.encoded(entry(self.row_key))
         sent = torch.ones_like(kept[..., 0], dtype=torch.bool)
         if self.sent_key is not None:
             sent = entry(self.sent_key).view(sent.shape)
@@ -203,12 +184,13 @@ class ObservationTimeline(StatefulTransform):
         found = self._timeline(stacked, torch.stack(arrived, 1))
         return entries | {next_key(self.out_keys[0]): found.view(*after["sent"].shape, *found.shape[1:])}
 
-    def _encoded(self, message: Tensor) -> Tensor:
+    def encoded(self, message: Tensor) -> Tensor:
+        """The numbers to keep of messages, [..., D]."""
         return message if self.encode is None else self.encode(message)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         spec, rows = observation_spec[self.row_key], spec_rows(observation_spec, self.row_key)
-        encoded = self._encoded(spec.zero())
+        encoded = self.encoded(spec.zero())
         shape = (*rows, *rows[-1:] * self.group, self.slots, encoded.shape[-1] + 1)
         dtype = torch.promote_types(encoded.dtype, torch.float32)
         add_spec(observation_spec, self.out_keys[0], shape, dtype)

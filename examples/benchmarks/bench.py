@@ -249,9 +249,8 @@ def steps_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
 
 def graphs_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
     """Call the compiled graph of a step with the same actions again and again, without any TensorDict."""
-    stateful, _ = env._split_transforms()
-    memories, entries = env._step_inputs(stateful, env.rand_action(following))
-    step, worlds = env._method("_whole_step_and_reset", *stateful, *entries), env.uav_env.worlds
+    memories, entries = env._step_inputs(env._fused(), env.rand_action(following))
+    step, worlds = env._compiled_fn("step_and_reset_fn", *entries), env.uav_env.worlds
     with torch.no_grad():
         for _ in range(steps):
             worlds, memories, _, _ = step(worlds, memories, entries)

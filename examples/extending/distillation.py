@@ -21,7 +21,6 @@ from torchrl.envs import EnvBase
 
 from damian import LearnerConfig, LearningSetup, keys, make_env
 from damian.common import checks
-from damian.envs.pipeline import has_message_delay
 from damian.recipes.shared.runs import stored_config
 from damian.runs.training_state import load_networks
 
@@ -93,7 +92,7 @@ def load_teacher(folder: str, env: EnvBase) -> Any:
     key = "learner.teacher"
     checks.require(bool(folder), key, "''", "is missing: the run folder of a policy trained without delay")
     config = stored_config(Path(folder), key)
-    checks.require(not has_message_delay(config), key, folder, "was trained with delayed messages")
+    checks.require(not config.delays.obs.late, key, folder, "was trained with delayed messages")
     world = make_env(config.eval_scenario, 1, device=env.device)
     spec, wanted = env.full_action_spec_unbatched[keys.ACTION], world.full_action_spec_unbatched[keys.ACTION]
     should = "chooses from other actions, or from continuous ones"

@@ -57,7 +57,8 @@ from damian.learners.sac import Sac, SacConfig
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.time_storage import TimeStorage
 from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline, set_seed
-from damian.transforms.base import Correction, Entries
+from damian.transforms.base import Correction
+from damian.transforms.entries import Entries
 
 AWARE = ("history", "buffer", "timeline")  # arms that observe their latest actions
 ARMS = ("undelayed", "naive", *AWARE, *(f"{arm}+bpql" for arm in AWARE))

@@ -19,7 +19,7 @@ from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.pipeline import make_env
 from damian.recipes.cli import settings
 from damian.recipes.config import TrainConfig
 from damian.runs.metrics import Evaluation, evaluate
@@ -32,7 +32,7 @@ KNOWN_ON_TIME = ("what has arrived", "its own messages", "all messages", "the so
 
 def script_rows(config: TrainConfig) -> dict[str, Evaluation]:
     """Evaluations of the script, in the same episodes, by what is known on time."""
-    checks.require(has_message_delay(config), "delay.obs", config.delay.obs, "leaves no message late or lost")
+    checks.require(config.delays.obs.late, "delay.obs", config.delay.obs, "leaves no message late or lost")
     should = "is nothing that the script seeks: it finds sources, of which the server knows"
     checks.require(
         config.seeks_source and config.links.kind == "server", "scenario", config.links.kind, should

@@ -51,7 +51,8 @@ from damian.learners.base import LearningSetup
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.transforms.base import Correction, Entries
+from damian.transforms.base import Correction
+from damian.transforms.entries import Entries
 
 Delays = tuple[int, int]
 """The shortest and the longest delay of a message [steps]; all between are equally likely."""

@@ -13,12 +13,12 @@ from torchrl.envs import TransformedEnv
 
 from damian import keys
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.episode_totals import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
 from damian.server.server import Server
-from damian.transforms.reward import EpisodeTotals
 
 from ..config import TrainConfig
 from .settings import backupdates, measures_hindsight

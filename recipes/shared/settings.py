@@ -2,8 +2,6 @@
 
 from damian import keys
 from damian.common import checks
-from damian.delays.scenario import check_laws, delay_sampler, link_reads
-from damian.envs.pipeline import has_delay, has_message_delay
 from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
 from damian.runs.loggers import check_loggers
@@ -18,13 +16,7 @@ from ..config import TrainConfig
 
 def late(config: TrainConfig) -> list[str]:
     """Settings by which messages, actions or rewards are late."""
-    found = [f"delay.{name}" for name in ("act", "rew") if has_delay(config, name)]
-    return [*["delay.obs"] * has_message_delay(config), *found]
-
-
-def longest_delay(config: TrainConfig) -> int:
-    """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
-    return max(delay_sampler(config.delay, kind, config.clock.dt).longest for kind in ("obs", "rew"))
+    return [f"delay.{name}" for name in ("obs", "act", "rew") if getattr(config.delays, name).late]
 
 
 def measures_hindsight(config: TrainConfig) -> bool:
@@ -34,13 +26,13 @@ def measures_hindsight(config: TrainConfig) -> bool:
 
 def action_delay(config: TrainConfig) -> int | None:
     """Delay of every action [steps of the training]; None if it differs between actions."""
-    delay = delay_sampler(config.delay, "act", config.clock.dt).constant_delay
+    delay = config.delays.act.constant_delay
     return None if delay and config.clock.skip else delay  # a step of the training then has any length
 
 
 def backupdates(config: TrainConfig) -> bool:
     """Is back-updating switched on, and can any message or reward be late or lost?"""
-    return config.backupdate and (has_message_delay(config) or has_delay(config, "rew"))
+    return config.backupdate and (config.delays.obs.late or config.delays.rew.late)
 
 
 def learning_setup(config: TrainConfig) -> LearningSetup:
@@ -52,7 +44,7 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
         worlds=config.worlds,
         shortest_period=clock.shortest,
         longest_period=clock.longest,
-        longest_delay=longest_delay(config),
+        longest_delay=config.delays.longest,
         backupdate=backupdates(config),
         settle=config.settle,
         recompute_actor="actor" in config.corrected,
@@ -68,8 +60,7 @@ def check_components(config: TrainConfig) -> None:
     checks.device("device", config.device)
     REGION_SOURCES.get(config.region.kind, "region.kind")
     MOTION_MODELS.get(config.motion.kind, "motion.kind")
-    check_laws(config.delay, config.clock.dt)
-    link_reads(config.links, config.clock.dt)
+    _ = config.delays
     check_features(config.observation)
     terms_of(config.reward)
     sensors_of(config.sensors)
@@ -90,7 +81,7 @@ def check_learning(config: TrainConfig) -> None:
 
 def _check_backupdate(config: TrainConfig) -> None:
     """Check what goes with back-updating only, and what it needs."""
-    no_messages = not (config.backupdate and has_message_delay(config))
+    no_messages = not (config.backupdate and config.delays.obs.late)
     problem = "reads hindsight, which needs aware=backupdate and a message delay (delay.obs)"
     unable = "hindsight" in config.learner.reads and no_messages
     checks.require(not unable, "learner", config.learner.name, problem)

@@ -12,7 +12,6 @@ from damian import compose_scenario
 from damian.common import counter_rng
 from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform, in_steps, law_of
 from damian.delays.samplers import Sampler
-from damian.delays.scenario import delay_sampler
 
 STREAMS, STEPS = 1000, 100
 """Size of a sample: 10^5 messages."""
@@ -118,7 +117,7 @@ def test_a_trace_is_played_in_order_from_a_random_start_and_wraps_around(tmp_pat
 def test_the_measured_trace_of_the_package_is_played_back():
     rows = (files("damian") / "data" / "queue_trace.csv").read_text(encoding="utf-8").split()[1:]
     arrive = [float(row.removesuffix("s")) for row in rows if row != "lost"]
-    measured = delay_sampler(compose_scenario("delay=measured").delay, "obs", 1.0)
+    measured = compose_scenario("delay=measured").delays.obs
     assert 1000 <= len(rows) <= 3000
     assert measured.longest == math.ceil(max(arrive)) == 8
     played = sample(measured, 2, len(rows)).T.tolist()

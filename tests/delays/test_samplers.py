@@ -8,8 +8,7 @@ from delay_twin import drawn
 from torch import Tensor
 
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Constant, Distance, Held, Lag, Law, Uniform
-from damian.delays.line import BroadcastLine, DelayLine
+from damian.delays.laws import Distance, Lag, Uniform
 from damian.delays.samplers import (
     ContextSampler,
     LinkSampler,
@@ -19,7 +18,7 @@ from damian.delays.samplers import (
     TableSampler,
 )
 
-LAW, SENDERS = Uniform(1, 5), 20_000
+SENDERS = 20_000
 
 
 def require_share(found: Tensor, expected: float) -> None:
@@ -28,76 +27,7 @@ def require_share(found: Tensor, expected: float) -> None:
     assert abs(found.double().mean().item() - expected) < 5 * deviation
 
 
-# Worked timelines of the docstrings.
-
-
-@pytest.mark.parametrize(("order", "ages"), [("generation", [1, 2, 0, 1]), ("arrival", [1, 2, 0, 3])])
-def test_the_timeline_of_a_delay_line(order, ages):
-    line, zero = DelayLine(Recorded([3, 1, 0, 2], 0.0), order), torch.zeros(1, dtype=torch.long)
-    memory = line.init_memory([torch.zeros(1)], zero) | {"state": zero}
-    for t, age in enumerate(ages, 1):
-        memory, delivery = line.step(memory, [torch.tensor([float(t)])], None)
-        assert delivery.age.item() == age
-        assert delivery.held[0].item() == t - age
-
-
-def test_the_timeline_of_a_broadcast_line():
-    line, zero = BroadcastLine(Recorded([1, 3], 0.0)), torch.zeros(2, dtype=torch.long)
-    memory = line.init_memory([torch.zeros(1)], zero, zero) | {"state": torch.tensor([0, 1])}
-    sent, nothing, held = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool), []
-    for t in range(4):
-        line.write(memory, [torch.tensor([10.0 + t])])
-        memory, _ = line.step(memory, nothing if t else sent)
-        held.append(line.held(memory)[0].tolist())
-    assert held == [[0.0, 0.0], [10.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
-
-
-# Lags.
-
-
-def sample(lag: Lag, n_senders: int, n_steps: int, loss: float = 0.0) -> Tensor:
-    """Delays of one episode, [T, M]."""
-    return drawn(lag.sampler(loss=loss), counter_rng.world_seeds(5, n_senders), n_steps)
-
-
-@pytest.mark.parametrize("probability", [0.0, 0.3, 0.95])
-def test_an_update_keeps_the_lag_with_the_hold_probability(probability):
-    delays = sample(Lag(Uniform(0, 999), 2, hold_probability=probability), 2000, 41)
-    kept = delays[1:] == delays[:-1]
-    assert kept[::2].all()
-    require_share(kept[1::2], probability + (1 - probability) / 1000)
-
-
 # States.
-
-
-@pytest.mark.parametrize(
-    "law",
-    [
-        Burst(0.1, 0.2, good=1, bad=4),
-        Burst(0.1, 0.2, good=Uniform(0, 3), bad=2, good_loss=1.0, bad_loss=0.0),
-        Lag(Uniform(0, 3), "episode"),
-        Constant(2),
-    ],
-    ids=str,
-)
-def test_held_messages_are_as_late_as_the_longest_and_the_same_are_lost_from_the_first_draw_on(law: Law):
-    """From the state of the first draw, and after a reset in half of the rows, too."""
-    for loss in (0.0, 0.3):
-        free, held = law.sampler(loss=loss), Held(law).sampler(loss=loss)
-        assert (held.longest, held.loses) == (free.longest, free.loses)
-        assert held.constant_delay == (None if free.loses else free.longest)
-        streams, found = counter_rng.world_seeds(5, 500), []
-        for sampler in (free, held):
-            state = sampler.initial_state(streams)
-            for clock in range(1, 11):
-                if clock == 6:
-                    state = sampler.begin_episode(state, streams % 2 == 0)
-                delay, state = sampler(streams, torch.tensor(clock), state)
-                found.append((delay, state))
-        for (one, state), (other, held_state) in zip(found[:10], found[10:], strict=True):
-            assert other.equal(torch.where(one == free.lost, held.lost, held.longest))
-            assert held_state.equal(state)
 
 
 class Doubling(Sampler):

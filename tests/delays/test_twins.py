@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from context_law import LONGEST, Crowd, twin_delay
-from delay_twin import Counting, Purse, Receiver
+from delay_twin import Counting, Purse, Receiver, drawn
 from delayed_envs import choices as uav_choices
 from helpers import everything, play
 from transform_cases import (
@@ -25,16 +25,19 @@ from transform_cases import (
     column,
     delayed,
 )
+from transform_cases import (
+    LAWS as TABLES,
+)
 
 from damian.common import counter_rng
 from damian.delays.config import DelayConfig
-from damian.delays.laws import Lag, Law, Uniform
+from damian.delays.laws import Lag, Uniform
 from damian.envs.pipeline import make_env
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 Route: Any = runpy.run_path(str(Path(__file__).parents[2] / "examples/extending/law.py"))["Route"]
 DT = 2.0
-LAWS: dict[str, Law] = {
+LAWS: dict[str, Any] = {
     "each message": Lag(Uniform(1, 5)),
     "time": Lag(Uniform(1, 5), "8s"),
     "episode": Lag(Uniform(1, 5), "episode"),
@@ -43,7 +46,12 @@ LAWS: dict[str, Law] = {
     "context": Crowd("seen", column=4),
     "state of one's own": Route(4, change=0.6),
 }
-every_law = pytest.mark.parametrize("name", LAWS)
+"""Laws that hold delays, read contexts, or keep a state of their own; ``TABLES`` have the others."""
+
+
+@pytest.fixture(params=[*TABLES, *LAWS])
+def law(request, tmp_path):
+    return LAWS[request.param] if request.param in LAWS else TABLES[request.param](tmp_path)
 
 
 class LagSender:
@@ -109,56 +117,74 @@ class RouteSender(LagSender):
         return None if self.share(now, 0) < self.loss else self.delay
 
 
-def senders(transform: Any, law: Law, loss: float = 0.0, first: int = 1) -> list[LagSender]:
+class TableSender(LagSender):
+    """Delays of one sender's messages as the sampler itself draws them, from ``drawn``."""
+
+    def __init__(self, delays: list[int], lost: int) -> None:
+        self.delays = [None if delay == lost else delay for delay in delays]
+
+    def begin(self) -> None:
+        """The draws go on."""
+
+    def send(self, now: int, value: float, n_sending: int) -> int | None:
+        return self.delays[now - 1]
+
+
+def senders(transform: Any, law: Any, loss: float = 0.0, first: int = 1) -> list[LagSender]:
     """A sender for each row, with the random stream of the transform."""
-    streams = transform.memory["streams"].tolist()
-    assert len(set(streams)) >= len(WORLDS), "worlds draw apart"
-    own = {Lag: LagSender, Route: RouteSender}.get(type(law))
-    return [
-        own(law, stream, loss) if own else CrowdSender(n, stream, loss, first)
-        for stream, (_, n) in zip(streams, ROWS, strict=True)
-    ]
+    streams, sampler = transform.memory["streams"], transform.sampler
+    own = {Lag: LagSender, Route: RouteSender, Crowd: CrowdSender}.get(type(law))
+    if own is None:
+        return [TableSender(d, sampler.lost) for d in drawn(sampler, streams, STEPS).T.tolist()]
+    assert len(streams.unique()) >= len(WORLDS), "worlds draw apart"
+    pairs = zip(streams.tolist(), ROWS, strict=True)
+    return [own(n, s, loss, first) if own is CrowdSender else own(law, s, loss) for s, (_, n) in pairs]
 
 
-def options(name: str) -> dict[str, Any]:
+def options(law: Any) -> dict[str, Any]:
     """Arguments of a transform that delays by this law."""
-    return {"dt": DT, "context_keys": {"seen": "observation"} if name == "context" else None}
+    keys = {"context_keys": {"seen": "observation"}} if isinstance(law, Crowd) else {}
+    return keys | {"dt": DT if type(law) in (Lag, Crowd, Route) else 1.0}
 
 
-@every_law
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("order", "loss", "sent_key"), [("generation", 0.0, None), ("arrival", 0.25, "message_sent")]
 )
-def test_messages_are_as_late_as_the_twin_says(name, order, loss, sent_key):
-    law, further = LAWS[name], {"loss": loss, "order": order, "sent_key": sent_key, "delay_key": "delay"}
-    transform = ObservationDelay(law, [OBSERVATION], [("agents", "held")], **further, **options(name))
+def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sent_key):
+    further = {"loss": loss, "order": order, "sent_key": sent_key, "fresh_key": "fresh", "delay_key": "delay"}
+    transform = ObservationDelay(law, [OBSERVATION], [("agents", "seen")], **further, **options(law))
     outputs = play(delayed(transform), choices())
     observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
-    held, found = column(outputs, "agents", "held"), column(outputs, "agents", "delay")
-    done, seen = column(outputs, "done"), set()
+    found = {key: column(outputs, "agents", key) for key in ("seen", "age", "fresh", "delay")}
+    done = column(outputs, "done")
     for sender, (w, n) in zip(senders(transform, law, loss), ROWS, strict=True):
         receiver = Receiver(order)
         receiver.begin(0, observed[0][w][n])
         for now in range(1, STEPS + 1):
-            at = 2 * now - 1
+            at, reset = 2 * now - 1, 2 * now
             n_sending = sum(message_sent[at][w]) if sent_key else N_AGENTS
             delay = sender.send(now, observed[at][w][n][4], n_sending)
             delay = delay if sent_key is None or message_sent[at][w][n] else None
-            receiver.step(now, observed[at][w][n], delay)
-            assert found[at][w][n] == [-1 if delay is None else delay]
-            assert held[at][w][n] == receiver.holds.content
-            seen.add(delay)
+            fresh, held = receiver.step(now, observed[at][w][n], delay), receiver.holds
+            told = -1 if delay is None else delay
+            assert [found[key][at][w][n] for key in found] == [
+                held.content,
+                [now - held.sent],
+                [fresh],
+                [told],
+            ]
             if done[at][w][0]:
-                receiver.begin(now, observed[at + 1][w][n])
+                receiver.begin(now, observed[reset][w][n])
                 sender.begin()
-    assert len(seen) > 3
+                assert [found[key][reset][w][n] for key in found] == [observed[reset][w][n], [0], [True], [0]]
 
 
-@every_law
-def test_actions_are_as_late_as_the_twin_says(name):
-    law, chosen, default, loss = LAWS[name], choices(), 5, 0.2
-    further = {"sent_key": "ready", "default": default, "loss": loss}
-    transform = ActionDelay(law, ACTION, **further, **options(name))
+@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
+def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key):
+    chosen, default = choices(), 5
+    further = {"sent_key": sent_key, "valid_key": "action_valid", "default": default, "loss": loss}
+    transform = ActionDelay(law, ACTION, **further, **options(law))
     outputs = play(delayed(transform), chosen)
     seen, ready = before(outputs, *OBSERVATION), before(outputs, "agents", "ready")
     observed, done = after(outputs, *OBSERVATION), after(outputs, "done")
@@ -166,27 +192,37 @@ def test_actions_are_as_late_as_the_twin_says(name):
         receiver = Receiver("generation")
         receiver.begin(0, default)
         for t in range(STEPS):
-            delay = sender.send(t + 1, seen[t][w][n][4], sum(ready[t][w]))
-            receiver.step(t + 1, chosen[t][w, n].item(), delay if ready[t][w][n] else None)
-            assert observed[t][w][n][5] == receiver.holds.content
+            delay = sender.send(t + 1, seen[t][w][n][4], sum(ready[t][w]) if sent_key else N_AGENTS)
+            sent = sent_key is None or ready[t][w][n]
+            fresh = receiver.step(t + 1, chosen[t][w, n].item(), delay if sent else None)
+            assert observed[t][w][n][5:] == [receiver.holds.content, fresh or receiver.waits]
             if done[t][w][0]:
                 receiver.begin(t + 1, default)
                 sender.begin()
 
 
-@every_law
-def test_rewards_are_as_late_as_the_twin_says_and_none_is_lost(name):
-    law = Crowd("seen", column=4, loses=False) if name == "context" else LAWS[name]
+@pytest.mark.sample(2)
+def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
+    law = Crowd("seen", column=4, loses=False) if isinstance(law, Crowd) else law
     earned = after(play(Counting(WORLDS, N_AGENTS), choices()), *REWARD)
-    transform = RewardDelay(law, REWARD, **options(name))
+    transform = RewardDelay(law, REWARD, delay_key="reward_delay", earned_key="earned", **options(law))
     outputs = play(delayed(transform), choices())
     seen, received, done = after(outputs, *OBSERVATION), after(outputs, *REWARD), after(outputs, "done")
+    reported, known = (after(outputs, "agents", name) for name in ("reward_delay", "earned"))
+    assert known == earned
+    assert received == after(play(delayed(RewardDelay(law, REWARD, **options(law))), choices()), *REWARD)
     for sender, (w, n) in zip(senders(transform, law), ROWS, strict=True):
-        purse = Purse()
+        purse, in_transit = Purse(), 0.0
         for t in range(STEPS):
-            delay = sender.send(t + 1, seen[t][w][n][4], N_AGENTS) or 0
-            ended = done[t][w][0]
-            assert received[t][w][n][0] == purse.step(t, earned[t][w][n][0], delay, ended)
+            delay, reward, ended = (
+                sender.send(t + 1, seen[t][w][n][4], N_AGENTS) or 0,
+                earned[t][w][n][0],
+                done[t][w][0],
+            )
+            assert reported[t][w][n] == [delay]
+            assert received[t][w][n][0] == purse.step(t, reward, delay, ended)
+            in_transit += reward - received[t][w][n][0]
+            assert not ended or in_transit == 0
             if ended:
                 sender.begin()
 

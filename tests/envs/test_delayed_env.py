@@ -20,6 +20,7 @@ from torchrl.envs.utils import check_env_specs
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.episode_totals import EpisodeTotals
 from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.keys import (
@@ -34,7 +35,6 @@ from damian.keys import (
     REWARD,
 )
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
-from damian.transforms.reward import EpisodeTotals
 from damian.world.landing import ActionConfig
 
 # Without delays.

@@ -18,7 +18,8 @@ from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import Outputs
-from damian.transforms.base import Entries, Memory, StatefulTransform
+from damian.transforms.base import Memory, StatefulTransform
+from damian.transforms.entries import Entries
 from damian.world.state import PackedState
 
 LATE = DelayConfig(obs={"law": "geometric", "mean": 2}, rew={"law": "uniform", "low": 0, "high": 30})
@@ -113,8 +114,8 @@ def step_and_reset(
 ) -> tuple[Outputs, Outputs]:
     """The outputs of a step, and of a reset of some worlds."""
     with torch.no_grad():
-        worlds, memories, stepped = env._whole_step(worlds, memories, entries)
-        return stepped, env._whole_reset(worlds, memories, mask)[2]
+        worlds, memories, stepped = env.step_fn(worlds, memories, entries)
+        return stepped, env.reset_fn(worlds, memories, mask.view(-1))[2]
 
 
 @pytest.fixture

@@ -1,45 +1,21 @@
 """``make_env``: the messages that the server holds, the action history, and clocks."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
-from delayed_envs import DELAYS, PAPER, choices, delayed, every_delay
-from helpers import FLYING, KEEPS_GOING, all_same, both_motions, everything, play, square
+from delayed_envs import choices, delayed
+from helpers import FLYING, KEEPS_GOING, all_same, everything, play, square
 
 from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
+from damian.envs.config import ClockConfig
 from damian.envs.pipeline import action_codes
 from damian.envs.uav_env import UavEnv
-from damian.keys import ACTION, AGE, OBSERVATION, READY, RECEIVED
+from damian.keys import ACTION, OBSERVATION, READY, RECEIVED
 from damian.world.landing import action_table
 from damian.world.messages import Messages
-from damian.world.signal_source import SourceConfig
 
 # The messages that the server holds, and their age of information.
-
-
-@pytest.mark.sample(4)
-@every_delay
-@both_motions
-def test_the_age_of_every_held_message_is_right(delays, motion):
-    delay = DELAYS[delays]["delay"]
-    env = delayed(everything(motion, delay=delay, clock=ClockConfig("2s")), 8)
-    outputs, dt = play(env, choices(env, 30)), env.scenario.clock.dt
-    steps, n_old = torch.zeros(8, 1), 0
-    for stepped, following in zip(outputs[1::2], outputs[2::2], strict=True):
-        steps += 1
-        for td in (stepped, following):
-            age = td[AGE].squeeze(-1)
-            assert Messages.unpack(td[RECEIVED]).time.equal((steps - age) * dt)
-            n_old += (age > 1).sum().item()
-            steps = steps * ~stepped["done"]  # ``following`` is output after the reset
-        assert following[AGE].squeeze(-1)[stepped["done"].squeeze(-1)].sum() == 0
-    assert n_old > 15
-
-
-SILENT = SourceConfig(emission="per_step", emission_probability=0.0)
 
 
 def test_the_action_history_holds_the_chosen_displacements_east_and_north():
@@ -80,35 +56,6 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
 
 
 # Clocks.
-
-
-def with_clocks(motion: str = "instant", act: Any = 0, **clocks: str) -> ScenarioConfig:
-    """A scenario with these clocks in which no UAV hears the source, so that motion counts never restart."""
-    delay = DelayConfig(obs=PAPER, act=act, history=2)
-    options = {"episode": KEEPS_GOING, "delay": delay, "clock": ClockConfig(**clocks)}
-    return everything(motion, source=SILENT, **options)
-
-
-def test_between_two_ticks_of_their_clock_uavs_do_not_act():
-    env = delayed(with_clocks(agents="3s"))
-    td, n_moves = env.reset(), 0
-    for t, action in enumerate(choices(env, 30)):
-        ticks = t % 3 == 0
-        assert (td[READY] == ticks).all()
-        before = env.base_env.state
-        _, following = env.step_and_maybe_reset(td.clone().set(ACTION, action))
-        after = env.base_env.state
-        assert after.motions.equal(before.motions + ticks)
-        if not ticks:
-            assert after.position.equal(before.position)
-            assert after.sent.trail.equal(before.sent.trail)
-            assert after.track.equal(before.track)
-            assert following[OBSERVATION][..., -4:].equal(td[OBSERVATION][..., -4:])  # the action history
-        if t % 3 < 2:
-            assert following[OBSERVATION][..., :-4].equal(td[OBSERVATION][..., :-4])
-        n_moves += (after.position != before.position).any().item()
-        td = following
-    assert n_moves > 5
 
 
 @pytest.mark.sample(2)

@@ -7,9 +7,8 @@ import torch
 from delayed_envs import DELAYS
 from helpers import all_same, everything
 from torchrl.collectors import Collector
-from torchrl.envs import GymEnv, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs import RewardSum, StepCounter
 
-from damian import ObservationDelay, Uniform
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
@@ -67,20 +66,3 @@ def test_a_state_as_torchrls_collector_saves_it_leaves_the_worlds():
     env.load_state_dict(collector.state_dict()["env_state_dict"])
     assert env.uav_env.worlds is before
     collector.shutdown()
-
-
-def collecting() -> Collector:
-    delay = ObservationDelay(Uniform(3, 6), "observation", "received", seed=0)
-    return Collector(TransformedEnv(GymEnv("Pendulum-v1"), delay), frames_per_batch=20, total_frames=40)
-
-
-def test_a_collector_that_loads_a_state_shows_messages_of_its_own_episode():
-    one, other = collecting(), collecting()
-    next(iter(one))
-    other.load_state_dict(one.state_dict(), strict=False)  # random actions have no state
-    steps = next(iter(other))
-    made = torch.cat([steps["observation"][:1], steps["next", "observation"]])
-    age = steps["next", "age"].flatten().long()
-    assert steps["next", "received"].equal(made[torch.arange(1, 21) - age])
-    for collector in (one, other):
-        collector.shutdown()

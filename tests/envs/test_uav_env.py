@@ -28,10 +28,9 @@ from damian.world.landing import ActionConfig
 
 
 @both_motions
-@pytest.mark.parametrize("delayed", [False, True], ids=["bare", "with delays"])
-def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion, delayed):
+def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
     delay = DelayConfig(obs={"law": "burst"}, act={"law": "uniform", "low": 0, "high": 2}, rew=1, history=2)
-    scenario = everything(motion, **({"delay": delay} if delayed else {}))
+    scenario = everything(motion, delay=delay)
     skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
     td, other = skipping.reset(), steady.reset()
     generator = torch.Generator().manual_seed(0)

@@ -10,9 +10,9 @@ from tensordict import TensorDict
 from damian import keys, make_env
 from damian.delays.config import LinkConfig
 from damian.envs.config import ScenarioConfig
+from damian.envs.nodes import OnboardNode
 from damian.learners.config import ModelConfig
 from damian.server.config import ObservationConfig
-from damian.transforms.server_node import OnboardNode
 
 WINDOW = 2
 WIDTH = 2 * WINDOW + 4

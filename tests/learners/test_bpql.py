@@ -13,11 +13,11 @@ from damian import keys
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
+from damian.envs.recompute import server_recompute
 from damian.learners.config import BpqlConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac
 from damian.replay.backupdate import BackupdateStorage
-from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
 
 SMALL, LONGEST = ModelConfig(hidden=[16]), 5

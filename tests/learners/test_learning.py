@@ -15,11 +15,11 @@ from damian import keys
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
+from damian.envs.recompute import server_recompute
 from damian.envs.uav_env import UavEnv
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import server_recompute
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig

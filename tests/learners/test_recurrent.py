@@ -13,12 +13,12 @@ from torchrl.envs import EnvBase, StepCounter
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
+from damian.envs.recompute import server_recompute
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
 from damian.learners.networks import ModelConfig, make_actor
 from damian.recipes.shared.collectors import make_collector
 from damian.replay.backupdate import BackupdateStorage
-from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
 
 GRU = ModelConfig(hidden=[16, 8], rnn="gru")

@@ -9,7 +9,6 @@ import pytest
 from omegaconf import OmegaConf
 
 import damian
-from damian.delays.scenario import delay_sampler
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
@@ -105,7 +104,7 @@ def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, m
     found = [config.frames, config.seed, *config.model.hidden, config.worlds, config.episode.max_steps]
     assert found == [1_000_000, 7, 100, 64, 20, 30]
     assert {type(number) for number in found} == {int}
-    assert delay_sampler(config.delay, "obs", config.clock.dt).longest == 3
+    assert config.delays.obs.longest == 3
     assert damian.ClockConfig(simulation="50ms").steps("agents") == 1
 
 

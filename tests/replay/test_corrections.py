@@ -1,14 +1,28 @@
-"""Back-updating with late rewards, sums of rewards and slow clocks, against a loop over a world's steps."""
+"""Back-updating in any environment, against a loop over a world's steps, and what a storage refuses."""
 
 import random
-from typing import NamedTuple
 
 import pytest
 import torch
-from remote import LONGEST, WORLDS, Receiver, Remote, Twin, both_layouts, key, make_storage, rollout, stored
-from tensordict import TensorDictBase
+from remote import (
+    ENDS,
+    GAMMA,
+    LONGEST,
+    WORLDS,
+    Case,
+    Twin,
+    both_layouts,
+    key,
+    make_env,
+    make_storage,
+    recompute_of,
+    rollout,
+    stored,
+)
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.data import ReplayBuffer
-from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, GymEnv, MultiStepTransform, StepCounter, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.delays.laws import Uniform
@@ -17,81 +31,9 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms import (
     ActionDelay,
     CumulativeReward,
-    ObservationDelay,
     RewardDelay,
-    SampleAndHold,
     set_seed,
 )
-
-
-class Case(NamedTuple):
-    """How late rewards are, how many are summed, and how slow the receiver's clock is."""
-
-    latest: int | None = None
-    window: int = 1
-    period: int = 1
-    loss: float = 0.0
-    order: str = "generation"
-
-
-GAMMA = 0.7
-
-
-def make_late(group: tuple[str, ...], case: Case) -> TransformedEnv:
-    """The remote environment with late messages and what a case says."""
-    message, received, reward = (key(group, name) for name in ("message", "received", "reward"))
-    delay = ObservationDelay(
-        Uniform(0, LONGEST),
-        [message],
-        [received],
-        loss=case.loss,
-        order=case.order,
-        delay_key="delay",
-        seed=3,
-    )
-    transforms = [delay, StepCounter(), Receiver(group)]
-    if case.latest is not None:
-        transforms.append(RewardDelay(Uniform(0, case.latest), reward, delay_key="reward_delay", seed=4))
-    transforms.append(CumulativeReward(case.window, GAMMA, reward))
-    transforms.append(SampleAndHold(case.period, [key(group, "observation")]))
-    return TransformedEnv(Remote(group), Compose(*transforms))
-
-
-class LateTwin(Twin):
-    """The twin of ``remote``, with late rewards, sums of rewards and a slow clock."""
-
-    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...], case: Case) -> None:
-        super().__init__(steps, world, group)
-        self.case = case
-
-    def paid(self, t: int, row: tuple[int, ...]) -> bool:
-        """Has the reward that step t earned been received by the last step."""
-        if self.case.latest is None:
-            return True
-        delay = int(self.steps[next_key(key(self.group, "reward_delay"))][(t, *row)])
-        for later in range(t, self.T):
-            if self.start[later] != self.start[t]:
-                return False
-            if later - t >= delay or self.steps["next", "done"][later]:
-                return True
-        return False
-
-    def summed(self, t: int, row: tuple[int, ...]) -> float:
-        """The reward after the step: eq. 4 of the rewards that have been received."""
-        latest = range(max(self.start[t], t - self.case.window + 1), t + 1)
-        return sum(GAMMA ** (t - g) * self.reward(g, row) for g in latest if self.paid(g, row))
-
-    def held(self, t: int, row: tuple[int, ...]) -> list[float]:
-        """The observation after the step: that of the latest tick, or of the reset."""
-        tick = t - (t - self.start[t] + 1) % self.case.period
-        if tick < self.start[t]:
-            return self.steps[key(self.group, "observation")][(self.start[t], *row)].tolist()
-        return self.observation(tick, row)
-
-    def held_before(self, t: int, row: tuple[int, ...]) -> list[float]:
-        if t == self.start[t]:
-            return self.steps[key(self.group, "observation")][(t, *row)].tolist()
-        return self.held(t - 1, row)
 
 
 def random_case(rng: random.Random) -> Case:
@@ -102,8 +44,8 @@ def random_case(rng: random.Random) -> Case:
 def storage_of(env: TransformedEnv, group: tuple[str, ...], n_steps: int) -> BackupdateStorage:
     """A storage of ``n_steps`` steps, with the corrections that follow from the environment."""
     recomputed = [key(group, name) for name in ("observation", "reward")]
-    corrections = corrections_of(env.transform, recomputed)
-    storage = make_storage(group, corrections=corrections)
+    corrections, hindsight = corrections_of(env.transform, recomputed), key(group, "hindsight")
+    storage = make_storage(group, corrections=corrections, hindsight_key=hindsight)
     storage.max_size = n_steps * WORLDS
     return storage
 
@@ -115,49 +57,40 @@ def test_stored_steps_become_what_a_slow_twin_says(group, seed):
     rng = random.Random(seed)
     for _ in range(3):
         case, part = random_case(rng), rng.choice([4, 10, 20])
-        env = make_late(group, case)
+        env = make_env(group, case)
         collected = rollout(env, 40)
         capacity = part + 2 * LONGEST + case.window - 1 + case.period - 1  # the least, so that the ring wraps
         after = stored(storage_of(env, group, min(capacity, 40)), collected, 40 // part)
         steps, n_older = collected.transpose(0, 1), 40 - len(after)
         for world in range(WORLDS):
-            twin = LateTwin(steps, world, group, case)
+            twin = Twin(steps, world, group, case)
+            done = [a or b for a, b in zip(twin.terminated, twin.truncated, strict=True)]
+            for name, right in (
+                ("terminated", twin.terminated),
+                ("truncated", twin.truncated),
+                ("done", done),
+            ):
+                assert after["next", name][:, world, 0].tolist() == right[n_older:]
+            assert after["valid"][:, world, 0].tolist() == twin.valid[n_older:]
             for t in range(n_older, 40):
                 for row in twin.senders:
                     check_step(after, (t - n_older, world, *row), twin, t, row)
     assert n_older >= 0
 
 
-def check_step(after: TensorDictBase, at: tuple[int, ...], twin: LateTwin, t: int, row: tuple) -> None:
+def check_step(after: TensorDictBase, at: tuple[int, ...], twin: Twin, t: int, row: tuple) -> None:
     """Compare what is stored of a step with the twin."""
     observation, reward = key(twin.group, "observation"), key(twin.group, "reward")
+    assert after[next_key(key(twin.group, "hindsight"))][at].tolist() == twin.message(t, row)
     assert after[next_key(reward)][at].item() == pytest.approx(twin.summed(t, row)), (twin.case, t)
     assert after[next_key(observation)][at].tolist() == pytest.approx(twin.held(t, row)), (twin.case, t)
     assert after[observation][at].tolist() == pytest.approx(twin.held_before(t, row)), (twin.case, t)
 
 
-def test_writing_in_small_batches_around_the_ring_gives_the_same_as_writing_at_once():
-    for case in (
-        Case(3, 4, 5, 0.7),
-        Case(None, 6, 1, 0.7),
-        Case(None, 1, 6, 0.5),
-        Case(0, 2, 2, 0.7, "arrival"),
-    ):
-        env = make_late((), case)
-        collected = rollout(env, 60)
-        least = 2 + 2 * LONGEST + case.window - 1 + case.period - 1
-        whole, ring = (
-            stored(storage_of(env, (), 200), collected),
-            stored(storage_of(env, (), least), collected, 30),
-        )
-        n_older = 60 - least
-        assert all(whole[name][n_older:].equal(ring[name]) for name in ring.keys(True, True)), case
-
-
 @both_layouts
 def test_neither_messages_nor_rewards_that_arrive_later_are_used(group):
     case = Case(4, 3, 2)
-    env = make_late(group, case)
+    env = make_env(group, case)
     collected = rollout(env, 30)
     spoilt = collected.clone()
     now = torch.arange(30).view(1, 30, *[1] * (len(group) + 1))
@@ -213,3 +146,121 @@ def test_late_rewards_alone_are_credited_in_any_environment(window):
 def test_a_reward_delay_that_does_not_tell_its_delays_is_refused():
     with pytest.raises(InputError, match="RewardDelay: back-updating needs each delay"):
         corrections_of(Compose(ActionDelay(2), RewardDelay(2)), ["reward"])
+
+
+@both_layouts
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(group, order):
+    reward, received = (next_key(key(group, name)) for name in ("reward", "received"))
+
+    def recompute(_: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        return {reward: (messages[..., 1:] > 0.3).float()}
+
+    collected = rollout(make_env(group, Case(order=order)), 60)
+    collected[reward] = recompute(collected, collected[received])[reward]
+    storage = make_storage(group, recompute, hindsight_key=key(group, "hindsight"))
+    buffer, known = ReplayBuffer(storage=storage), collected[reward].transpose(0, 1).clone()
+    changed = torch.zeros_like(known, dtype=torch.bool)
+    for end in range(5, 65, 5):
+        buffer.extend(collected[:, end - 5 : end])
+        now = storage[storage.latest()]
+        changed[:end] |= now[reward] != known[:end]
+        known[:end] = now[reward]
+    assert now[key(group, "backupdated")].equal(changed)
+    replaced = (now[next_key(key(group, "hindsight"))] != now[received]).any(-1)
+    assert 0 < changed.float().mean() < 0.8 * replaced.float().mean()
+
+
+@both_layouts
+def test_what_was_known_at_the_time_stays_beside_hindsight(group):
+    collected = rollout(make_env(group), 40)
+    after = stored(make_storage(group, hindsight_key=key(group, "hindsight")), collected, 4)
+    names = {next_key(key(group, name)) for name in ("message", "received", "delay", "age")}
+    for name in names | set(ENDS) | {key(group, "received"), "action", "step_count", ("next", "step_count")}:
+        assert after[name].equal(collected[name].transpose(0, 1)), name
+    held, hindsight, sent = (
+        after[next_key(key(group, name))] for name in ("received", "hindsight", "message")
+    )
+    assert (hindsight == held).any()
+    assert (hindsight[..., 0] > held[..., 0]).any()  # numbers of messages grow
+    assert (hindsight[..., 0] >= held[..., 0]).all()
+    assert (hindsight[..., 0] <= sent[..., 0]).all()
+
+
+@both_layouts
+def test_the_ends_stay_if_recompute_returns_none(group):
+    reward = next_key(key(group, "reward"))
+
+    def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        return {reward: recompute_of(group)(steps, messages)[reward]}
+
+    collected = rollout(make_env(group), 40)
+    after, full = (stored(make_storage(group, f), collected, 4) for f in (recompute, None))
+    for name in ENDS:
+        assert after["next", name].equal(collected["next", name].transpose(0, 1))
+    assert after["valid"].all()
+    assert after["reset_after"].equal(after["next", "done"])
+    assert after[reward].equal(full[reward])
+    assert not after[reward].equal(collected[reward].transpose(0, 1))
+    name = key(group, "observation")
+    assert after[name].equal(collected[name].transpose(0, 1))
+
+
+# Mistakes.
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "message"),
+    [
+        ("message", "none", r"message_key: \('next', 'none'\) is not in the steps"),
+        ("step_count", "none", r"step_count_key: none is not in the steps: StepCounter\(\) writes it"),
+    ],
+)
+def test_a_missing_or_misshapen_entry_is_one_line(name, other, message):
+    with pytest.raises(InputError, match=message):
+        stored(make_storage((), **{f"{name}_key": other}), rollout(make_env(()), 8))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda entries: entries | {("next", "success"): entries["next", "reward"]},
+            "is not an entry after the steps",
+        ),
+        (lambda entries: {("next", "done"): entries["next", "done"]}, "are returned in part"),
+    ],
+)
+def test_a_mistake_in_recompute_is_one_line(change, message):
+    storage = make_storage((), lambda *arguments: change(recompute_of(())(*arguments)))
+    with pytest.raises(InputError, match=f"recompute: .*{message}"):
+        stored(storage, rollout(make_env(()), 8))
+
+
+def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused():
+    steps, storage = rollout(make_env(()), 8), make_storage(())
+    with pytest.raises(InputError, match="step_count grows from world to world"):
+        stored(make_storage(()), steps.transpose(0, 1))
+    stored(storage, steps)
+    for batch in (steps.transpose(0, 1), steps[:2]):
+        with pytest.raises(InputError, match=r"steps: a batch of shape \[.*\] is not one of 3 worlds: give"):
+            stored(storage, batch)
+    with pytest.raises(InputError, match=r"steps: a batch of shape \[24\] is not \[T, B\]"):
+        storage.set(range(24), steps.reshape(-1))
+    with pytest.raises(InputError, match="longest: -1 steps is not at least 0 steps"):
+        BackupdateStorage(10, recompute_of(()), -1)
+
+
+def test_a_storage_holds_a_batch_and_twice_the_longest_delay_or_is_refused():
+    steps, least = rollout(make_env(()), 8), 8 + 2 * LONGEST
+    names = {f"{name}_key": name for name in ("message", "received", "delay", "age")}
+    stored(BackupdateStorage(least * WORLDS, recompute_of(()), LONGEST, **names), steps)
+    with pytest.raises(InputError, match=f"{least} steps of {WORLDS} worlds need {least * WORLDS}"):
+        stored(BackupdateStorage((least - 1) * WORLDS, recompute_of(()), LONGEST, **names), steps)
+
+
+def test_steps_that_a_transform_has_joined_are_refused():
+    n_step = MultiStepTransform(n_steps=3, gamma=0.9)
+    buffer = ReplayBuffer(storage=make_storage(()), transform=n_step, batch_size=4)
+    with pytest.raises(InputError, match="MultiStepTransform joins steps before they are corrected"):
+        buffer.extend(rollout(make_env(()), 20))

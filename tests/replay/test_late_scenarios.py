@@ -1,11 +1,12 @@
 """UAVs whose rewards are late too, or summed, or whose server has a slow clock: hindsight equals no delay."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from helpers import everything, random_actions
+from helpers import everything, random_actions, square
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
@@ -15,10 +16,10 @@ from damian import keys
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.pipeline import make_env
+from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import CORRECTED, server_recompute
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
 
@@ -28,35 +29,46 @@ SUMMED = {"reward_window": 3, "reward_discount": 0.7}
 ENDS = ["success", "done", "terminated", "truncated"]
 
 
-def training_env(scenario: ScenarioConfig) -> DelayedEnv:
-    env = make_env(scenario, WORLDS, extras={"message", "reward_terms"})
+def training_env(scenario: ScenarioConfig, n_worlds: int = WORLDS) -> DelayedEnv:
+    env = make_env(scenario, n_worlds, extras={"message", "reward_terms"})
     env.append_transform(StepCounter())
     return env
 
 
-def fly(env: DelayedEnv) -> TensorDictBase:
+def fly(env: DelayedEnv, n_steps: int = STEPS) -> TensorDictBase:
     """Steps [T, B] with random actions, the same at each call."""
     generator, steps, td = torch.Generator().manual_seed(5), [], env.reset()
-    for _ in range(STEPS):
+    for _ in range(n_steps):
         action = random_actions(env.base_env, generator)
         after, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
         steps.append(after.clone())
     return torch.stack(steps)
 
 
-def backupdated(scenario: ScenarioConfig, actor: bool) -> tuple[TensorDictBase, TensorDictBase]:
-    """Such steps as collected, and as corrected by all that has arrived after the last one, [T, B]."""
-    env = training_env(scenario)
-    corrected = ["reward", "critic", *["actor"] * actor]
-    late = has_message_delay(scenario)
+def buffer_of(env: DelayedEnv, corrected: Sequence[str]) -> ReplayBuffer:
+    """A buffer in which late messages and rewards correct what is named."""
+    late = env.uav_env.scenario.delays.obs.late
     recompute = server_recompute(env.server, corrected, reward_terms=True) if late else None
-    names = corrected if recompute else ["reward"]
+    names = corrected if late else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in names])
-    storage = BackupdateStorage(2 * STEPS * WORLDS, recompute, LONGEST, corrections=corrections, device="cpu")
-    buffer, late = ReplayBuffer(storage=storage), fly(env)
+    size = 3 * STEPS * env.batch_size[0]
+    return ReplayBuffer(storage=BackupdateStorage(size, recompute, LONGEST, corrections=corrections))
+
+
+def in_order(buffer: ReplayBuffer) -> TensorDictBase:
+    """The stored steps in order of time, [T, B]."""
+    return buffer.storage[buffer.storage.latest()]
+
+
+def backupdated(
+    scenario: ScenarioConfig, corrected: Sequence[str], n_worlds: int = WORLDS, n_steps: int = STEPS
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """Such steps as collected, and as corrected by all that has arrived after the last one, [T, B]."""
+    env = training_env(scenario, n_worlds)
+    buffer, late = buffer_of(env, corrected), fly(env, n_steps)
     for steps in late.split(8):
         buffer.extend(steps.transpose(0, 1))
-    return late, storage[storage.latest()]
+    return late, in_order(buffer)
 
 
 CASES: dict[str, dict[str, Any]] = {
@@ -104,14 +116,14 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     case, motion = CASES[name], "polynomial" if name in FLYING else "instant"
     scenario = everything(motion, episode=EpisodeConfig(max_steps=9), **case)
     on_time = replace(scenario, delay=replace(scenario.delay, obs=0, rew=0, order="generation"))
-    actor = scenario.links.kind == "server" and has_message_delay(scenario)
-    rollouts = (*backupdated(scenario, actor), fly(training_env(on_time)))
+    actor = scenario.links.kind == "server" and scenario.delays.obs.late
+    corrected = ["reward", "critic", *["actor"] * actor]
+    rollouts = (*backupdated(scenario, corrected), fly(training_env(on_time)))
     late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
     after = [keys.REWARD, keys.GLOBAL_OBSERVATION, *ENDS]
-    if has_message_delay(scenario):
+    if scenario.delays.obs.late:
         after += [(*keys.REWARD_TERMS, term) for term in scenario.reward.terms]
-    corrected = [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]
-    for key in corrected:
+    for key in [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]:
         assert found[key].equal(true[key]), key
     assert not late[next_key(keys.REWARD)].equal(true[next_key(keys.REWARD)])
     if actor:
@@ -120,3 +132,44 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
             assert found[key][..., :n_features].equal(true[key][..., :n_features]), key
             assert found[key][..., n_features:].equal(late[key][..., n_features:]), key
             assert not late[key][..., :n_features].equal(true[key][..., :n_features])
+
+
+@pytest.mark.parametrize("corrected", [["reward"], ["critic"]], ids="+".join)
+def test_only_what_is_named_is_corrected(corrected):
+    late, found = backupdated(square(delay=DelayConfig(obs=3)), corrected)
+    for name in ("reward", "critic"):
+        key = next_key(CORRECTED[name])
+        assert found[key].equal(late[key]) == (name not in corrected)
+
+
+def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():
+    scenario = square(episode=EpisodeConfig(max_steps=12, success_share=0.3))
+    _, corrected = backupdated(replace(scenario, delay=DelayConfig(obs=3)), ["reward", "critic"], 16, 60)
+    first_episode = corrected["step_count"].squeeze(-1).cumsum(0) == torch.arange(60).cumsum(0).view(60, 1)
+    valid = first_episode & corrected["valid"].squeeze(-1)
+    ends, true_ends = (
+        td["next", "success"].squeeze(-1) for td in (corrected, fly(training_env(scenario, 16), 60))
+    )
+    for b in range(16):
+        steps = valid[:, b].nonzero().flatten()
+        if true_ends[: len(steps), b].any():
+            assert ends[steps, b].tolist() == true_ends[: len(steps), b].tolist()
+    assert (~corrected["valid"]).any()
+    assert corrected["next", "done"][corrected["reset_after"]].all()
+
+
+@pytest.mark.parametrize("as_files", [False, True])
+def test_a_saved_storage_continues_in_the_same_way(tmp_path, as_files):
+    env = training_env(everything(episode=EpisodeConfig(max_steps=9), delay=DelayConfig(obs=LATE)))
+    late, (one, other) = fly(env), (buffer_of(env, ["reward", "critic"]) for _ in range(2))
+    one.extend(late[:25].transpose(0, 1))
+    if as_files:
+        one.dumps(tmp_path)
+        other.loads(tmp_path)
+    else:
+        other.load_state_dict(one.state_dict())
+    assert other.storage.latest().equal(one.storage.latest())
+    for buffer in (one, other):
+        buffer.extend(late[25:].transpose(0, 1))
+    original, loaded = in_order(one), in_order(other)
+    assert all(original[key].equal(loaded[key]) for key in original.keys(True, True))

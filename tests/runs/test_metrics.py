@@ -20,9 +20,10 @@ from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
+from damian.envs.episode_totals import EpisodeTotals
 from damian.envs.pipeline import make_env
+from damian.envs.recompute import server_recompute
 from damian.replay.backupdate import BackupdateStorage
-from damian.replay.recompute import server_recompute
 from damian.runs.checkpoint import plain
 from damian.runs.metrics import EpisodeLog, Evaluation, HindsightReturns, evaluation
 from damian.runs.metrics_log import MetricsLog
@@ -32,7 +33,6 @@ from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig
-from damian.transforms.reward import EpisodeTotals
 from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig
 

@@ -15,7 +15,6 @@ from torchrl.data import (
 from torchrl.envs import TransformedEnv
 from transform_cases import ACTION
 
-from damian.common.errors import InputError
 from damian.delays.laws import Uniform
 from damian.transforms import ActionDelay, ActionHistory
 
@@ -32,11 +31,6 @@ RANGES: dict[str, tuple[TensorSpec, torch.Tensor, torch.Tensor]] = {
         Bounded(-numbered(3).double(), numbered(5).double(), (*GROUP, 2), dtype=torch.float64),
         -numbered(3),
         numbered(5),
-    ),
-    "whole numbers": (
-        Bounded(-numbered(2), numbered(4), (*GROUP, 2), dtype=torch.int32),
-        -numbered(2),
-        numbered(4),
     ),
     "one possible value": (
         Bounded(torch.full((*GROUP, 2), 2.0), torch.tensor([2.0, 4.0]).expand(*GROUP, 2), (*GROUP, 2)),
@@ -82,20 +76,6 @@ def test_the_entries_of_an_action_travel_as_one_message(default, first):
         ages.append([t - found[0] if found else None for found in known])
     assert {None, 0, 1, 2, 3} <= {age for step in ages for age in step}
     assert len(set(zip(*ages, strict=True))) == 3, "worlds draw apart"
-
-
-@pytest.mark.parametrize(
-    ("wrong", "error"),
-    [
-        ({"in_keys_inv": ["place", ("agents", "gear")]}, "in_keys_inv: .* are not beside each other"),
-        ({"in_keys_inv": ["place", "gear"], "default": 0}, "default: 0 is not a list of 2 defaults"),
-        ({"in_keys_inv": ["place", "gear"], "out_keys_inv": "wish"}, "out_keys_inv: wish does not have one"),
-    ],
-    ids=str,
-)
-def test_entries_that_cannot_travel_together_are_refused_in_one_line(wrong, error):
-    with pytest.raises(InputError, match=error):
-        ActionDelay(2, **wrong)
 
 
 # Defaults.

@@ -17,8 +17,8 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
+from damian.envs.recompute import server_recompute
 from damian.replay.backupdate import BackupdateStorage
-from damian.replay.recompute import server_recompute
 from damian.server.belief import report_rows
 from damian.server.features import ObservationConfig
 from damian.world.motion import MotionConfig

@@ -10,9 +10,11 @@ import pytest
 import torch
 from channel_twin import World, check_against_twin, table, turn
 from delay_twin import Counting
-from environments import vmas
+from environments import petting_zoo, vmas
 from torch import Tensor
+from torchrl.data import Bounded
 from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from damian.common import counter_rng
 from damian.delays.laws import Burst, Law, Trace, Uniform
@@ -173,3 +175,30 @@ def test_an_agent_sends_what_its_policy_chooses(navigation):
 
     make = twin_of(Uniform(0, 3), own_at_reset=False)
     check_against_twin(env, make, wants, forced=some_worlds, sent=key)
+
+
+def test_a_limited_medium_is_shared_fairly():
+    env = TransformedEnv(Counting([*range(200)], N, ends=0.0), Channel(0, limit=1, seed=1))
+    steps = env.rollout(20)
+    fresh = torch.stack([*(steps["next", "agents", "received_age"] == 0).unbind(1)])
+    others = ~torch.eye(N, dtype=torch.bool)
+    assert (fresh & others).flatten(-2).sum(-1).eq(N - 1).all()
+    counts = (fresh & others).flatten(0, 1)[:, [1, 2, 0], [0, 1, 2]].sum(0)
+    expected, n = 20 * 200 / N, 20 * 200
+    assert all(abs(count - expected) < 5 * math.sqrt(n * 2 / 9) for count in counts.tolist())
+
+
+def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
+    env = TransformedEnv(petting_zoo(N), Channel(1, action_key=("agent", "message"), message_size=4))
+    assert isinstance(env.full_action_spec["agent", "message"], Bounded)
+    assert ("agent", "message") not in env.base_env.full_action_spec.keys(True)
+    check_env_specs(env)
+    got = []
+    step = env.base_env._step
+    env.base_env._step = lambda td: got.append(td) or step(td)
+    late = env.rollout(5)
+    assert all(("agent", "message") not in td.keys(True) for td in got)
+    sent, received = late["agent", "message"], late["next", "agent", "received"]
+    assert received[1:, 0, 2].equal(sent[:-1, 2])
+    assert received[:, 1, 1].equal(sent[:, 1])
+    assert not late["agent", "received_mask"][0].any()

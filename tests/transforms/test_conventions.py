@@ -2,18 +2,13 @@
 
 import pytest
 import torch
-from environments import vmas
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian import (
     ActionDelay,
     ActionHistory,
-    Channel,
-    Function,
     ObservationDelay,
-    RewardDelay,
-    Uniform,
     set_seed,
 )
 from damian.delays.samplers import MessageContext
@@ -52,25 +47,3 @@ def test_a_function_is_taken_as_a_distribution_of_delays():
     delays = env.rollout(3000, break_when_any_done=False)["next", "delay"].flatten()
     shares = delays.bincount(minlength=6)[1:] / len(delays)
     assert shares.tolist() == pytest.approx([0.2] * 5, abs=0.03)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(drawn)),
-        lambda: TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(drawn)),
-        lambda: TransformedEnv(vmas(), Channel(drawn)),
-    ],
-    ids=["actions", "rewards", "links"],
-)
-def test_a_function_delays_anything(make):
-    check_env_specs(make())
-
-
-def test_the_longest_delay_of_a_function_is_20_steps_if_it_names_no_other():
-    def seconds(message: MessageContext) -> torch.Tensor:
-        return torch.full_like(message.time, 30.0)
-
-    assert ObservationDelay(seconds).sampler.longest == 20
-    assert ObservationDelay(Function(seconds, longest=40)).sampler.longest == 40
-    assert ObservationDelay(Uniform(0, 3)).sampler.longest == 3

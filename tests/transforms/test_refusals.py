@@ -2,17 +2,27 @@
 
 import pytest
 import torch
-from contract import ACTION, OBSERVATION
+from contract import ACTION, LATE, OBSERVATION, Drift
 from delay_twin import Counting
 from plain_env import Plain
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    ConditionalSkip,
+    GymEnv,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
 
 from damian.common.errors import InputError
 from damian.transforms import (
     ActionDelay,
+    ActionHistory,
     Channel,
+    CumulativeReward,
     ObservationDelay,
+    RewardDelay,
     SampleAndHold,
     delay_trajectories,
 )
@@ -43,6 +53,8 @@ def test_an_entry_that_there_is_already_is_not_replaced(transforms):
 
 
 MISTAKES = {
+    "in_keys_inv: .* are not beside each other": lambda: ActionDelay(2, ["place", ("agents", "gear")]),
+    "default: 0 is not a list of 2 defaults": lambda: ActionDelay(2, ["place", "gear"], default=0),
     "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
     "delay 2 x 2, hears 3 x 3: these are of": lambda: Channel([[0, 1], [1, 0]], hears=[[True] * 3] * 3),
     "comm_range: 5 needs a position_key": lambda: Channel(1, comm_range=5),
@@ -71,3 +83,45 @@ def test_stored_steps_refuse_what_would_have_changed_what_happened(text):
 def test_outside_an_environment_the_error_says_what_to_do(use):
     with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*delay_trajectories"):
         use(ObservationDelay(2))(TensorDict({"observation": torch.zeros(3, 1)}, [3]))
+
+
+# Orders in which one transform would undo or miss the work of another.
+
+
+def delay() -> Transform:
+    return ObservationDelay(LATE)
+
+
+def appending() -> Transform:
+    return ActionHistory(2, append_to="observation")
+
+
+WRONG = {
+    "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
+    "an observation delay after a history that appends": (appending, delay),
+    "a time limit after a reward delay": (lambda: RewardDelay(2), lambda: StepCounter(max_steps=5)),
+    "skipped steps before a delay": (lambda: ConditionalSkip(lambda td: td["done"]), delay),
+}
+RIGHT = {
+    "a history after an action delay": (lambda: ActionDelay(LATE), lambda: ActionHistory(2)),
+    "a history that appends after a delay": (delay, appending),
+    "sums of delayed rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
+}
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("pair", WRONG.values(), ids=WRONG)
+def test_a_wrong_order_of_transforms_is_refused(pair, nested):
+    one, other = (make() for make in pair)
+    if nested:
+        env = TransformedEnv(TransformedEnv(Drift(), one), other)
+    else:
+        env = TransformedEnv(Drift(), Compose(one, other))
+    with pytest.raises(InputError, match=r"order of transforms: .* must come after"):
+        env.reset()
+
+
+@pytest.mark.parametrize("pair", RIGHT.values(), ids=RIGHT)
+def test_a_right_order_of_transforms_works(pair):
+    env = TransformedEnv(Drift(), Compose(*(make() for make in pair)))
+    assert env.rollout(6, break_when_any_done=False).shape == (3, 6)

@@ -50,12 +50,6 @@ def test_a_replay_buffer_contains_late_steps():
     assert stored["age"][0] == stored["age"][1:][stored["next", "done"][:-1]].max() == 0
 
 
-@pytest.mark.slow  # what each transform's own test shows, in the words of the document
-def test_compiled_steps_have_no_graph_break(capsys):
-    run("late_compiled")["main"](num_worlds=4, backend="eager")
-    assert capsys.readouterr().out.endswith("steps of UAVs: 80\n")
-
-
 def test_workers_draw_the_same_delays_again_each_its_own():
     one, other = run("late_workers")["draw"](SerialEnv)
     assert one != other

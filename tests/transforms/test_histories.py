@@ -1,10 +1,10 @@
-"""The delay transforms beside slow reference implementations in plain Python."""
+"""Sums of rewards, clocks and histories beside slow reference implementations in plain Python."""
 
 from collections.abc import Sequence
 
 import pytest
 import torch
-from delay_twin import Counting, Purse, Receiver, drawn, last_actions, looking_back
+from delay_twin import Counting, last_actions, looking_back
 from helpers import play
 from tensordict import TensorDictBase
 from transform_cases import (
@@ -24,7 +24,6 @@ from transform_cases import (
 )
 
 from damian.transforms import (
-    ActionDelay,
     ActionHistory,
     CumulativeReward,
     ObservationDelay,
@@ -38,82 +37,9 @@ def law(request, tmp_path):
     return LAWS[request.param](tmp_path)
 
 
-@pytest.mark.sample(3)
-@pytest.mark.parametrize("order", ["generation", "arrival"])
-@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "message_sent")])
-def test_every_agent_holds_the_message_that_the_reference_receiver_holds(law, order, loss, sent_key):
-    options = {"loss": loss, "order": order, "sent_key": sent_key, "fresh_key": "fresh", "delay_key": "delay"}
-    transform = ObservationDelay(law, [OBSERVATION], [("agents", "seen")], **options)
-    outputs = play(delayed(transform), choices())
-    observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
-    found = {key: column(outputs, "agents", key) for key in ("seen", "age", "fresh", "delay")}
-    table = drawn(transform.sampler, transform.memory["streams"], STEPS).tolist()
-    done, lost = column(outputs, "done"), transform.sampler.lost
-    for row, (w, n) in enumerate(ROWS):
-        receiver = Receiver(order)
-        receiver.begin(0, observed[0][w][n])
-        for now in range(1, STEPS + 1):
-            at, reset = 2 * now - 1, 2 * now
-            delay = table[now - 1][row]
-            arrives = delay < lost and (sent_key is None or message_sent[at][w][n])
-            fresh = receiver.step(now, observed[at][w][n], delay if arrives else None)
-            expected = [
-                receiver.holds.content,
-                [now - receiver.holds.sent],
-                [fresh],
-                [delay if arrives else -1],
-            ]
-            assert [found[key][at][w][n] for key in found] == expected
-            if done[at][w][0]:
-                receiver.begin(now, observed[reset][w][n])
-                expected = [observed[reset][w][n], [0.0], [True], [0]]
-            assert [found[key][reset][w][n] for key in found] == expected
-
-
-@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
-def test_every_agent_executes_the_action_that_the_reference_receiver_holds(law, loss, sent_key):
-    default = 5
-    options = {"loss": loss, "sent_key": sent_key, "valid_key": "action_valid", "default": default}
-    transform, chosen = ActionDelay(law, ACTION, **options), choices()
-    outputs = play(delayed(transform), chosen)
-    ready = before(outputs, "agents", "ready")
-    observed, done = after(outputs, *OBSERVATION), after(outputs, "done")
-    table = drawn(transform.sampler, transform.memory["streams"], STEPS).tolist()
-    for row, (w, n) in enumerate(ROWS):
-        receiver = Receiver("generation")
-        receiver.begin(0, default)
-        for now in range(1, STEPS + 1):
-            delay, t = table[now - 1][row], now - 1
-            arrives = delay < transform.sampler.lost and (sent_key is None or ready[t][w][n])
-            fresh = receiver.step(now, chosen[t][w, n].item(), delay if arrives else None)
-            assert observed[t][w][n][5:] == [receiver.holds.content, fresh or receiver.waits]
-            if done[t][w][0]:
-                receiver.begin(now, default)
-
-
 def rewards_of(outputs: Sequence[TensorDictBase]) -> tuple[list, list]:
     """Rewards [T][B][N][1], and flags of the ends of episodes [T][B][1], as nested lists."""
     return after(outputs, *REWARD), after(outputs, "done")
-
-
-@pytest.mark.sample(2)
-def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law):
-    transform = RewardDelay(law, REWARD, delay_key="reward_delay", earned_key="earned")
-    earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
-    outputs = play(delayed(transform), choices())
-    received, _ = rewards_of(outputs)
-    reported, known = (after(outputs, "agents", name) for name in ("reward_delay", "earned"))
-    assert known == earned
-    assert received == rewards_of(play(delayed(RewardDelay(law, REWARD)), choices()))[0]
-    table = drawn(transform.sampler, transform.memory["streams"], STEPS).tolist()
-    for row, (w, n) in enumerate(ROWS):
-        purse, in_transit = Purse(), 0.0
-        for t in range(STEPS):
-            reward, ended = earned[t][w][n][0], done[t][w][0]
-            assert reported[t][w][n] == [table[t][row]]
-            assert received[t][w][n][0] == purse.step(t, reward, table[t][row], ended)
-            in_transit += reward - received[t][w][n][0]
-            assert not ended or in_transit == 0
 
 
 def test_a_reset_during_an_episode_discards_its_rewards_in_transit():

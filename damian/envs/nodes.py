@@ -19,19 +19,52 @@ from damian.server.belief import (
     report_rows,
 )
 from damian.server.server import Server
-from damian.transforms.base import (
-    Change,
-    Entries,
-    Memory,
-    StatefulTransform,
-    as_rows,
-    existing,
-    from_rows,
-)
+from damian.transforms.base import Change, Memory, StatefulTransform
+from damian.transforms.entries import Entries, existing
 from damian.world.coverage import KnownCoverage
 
 
-class ServerNode(StatefulTransform):
+class WorldTransform(StatefulTransform):
+    """Base class of transforms whose memory has a row for each world, whatever entries they read."""
+
+    dropped_keys: Sequence[NestedKey] = ()
+    """Keys of entries that are removed, because nothing reads them later and each one costs time."""
+
+    @property
+    def row_key(self) -> NestedKey:
+        return keys.DONE
+
+    @property
+    def created_keys(self) -> Sequence[NestedKey]:
+        # A node writes again what the environment has written.
+        return [] if self.stage == "server" else super().created_keys
+
+    def _write(self, tensordict: TensorDictBase, change: Change) -> TensorDictBase:
+        written = super()._write(tensordict, change)
+        for key in self.dropped_keys:
+            written.pop(key, None)
+        return written
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        for key in self.dropped_keys:
+            del observation_spec[key]
+        return observation_spec
+
+
+class _Node(WorldTransform):
+    """Base class of nodes that count the steps of an episode."""
+
+    stage = "server"
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        device = tensordict.get(self.in_keys[0]).device
+        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        return memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
+
+
+class ServerNode(_Node):
     """Computes observations, rewards and the task's status from the messages that have arrived.
 
     It writes the entries that ``UavEnv`` writes itself when no message is delayed; after a reset, the server
@@ -44,9 +77,6 @@ class ServerNode(StatefulTransform):
         dropped_keys: keys of entries to remove, because nothing reads them later and each one costs time.
         reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
     """
-
-    stage = "server"
-    per_world = True
 
     def __init__(
         self,
@@ -70,15 +100,14 @@ class ServerNode(StatefulTransform):
         return existing([*self.in_keys, self.own_key, *self.belief_keys])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        rows = tensordict.get(self.in_keys[0])
-        memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
+        memory, rows = super().init_memory(tensordict), tensordict.get(self.in_keys[0])
         if not self.server.remembers_coverage:
             return memory
         trail = self.server.counted(self.server.messages(rows))
         return memory | {"trail": trail, "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
+        memory, _ = super().on_reset(memory, entries, mask)
         if "coverage" in memory:
             memory["coverage"] = memory["coverage"].masked_fill(expand_mask(mask, memory["coverage"]), -1)
         return memory, {}
@@ -105,30 +134,17 @@ class ServerNode(StatefulTransform):
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
         return memory, written | outputs.status.entries()
 
-    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
-        return memory | {"elapsed": memory["elapsed"] + n_steps}
 
-
-class OnboardNode(StatefulTransform):
+class OnboardNode(_Node):
     """Computes each UAV's observation from ``("agents", "linked")``, by the server's formulas.
 
     Rewards, the task's status and the critic's observation stay those of the server node. After a reset every
     UAV knows the first message of every other. ``damian.make_env`` adds the transform with ``links=matrix``.
     """
 
-    stage = "server"
-    per_world = True
-
     def __init__(self, server: Server, *, dropped_keys: Sequence[NestedKey] = ()) -> None:
         super().__init__(keys.LINKED, keys.OBSERVATION)
         self.server, self.dropped_keys, self.step_keys = server, list(dropped_keys), self.in_keys
-
-    def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        device = tensordict.get(self.in_keys[0]).device
-        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}
-
-    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed = memory["elapsed"] + 1
@@ -137,7 +153,7 @@ class OnboardNode(StatefulTransform):
         return {"elapsed": elapsed}, {keys.OBSERVATION: observation}
 
 
-class Belief(StatefulTransform):
+class Belief(WorldTransform):
     """Writes the probability that the source is in each cell of a grid, by Bayes' rule.
 
     The belief is exact for the messages that have arrived by now, whenever they were sent: when one comes in
@@ -151,8 +167,6 @@ class Belief(StatefulTransform):
         own: compute the belief of each UAV too.
     """
 
-    per_world = True
-
     def __init__(self, server: Server, longest: int, *, delayed: bool, own: bool = False) -> None:
         reads: list[NestedKey] = [keys.MESSAGE, keys.MESSAGE_SENT, *([keys.DELAY] if delayed else [])]
         super().__init__(reads, [keys.BELIEF, *([keys.OWN_BELIEF] if own else [])])
@@ -165,48 +179,39 @@ class Belief(StatefulTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]
-        return empty_window(self._grid, self.longest, n_worlds, n_agents, self.own)._asdict()
+        return empty_window(self.grid, self.longest, n_worlds, n_agents, self.own)._asdict()
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        messages = self.server.messages(as_rows(entries[keys.MESSAGE], self.rows))
+        messages = self.server.messages(self.to_rows(entries[keys.MESSAGE]))
         region = self.server.region_of(messages)
-        return memory, self._written(begin_beliefs(self._grid, Window(**memory), messages, region, mask))
+        return memory, self._written(begin_beliefs(self.grid, Window(**memory), messages, region, mask))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        rows = {key: as_rows(entries[key], self.rows) for key in self.in_keys}
+        rows = {key: self.to_rows(entries[key]) for key in self.in_keys}
         messages = self.server.messages(rows[keys.MESSAGE])
-        report = report_rows(self._grid, messages, rows[keys.MESSAGE_SENT])
+        report = report_rows(self.grid, messages, rows[keys.MESSAGE_SENT])
         delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(report)
         region = self.server.region_of(messages)
         every = torch.ones_like(region, dtype=torch.bool)
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        window, beliefs = advance_beliefs(self._grid, Window(**memory), report, delay, region, stepped)
+        window, beliefs = advance_beliefs(self.grid, Window(**memory), report, delay, region, stepped)
         return window._asdict(), self._written(beliefs)
-
-    def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """Note, in place, a UAV's packed message [M] that arrives in the next step, ``lag`` steps late."""
-        if lag <= self.longest:
-            messages = self.server.messages(message.view(1, 1, -1))
-            slot = (memory["slot"] + 1 - lag) % len(memory["report"])
-            every = torch.ones_like(messages.spotted)
-            memory["report"][slot, agent] = report_rows(self._grid, messages, every).view(-1)
-            memory["delay"][slot, agent] = lag
-        return memory
 
     def _written(self, beliefs: Beliefs) -> Entries:
         """The entries to write."""
-        own: Entries = {keys.OWN_BELIEF: from_rows(beliefs.own, self.rows)} if self.own else {}
-        return {keys.BELIEF: from_rows(beliefs.server, self.rows), **own}
+        own: Entries = {keys.OWN_BELIEF: self.from_rows(beliefs.own)} if self.own else {}
+        return {keys.BELIEF: self.from_rows(beliefs.server), **own}
 
     @property
-    def _grid(self) -> SourceGrid:
+    def grid(self) -> SourceGrid:
+        """The grid of the server."""
         if self.server.grid is None:
             raise RuntimeError("the server has no grid, because no feature reads the belief")
         return self.server.grid
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         worlds, n_agents = observation_spec[keys.MESSAGE].shape[:-2], observation_spec[keys.MESSAGE].shape[-2]
-        n_cells = self._grid.prior.shape[-1]
+        n_cells = self.grid.prior.shape[-1]
         for key, shape in ((keys.BELIEF, worlds), (keys.OWN_BELIEF, (*worlds, n_agents))):
             if key in self.out_keys:
                 size = torch.Size((*shape, n_cells))
