@@ -57,6 +57,7 @@ def on_config(config: Any) -> Any:
         {"API": ["api/index.md", *[{f"damian.{name}": f"api/{name}.md"} for name in PACKAGES]]},
         {"Notebooks": [f"notebooks/{path.stem}.md" for path in NOTEBOOKS]},
         {"Examples": [{path: f"examples/{path}.md"} for path in examples()]},
+        {"A service for fleets": ["fleet.md", "mavlink.md"]},
         {"Project": [{"Contributing": "CONTRIBUTING.md"}, {"Changes": "CHANGELOG.md"}]},
     ]
     return config
@@ -79,11 +80,12 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     page_name = page.file.src_uri
     if page_name.startswith(("api/", "commands/", "examples/", "notebooks/")):
         return markdown
-    folder = "" if page_name in TEXTS.values() else "docs"
+    files = {name: path for path, name in TEXTS.items()}
+    folder = posixpath.dirname(files.get(page_name, "docs/"))
 
     def lead(match: re.Match[str]) -> str:
         path = posixpath.normpath(posixpath.join(folder, match[2]))
-        if path.startswith("examples/"):
+        if path.startswith("examples/") and path not in TEXTS:
             return f"{match[1]}{path}.md"
         return match[1] + TEXTS.get(path, path.removeprefix("docs/"))
 
@@ -168,8 +170,9 @@ def package(name: str) -> str:
 def examples() -> list[str]:
     """The files of examples/, relative to it."""
     folder = ROOT / "examples"
-    files = [*folder.rglob("*.py"), *folder.rglob("*.yaml")]
-    return sorted(path.relative_to(folder).as_posix() for path in files)
+    files = [path for kind in ("*.py", "*.yaml") for path in folder.rglob(kind)]
+    own = folder / "fleet"  # a distribution of its own
+    return sorted(path.relative_to(folder).as_posix() for path in files if own not in path.parents)
 
 
 def example(path: str) -> str:

@@ -14,7 +14,7 @@ from damian.recipes.known import check_words
 
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]
-DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
+DOCUMENTS += [*sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples" / "fleet").rglob("*.md"))]
 FILES = [file for file in DOCUMENTS if file.name != "CHANGELOG.md"]  # which names commands of older versions
 FILES += [*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.py")]
 FILES += sorted((ROOT / "recipes").glob("*.py"))

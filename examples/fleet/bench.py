@@ -1,8 +1,8 @@
-"""Measure ``damian advise`` over loopback: requests per second, and how long each takes.
+"""Measure ``damian-fleet`` over loopback: requests per second, and how long each takes.
 
-    python examples/benchmarks/bench_advise.py          (make bench-advise)
-    python examples/benchmarks/bench_advise.py --rate 500 --seconds 20 --fleets 5
-    python examples/benchmarks/bench_advise.py --restart 1000 --rate 100
+    python bench.py
+    python bench.py --rate 500 --seconds 20 --fleets 5
+    python bench.py --restart 1000 --rate 100
 
 The service runs in a process of its own, on one core if the system lets it. Connections that stay open send
 the reports of 10 UAVs and a question for their advice, in turn; first at a fixed rate, then as fast as it
@@ -28,6 +28,9 @@ from typing import NamedTuple
 import numpy as np
 
 from damian.common.tables import markdown_table
+from damian.field.rows import Report
+from damian_fleet.answers import Acknowledgement
+from damian_fleet.program import config_of, make_session
 
 TOKEN = "a-token-for-the-bench"
 N_UAVS = 10
@@ -49,10 +52,10 @@ class Sample(NamedTuple):
 
 def start(folder: Path, words: Sequence[str]) -> tuple[subprocess.Popen, int]:
     """Start the service; returns its process and port."""
-    code = "from damian.recipes.command import main; main()"
-    given = [*words, "port=0", f"token={TOKEN}", f"hydra.run.dir={folder}/run"]
+    code = "from damian_fleet.program import main; main()"
+    given = [f"journal={folder}/journals", *words, "port=0", f"token={TOKEN}"]
     process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", code, "advise", *given],
+        [sys.executable, "-W", "ignore", "-c", code, *given],
         stdout=subprocess.PIPE,
         encoding="utf-8",
     )
@@ -153,13 +156,8 @@ def fly_an_hour(folder: Path, words: Sequence[str], n_fleets: int) -> None:
     Each UAV reports every 5 s, and is sent somewhere every 30 s. One fleet, f10000, flies; the others are
     copies.
     """
-    from damian.field.rows import Acknowledgement, Report  # noqa: PLC0415 (needs the extra advise)
-    from damian.recipes import cli  # noqa: PLC0415
-    from damian.recipes.advise import make_session  # noqa: PLC0415
-
-    config = cli.checked(cli.composed("advise", [*words, "port=0"]), "advise")
-    config.overrides = [*words, "port=0"]
-    session, begin = make_session(config, folder), time.time() - 3600
+    config, others = config_of([*words, "port=0", f"journal={folder}"])
+    session, begin = make_session(config, others, words), time.time() - 3600
     uavs = [f"uav{i}" for i in range(3)]
     session.create("f10000", uavs)
     for second in range(0, 3600, 5):
@@ -190,7 +188,7 @@ def measure_restart(n_fleets: int, rate: float, seconds: float, words: Sequence[
         folder = Path(name)
         fly_an_hour(folder / "journals", words, n_fleets)
         began = time.perf_counter()
-        process, port = start(folder, [*words, f"journal={folder}/journals"])
+        process, port = start(folder, words)
         print(f"listens after {time.perf_counter() - began:.1f} s")
         try:
             one = Connection(port, [])
@@ -216,7 +214,7 @@ def measure_restart(n_fleets: int, rate: float, seconds: float, words: Sequence[
 
 def main() -> None:
     """Measure and print the table."""
-    options = ArgumentParser(description="Speed of damian advise over loopback.")
+    options = ArgumentParser(description="Speed of damian-fleet over loopback.")
     options.add_argument("--rate", type=float, default=500.0, help="requests per second")
     options.add_argument("--seconds", type=float, default=10.0, help="time of each measurement")
     options.add_argument("--fleets", type=int, default=4, help="number of fleets of 10 UAVs")
@@ -224,7 +222,7 @@ def main() -> None:
         "settings",
         nargs="*",
         default=["policy=script", "delay=paper", "region=llanbedr"],
-        help="of damian advise",
+        help="of damian-fleet",
     )
     options.add_argument("--restart", type=int, metavar="N", help="restart with N fleets instead")
     args = options.parse_args()

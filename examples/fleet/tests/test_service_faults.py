@@ -70,7 +70,7 @@ def test_columns_that_are_not_understood_are_named_and_not_kept(client, tmp_path
     table = "ID,AoI,lat,lon,battery,vx,alt\nA,0,52.8110,-4.1283,80,1.5,30\n"
     answer = client.post("/fleets/north/reports", content=table, headers={"Content-Type": "text/csv"})
     assert answer.json() == {"accepted": 1, "found": ["new"], "ignored": ["alt", "vx"]}
-    assert "vx" not in (tmp_path / "north.jsonl").read_text()
+    assert "vx" not in (tmp_path / "north.jsonl").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("jump", [3600.0, -3600.0])
@@ -279,11 +279,11 @@ def test_more_connections_than_handles_are_turned_away_and_it_goes_on(tmp_path):
         each.close()
     assert program.ask("POST", "/fleets/north/reports", [row("A"), row("B")])[0] == 200
     program.stop()
-    assert len((tmp_path / "log.txt").read_text()) < 10_000
+    assert len((tmp_path / "log.txt").read_text(encoding="utf-8")) < 10_000
 
 
 def test_the_client_of_the_document_flies(tmp_path):
-    (text,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    (text,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
     program = Program(tmp_path, "motion=polynomial")
     text = text.replace(":8000", f":{program.port}").replace("3hR5...", TOKEN)
     text = re.sub(r"time\.sleep\(.*\)", "time.sleep(0.1)", text)

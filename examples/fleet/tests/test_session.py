@@ -115,7 +115,7 @@ GOOD = '{"journal": "damian-advice", "version": 3, "fleet": "x", "uavs": ["A"], 
     ],
 )
 def test_a_journal_of_something_else_is_refused(node, tmp_path, text, message):
-    (tmp_path / "x.jsonl").write_text(text)
+    (tmp_path / "x.jsonl").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as error:
         AdviceSession(lambda uavs, mark: Fleet(node, uavs, lambda _: pytest.fail("it was asked")), tmp_path)
     assert str(error.value).startswith(f"{tmp_path / 'x.jsonl'}: {message}")
