@@ -25,6 +25,7 @@ from damian.recipes.config import TrainConfig
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import results_table
 from damian.server.belief import SourceGrid
+from damian.world.state import Truth
 
 KNOWN_ON_TIME = ("what has arrived", "its own messages", "all messages", "the source's place")
 """What the script knows on time in each row of the results."""
@@ -60,7 +61,7 @@ def true_belief(env: DelayedEnv) -> TensorDictModule:
 
     def know(state: Tensor, message: Tensor) -> Tensor:
         inside = grid.prior[server.region_of(server.messages(message))] > 0
-        distance = torch.cdist(state[..., -2:].to(grid.centres), grid.centres)
+        distance = torch.cdist(Truth.unpack(state).source.to(grid.centres), grid.centres)
         return one_hot(distance.where(inside, torch.inf).argmin(-1), distance.shape[-1]).to(distance)
 
     return TensorDictModule(know, in_keys=[keys.STATE, keys.MESSAGE], out_keys=[keys.BELIEF])
