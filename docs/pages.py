@@ -14,15 +14,15 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 import damian
-from damian.recipes.command import PROGRAMS, program_help
-from damian.recipes.known import Setting, default_options, groups, known_settings
+from damian.recipes.command import PROGRAMS
+from damian.recipes.known import SCHEMAS, Setting, default_options, groups, help_text, known_settings
 
 ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
 TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff"}
 TEXTS |= {"examples/fleet/README.md": "fleet.md", "examples/fleet/docs/mavlink.md": "mavlink.md"}
 """Files beside docs/, and what they are called in the site."""
-SHOWN = ("train", "fly", "tune", "compare", "advise")
+SHOWN = (*SCHEMAS,)
 """Programs whose settings have a page."""
 PACKAGES = (
     "transforms",
@@ -97,7 +97,7 @@ def commands() -> str:
     hint = "Settings are overrides of [Hydra](https://hydra.cc); `damian PROGRAM --help KEY` explains one."
     parts = ["# Commands", hint]
     for name, what in PROGRAMS.items():
-        text = program_help(name)
+        text = help_text(name)
         parts += [f"## damian {name}", f"{what[0].upper()}{what[1:]}.", f"```text\n{text}\n```"]
     return "\n\n".join(parts)
 
@@ -108,13 +108,13 @@ def settings(program: str) -> str:
     parts = [f"# Settings of damian {program}"]
     if program == "train":
         parts += ["## Groups", table(("group", "options"), group_rows(program))]
-    elif program != "compare":
+    elif "learner" in everything:
         parts.append("Those of [damian train](train.md) may be given too.")
         everything = {key: each for key, each in everything.items() if key not in known_settings("train")}
     sections: dict[str, list[tuple[str, ...]]] = {}
     for key, setting in everything.items():
         section = key.split(".")[0] if "." in key else "general"
-        if setting.default or "." in key or not any(other.startswith(f"{key}.") for other in everything):
+        if not setting.is_section:
             sections.setdefault(section, []).append(row(key, setting))
     head = ("setting", "type", "default", "meaning")
     return "\n\n".join([*parts, *(f"## {name}\n\n{table(head, rows)}" for name, rows in sections.items())])
@@ -133,7 +133,7 @@ def group_rows(program: str) -> list[tuple[str, ...]]:
 def row(key: str, setting: Setting) -> tuple[str, ...]:
     """A setting in a table."""
     meaning = " ".join(setting.text.replace("``", "`").split())
-    return code(key), code(setting.kind), code(setting.default), meaning.replace("|", "&#124;")
+    return code(key), code(setting.kind), code(setting.shown), meaning.replace("|", "&#124;")
 
 
 def code(text: str) -> str:

@@ -4,9 +4,14 @@ damian advise checkpoint=runs/first table=reports.csv     (one table, one answer
 damian advise fit=journals/north.jsonl                    (only the delays, as a trace to train with)
 """
 
+__package__ = "damian.recipes"  # also of a script: python recipes/advise.py
+
 import json
 import time
 from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
 
 from damian.baselines.greedy import greedy_policy
 from damian.common.atomic_files import write_atomically
@@ -31,7 +36,7 @@ from damian.world.vehicles import MOTION_MODELS
 from . import cli
 from .config import AdviseConfig
 from .evaluate import stored_actor
-from .shared.runs import run_folder, save_config, stored_values
+from .shared.runs import run_folder, save_config, start, stored_values
 
 
 def advise(config: AdviseConfig, folder: Path) -> None:
@@ -86,5 +91,11 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
     plot_delays(fitted, *laws, folder / "delays.png")
 
 
-def run() -> None:
-    cli.run(advise, "advise")
+@cli.one_line_errors("advise")
+@hydra.main(config_path="../conf", config_name="advise", version_base=None)
+def main(given: DictConfig) -> None:
+    start(advise, given, "advise")
+
+
+if __name__ == "__main__":
+    main()

@@ -12,7 +12,7 @@ from importlib import import_module
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
 
-from .known import check_words, help_text, parsed
+from .known import check_words, help_text
 
 PROGRAMS = {
     "train": "train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one",
@@ -25,8 +25,9 @@ PROGRAMS = {
     "results": "show the results in a folder as one table: damian results FOLDER",
 }
 """What each program does, by its name; the program is the module of this name."""
-SETTINGS = {name: name for name in PROGRAMS if name not in ("export", "results")} | {"evaluate": "train"}
-"""Whose settings each program has; the others take a folder."""
+FOLDERS = {"export": "checkpoint={}", "results": "folders=[{}]"}
+"""The setting that plain words mean, of programs whose main setting is a folder."""
+MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -44,36 +45,38 @@ def main(words: Sequence[str] | None = None) -> None:
         print(import_module("damian").__version__)
     else:
         try:
-            _run(name, words)
-        except InputError as error:
+            checked = _checked(name, words)
+            if checked is None:
+                return
+            program = import_module(f".{name}", __package__)
+        except InputError as error:  # also a package that the program needs and that is not installed
             print(f"error: {one_line(str(error))}", file=sys.stderr)
             sys.exit(2)
+        sys.argv = [f"damian {name}", *checked]  # the program's own command line, which Hydra reads
+        program.main()
 
 
-def _run(name: str, words: Sequence[str]) -> None:
+def _checked(name: str, words: list[str]) -> list[str] | None:
+    """The words for a program; None if it was asked for help, which is printed."""
     if name not in PROGRAMS:
         raise InputError(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}")
-    sys.argv = [f"damian {name}", *words]
-    if name not in SETTINGS:  # it takes a folder
-        if {"-h", "--help"} & {*words}:
-            _show(program_help(name))
-        else:
-            with import_module(".cli", __package__).one_line_errors():
-                import_module(f".{name}", __package__).run()
-        return
-    program, given = SETTINGS[name], parsed(words)
-    if given.help:
-        keys = [word for word in given.overrides if "=" not in word]
-        _show(program_help(name, keys, given.config_dir))
-        return
-    check_words(program, given.overrides, given.config_dir)
-    cli = import_module(".cli", __package__)  # with Hydra, which takes a while to import
-    with cli.one_line_errors():
-        found = cli.check(program, given)
-        if given.cfg:
-            _show(found)
-            return
-    import_module(f".{name}", __package__).run()
+    options = [word for word in words if word.startswith("-") or ("=" not in word and word[0] != "~")]
+    rest = [word for word in words if word not in options]
+    before = dict(zip(options, ["", *options], strict=False))
+    plain = [word for word in options if word[0] != "-" and before[word][:1] != "-"]
+    if {"-h", "--help"} & {*options}:
+        _show(help_text(name, [word for word in options if word[0] != "-"]))
+        return None
+    if plain and name in FOLDERS:
+        options = [word for word in options if word not in plain]
+        rest.append(FOLDERS[name].format(",".join(f"'{word}'" for word in plain)))
+    elif plain:
+        raise InputError(f"{plain[0]}: this word is not of the form KEY=VALUE")
+    if {"-m", "--multirun"} & {*options} and name in ("compare", "tune", *FOLDERS):
+        raise InputError(f"-m: not with damian {name}, which has many runs anyway")
+    if not any(word.startswith(("--config-dir", "-cd")) for word in options):  # it may have any key
+        check_words(name, rest)
+    return [*options, *rest]  # Hydra wants options first
 
 
 def _show(text: str) -> None:
@@ -89,13 +92,3 @@ def usage() -> str:
     width = max(map(len, PROGRAMS))
     programs = [f"  {name:{width}}  {what}" for name, what in PROGRAMS.items()]
     return "\n".join(["damian PROGRAM [GROUP=OPTION] [KEY=VALUE] ...", "", *programs, "", MORE])
-
-
-def program_help(name: str, keys: Sequence[str] = (), own_folder: str | None = None) -> str:
-    """What ``damian NAME --help`` prints."""
-    if name not in SETTINGS:
-        return import_module(f".{name}", __package__).__doc__ or ""
-    return help_text(name, SETTINGS[name], keys, own_folder)
-
-
-MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."

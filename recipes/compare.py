@@ -4,6 +4,8 @@ damian compare experiment=usecases "tasks=[usecase2]" seeds=2 "overrides=['frame
 damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench
 """
 
+__package__ = "damian.recipes"  # also of a script: python recipes/compare.py
+
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -11,7 +13,9 @@ from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
+import hydra
 import pandas as pd
+from omegaconf import DictConfig
 
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
@@ -33,10 +37,10 @@ from damian.runs.interrupt import end_interrupted, number_of
 
 from . import cli
 from .evaluate import fly, fly_untrained
-from .known import key_of
+from .known import key_of, without
 from .shared.comparison_results import FIGURE, MARKDOWN, NO_RESULTS, ROWS, Results, results_of, stored_results
-from .shared.many_runs import LOG, Run, check_stored, perform_all
-from .shared.runs import check_policy_fits, without
+from .shared.many_runs import LOG, Run, perform_all
+from .shared.runs import check_policy_fits, check_stored, start
 from .shared.settings import check_learning, late
 from .train import train
 
@@ -87,7 +91,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     source = flown or arm.source
     overrides = ["logger=csv", *overrides, *arm.overrides, *config.overrides]
     try:
-        unseeded = _composed(*overrides, own_folder=config.own_folder)
+        unseeded = _composed(*overrides)
         late_by = [] if arm.delayed else late(unseeded)
         if late_by and away:
             return  # a held-out delay, under which the undelayed arm is not flown
@@ -171,7 +175,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
     report(config, results, missing, folder)
     print((folder / MARKDOWN).read_text(encoding="utf-8"))
-    print(f"results: {cli.shown(folder)}")
+    print(f"results: {cli.short(folder)}")
     if failed:
         sys.exit(1)
 
@@ -183,7 +187,7 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
         kept = stored_results(folder)
         runs = _not_kept(runs, kept)
     for run in runs:
-        check_stored(run)
+        check_stored(run.config, run.folder)
     stored = kept.with_those_of(results_of([run for run in runs if run.finished], arms))
 
     def store(run: Run) -> None:
@@ -216,5 +220,11 @@ def _not_kept(runs: list[Run], kept: Results) -> list[Run]:
     return [run for run in runs if run in todo or run.folder in needed]
 
 
-def run() -> None:
-    cli.run(compare, "compare", again=True)
+@cli.one_line_errors("compare")
+@hydra.main(config_path="../conf", config_name="compare", version_base=None)
+def main(given: DictConfig) -> None:
+    start(compare, given, "compare", again=True)
+
+
+if __name__ == "__main__":
+    main()

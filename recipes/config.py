@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.common.fields import constant, setting
+from damian.common.fields import Settings, constant, setting
 from damian.compare.config import LESS_IS_BETTER, POLICY_MEANS, SCORE_MEANS, SCORES, STORED
 from damian.envs.config import ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
@@ -14,30 +14,6 @@ FORMATS = ("gif", "mp4", "png", "html", "geojson")
 FILMS = FORMATS[:2]
 MOST_EPISODES = 12
 """Episodes that one page can play side by side."""
-_HIDDEN = {"hidden": {"choices": [[64, 64], [128, 128], [256, 256]]}}
-_GAMMA = {"choices": [0.8, 0.9, 0.95, 0.98, 0.99]}
-_MAPPO = {
-    "lr": {"low": 1e-4, "high": 1e-2, "log": True},
-    "entropy_coeff": {"low": 1e-4, "high": 1e-1, "log": True},
-    "gamma": _GAMMA,
-    "lmbda": {"choices": [0.8, 0.9, 0.95]},
-    "epochs": {"low": 2, "high": 10},
-    "minibatches": {"choices": [2, 4, 8]},
-}
-_SAC = {
-    "lr": {"low": 1e-4, "high": 3e-3, "log": True},
-    "alpha_lr": {"low": 1e-3, "high": 1e-1, "log": True},
-    "target_entropy": {"low": 0.1, "high": 0.9},
-    "gamma": _GAMMA,
-    "tau": {"low": 2e-3, "high": 5e-2, "log": True},
-    "batch_size": {"choices": [256, 512, 1024]},
-}
-SEARCHES: dict[str, dict[str, Any]] = {
-    "mappo": {"learner": _MAPPO, "model": _HIDDEN},
-    "sac": {"learner": _SAC, "model": _HIDDEN},
-    "bpql": {"learner": _SAC, "model": _HIDDEN, "delay": {"history": {"choices": [2, 4, 8, 12]}}},
-}
-"""What ``damian tune`` varies, by the learner."""
 COMPILE_FROM = 1_000_000
 """Environment steps from which on compiling saves more time than it takes, half a minute."""
 
@@ -76,9 +52,9 @@ class TrainConfig(ScenarioConfig):
         "With ``backupdate``: what late messages correct: reward, critic (its observation), actor (its own).",
     )
     checkpoint: str | None = setting(
-        None, "Run folder, or the best.pt in it, of the policy to begin with or to fly; its overrides apply."
+        None, "Run folder, or the best.pt in it, of the policy to begin with or to fly; its settings apply."
     )
-    overrides: list[str] = constant([], "Words of the command line; the program fills them in.")
+    overrides: list[str] = constant([], "Words of the command line, to be shown; the program fills them in.")
     resume: str | None = setting(None, "Run folder of the run to continue.")
     device: str = setting("cpu", "Device of all tensors: cpu, cuda, cuda:1, ...")
     threads: int = setting(
@@ -259,3 +235,25 @@ class TuneConfig(TrainConfig):
     def sign(self) -> int:
         """1 if the greatest score is the best, -1 if the least is."""
         return -1 if self.score in LESS_IS_BETTER else 1
+
+
+@dataclass
+class ExportConfig(Settings):
+    """All settings of ``damian export``."""
+
+    checkpoint: str | None = setting(None, "Run folder, or the best.pt in it, of the policy to export.")
+    trust: bool = setting(False, "Import the components package.module:Name that the run folder names.")
+
+
+@dataclass
+class ResultsConfig(Settings):
+    """All settings of ``damian results``."""
+
+    folders: list[str] = setting([], "Folder of a run, a sweep or a comparison; or two folders to compare.")
+    score: str = setting(
+        "return", "The measure whose differences the table of two folders has.", choices=SCORES
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.refuse(len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare")

@@ -4,11 +4,15 @@ damian evaluate checkpoint=runs/first agents=10 delay=paper
 damian evaluate -m checkpoint=runs/first delay.obs=0,2,4,8
 """
 
+__package__ = "damian.recipes"  # also of a script: python recipes/evaluate.py
+
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
+import hydra
 import torch
+from omegaconf import DictConfig
 from tensordict.nn import InteractionType
 from torchrl.modules import ProbabilisticActor
 
@@ -24,7 +28,7 @@ from damian.runs.training_state import load_networks
 
 from . import cli
 from .config import TrainConfig
-from .shared.runs import save_config, with_policy_of
+from .shared.runs import only_named_code, save_config, start, with_policy_of
 from .shared.settings import check_components
 
 MEANING = """untrained: the same network before any training; its results are not learnt. script: a rule
@@ -92,9 +96,9 @@ def load(
         >>> rollout = env.rollout(50, policy, break_when_any_done=False)
     """
     words = [f"checkpoint='{run}'", *overrides, *["trust=true"] * trust]
-    given = cli.composed("train", words)
-    with cli.only_named_code(given):
-        config, _ = with_policy_of(given, "train", words, None)
+    values = cli.plain(cli.composed(*words), words)
+    with only_named_code(values):
+        config = with_policy_of(values, words)
         check_components(config)  # imports all of the user's own that is ever needed
         eval_seed = config.eval_seed if seed is None else seed
         env = make_env(config.eval_scenario, worlds, eval_seed, config.device)
@@ -146,5 +150,11 @@ def own_code(learner: str) -> AbstractContextManager[None]:
     return naming_errors(learner) if ":" in learner else nullcontext()
 
 
-def run() -> None:
-    cli.run(fly)
+@cli.one_line_errors("evaluate")
+@hydra.main(config_path="../conf", config_name="evaluate", version_base=None)
+def main(given: DictConfig) -> None:
+    start(fly, given, "evaluate")
+
+
+if __name__ == "__main__":
+    main()

@@ -4,12 +4,16 @@ damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]"
 damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
 """
 
+__package__ = "damian.recipes"  # also of a script: python recipes/fly.py
+
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
 
+import hydra
 import numpy as np
 from matplotlib.animation import FFMpegWriter
+from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
@@ -29,7 +33,7 @@ from damian.show.replay_page import save_page
 from . import cli
 from .config import FILMS, FlyConfig
 from .evaluate import stored_actor
-from .shared.runs import save_config
+from .shared.runs import save_config, start
 
 
 def fly(config: FlyConfig) -> list[Episode]:
@@ -121,5 +125,11 @@ def fly_or_replay(config: FlyConfig, folder: Path) -> None:
         show(config, folder)
 
 
-def run() -> None:
-    cli.run(fly_or_replay, "fly")
+@cli.one_line_errors("fly")
+@hydra.main(config_path="../conf", config_name="fly", version_base=None)
+def main(given: DictConfig) -> None:
+    start(fly_or_replay, given, "fly")
+
+
+if __name__ == "__main__":
+    main()

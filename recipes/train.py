@@ -4,6 +4,8 @@ damian train scenario=paper/usecase2 delay=paper aware=both hydra.run.dir=runs/f
 damian train resume=runs/first frames=600000
 """
 
+__package__ = "damian.recipes"  # also of a script: python recipes/train.py
+
 import shlex
 import time
 from collections.abc import Collection
@@ -11,7 +13,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import cast
 
+import hydra
 import torch
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from tqdm import tqdm
@@ -39,7 +43,7 @@ from . import cli
 from .config import TrainConfig
 from .evaluate import make_eval_env, own_code, report
 from .shared.collectors import learning_env, make_collector, read_by, ticks
-from .shared.runs import names_own_code, run_folder, save_config, stored_values
+from .shared.runs import names_own_code, run_folder, save_config, start, stored_values
 from .shared.settings import (
     backupdates,
     check_learning,
@@ -257,5 +261,11 @@ def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, int
     return finished or asked
 
 
-def run() -> None:
-    cli.run(train)
+@cli.one_line_errors("train")
+@hydra.main(config_path="../conf", config_name="train", version_base=None)
+def main(given: DictConfig) -> None:
+    start(train, given, "train")
+
+
+if __name__ == "__main__":
+    main()

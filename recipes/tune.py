@@ -6,6 +6,8 @@ damian tune aware=both "search.learner.gamma.choices=[0.9,0.99]" "+search.delay.
 All trials have the same seed: what they find must be shown with other seeds (damian compare).
 """
 
+__package__ = "damian.recipes"  # also of a script: python recipes/tune.py
+
 import json
 import shlex
 import sys
@@ -14,7 +16,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import hydra
 import pandas as pd
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from damian.common import checks
@@ -22,12 +26,14 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.tables import markdown_table, write_csv
 from damian.runs.interrupt import end_interrupted, number_of
+from damian.runs.processes import each_in_processes
 
 from . import cli
 from .compare import POLICIES
 from .config import TrainConfig, TuneConfig
-from .known import is_known, key_of, known_settings, no_such_key
-from .shared.many_runs import Run, perform_each
+from .known import is_known, key_of, no_such_key
+from .shared.many_runs import Run, perform_run
+from .shared.runs import start
 from .shared.settings import check_learning
 from .train import train
 
@@ -62,7 +68,7 @@ def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistr
         checks.require(isinstance(written, Mapping), f"search.{key}", written, should)
         if not {*written} & {"low", "high", "choices"}:
             space |= read_space(written, f"{key}.")
-        elif not is_known(key, known_settings("train")):
+        elif not is_known(key, "train"):
             raise InputError(f"search: {no_such_key(key, 'train')}")
         else:
             try:
@@ -182,7 +188,7 @@ def search_all(config: TuneConfig, folder: Path) -> None:
     done = found.n_finished
     try:
         with tqdm(total=config.trials, initial=done, unit=" trials", disable=done >= config.trials) as bar:
-            for run, error in perform_each(found.runs(), config.processes):
+            for run, error in each_in_processes(perform_run, found.runs(), config.processes):
                 value = found.tell(run, error)
                 bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}"})
                 bar.update()
@@ -194,5 +200,11 @@ def search_all(config: TuneConfig, folder: Path) -> None:
     print(f"results: {folder}")
 
 
-def run() -> None:
-    cli.run(search_all, "tune", again=True)
+@cli.one_line_errors("tune")
+@hydra.main(config_path="../conf", config_name="tune", version_base=None)
+def main(given: DictConfig) -> None:
+    start(search_all, given, "tune", again=True)
+
+
+if __name__ == "__main__":
+    main()

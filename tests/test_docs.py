@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import damian
-from damian.recipes.command import PROGRAMS, SETTINGS
+from damian.recipes.command import FOLDERS, PROGRAMS
 from damian.recipes.known import check_words
 
 ROOT = Path(damian.__file__).parents[1]
@@ -41,8 +41,8 @@ def test_every_command_that_a_file_names_exists(file):
         line = shlex.join([name, *words])
         assert name in PROGRAMS, line
         own = [word for word in words if re.match(r"[\w.]+=", word) and not re.search("FOLDER|NAME", word)]
-        if name in SETTINGS and not any(word.startswith(("--help", "--config-dir")) for word in words):
-            check_words(SETTINGS[name], own)
+        if name not in FOLDERS and not any(word.startswith(("--help", "--config-dir")) for word in words):
+            check_words(name, own)
 
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)

@@ -5,16 +5,19 @@ in ``__post_init__`` only what its settings exclude in each other. Nothing here 
 """
 
 import dataclasses
+import difflib
 import functools
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from damian.common import checks
 from damian.common.errors import InputError
+
+S = TypeVar("S", bound="Settings")
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,11 @@ class Settings:
         """The kind of this section, which decides what of it is read; empty if there is none."""
         return str(getattr(self, "kind", ""))
 
+    @classmethod
+    def class_for(cls, values: Mapping[str, Any]) -> "type[Settings]":
+        """The class that plain values of this section make; one with a class for each option finds it."""
+        return cls
+
     def key(self, name: str) -> str:
         """The key of a field on the command line."""
         return f"{self.section}.{name}".lstrip(".")
@@ -127,25 +135,57 @@ def leaves(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{path}{name}", value
 
 
-def filled(default: Any, values: Mapping[str, Any], path: str = "") -> Any:
-    """Settings like ``default`` with these plain values, whose sections are mappings; no text is resolved."""
-    known = {name for name, rule in rules(type(default)).items() if not rule.fixed}
-    if unknown := sorted({*values} - known):
-        raise InputError(f"{path}{unknown[0]} is not a setting of damian train: no policy was trained there")
-    changed = {}
+def nested(config: Any) -> dict[str, Any]:
+    """Settings as plain data, a mapping for each section, without what ``leaves`` leaves out."""
+    found: dict[str, Any] = {}
+    for key, value in leaves(config):
+        set_at(found, key, value)
+    return found
+
+
+def value_at(values: Mapping[str, Any], key: str) -> Any:
+    """A value of nested data by its dotted key; None if there is none."""
+    found: Any = values
+    for name in key.split("."):
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return found
+
+
+def set_at(values: dict[str, Any], key: str, value: Any) -> None:
+    """Set a value of nested data by its dotted key, in sections that are made where there are none."""
+    *sections, name = key.split(".")
+    for each in sections:
+        if not isinstance(values.get(each), dict):
+            values[each] = {}
+        values = values[each]
+    values[name] = value
+
+
+def filled(kind: type[S], values: Mapping[str, Any], path: str = "") -> S:
+    """Settings of a class from plain values, whose sections are mappings; no text in them is resolved."""
+    known, hints, given = rules(kind), _hints(kind), {}
     for name, value in values.items():
-        old = getattr(default, name)
-        changed[name] = filled(old, value, f"{path}{name}.") if dataclasses.is_dataclass(old) else value
-    return dataclasses.replace(default, **changed)
+        if name not in known or known[name].fixed:
+            close = difflib.get_close_matches(str(name), [each for each in known if not known[each].fixed], 1)
+            hint = "".join(f"; did you mean {path}{each}?" for each in close)
+            raise InputError(f"{path}{name}: unknown setting{hint}")
+        declared = _base(hints[name])
+        section = [*get_args(declared), declared][1] if get_origin(declared) is dict else declared
+        if not (isinstance(section, type) and issubclass(section, Settings)):
+            given[name] = value
+        elif section is not declared:  # sections by name
+            below = value.items() if isinstance(value, Mapping) else ()
+            given[name] = {k: filled(section, v or {}, f"{path}{name}.{k}.") for k, v in below}
+        else:
+            problem = f"is not a section; write {path}{name}=OPTION, or {path}{name}.KEY=VALUE"
+            checks.require(isinstance(value, Mapping), f"{path}{name}", value, problem)
+            given[name] = filled(section.class_for(value), value, f"{path}{name}.")
+    made = kind(**given)
+    made.refuse_unread()
+    return made
 
 
 _hints = functools.cache(get_type_hints)
-
-
-def is_whole(kind: type, name: str) -> bool:
-    """Is a setting of a dataclass a whole number, or a list of them?"""
-    declared = _base(_hints(kind)[name])
-    return declared is int or get_args(declared) == (int,)
 
 
 def _base(hint: Any) -> Any:
@@ -165,7 +205,7 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
         return value
     origin, inner = get_origin(kind) or kind, get_args(kind)
     if origin is float and checks.is_number(value):
-        return value
+        return float(value)
     if origin is str and checks.is_number(value):
         return str(value)  # a time such as 2
     if origin is int and (isinstance(value, str) or (isinstance(value, float) and value.is_integer())):

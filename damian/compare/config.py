@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.common.fields import Settings, constant, setting
+from damian.common.fields import Settings, setting
 
 MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
@@ -124,7 +124,6 @@ class CompareConfig(Settings):
     keep: bool = setting(
         False, "Keep the stored results of runs whose folders are gone, and run only the others."
     )
-    own_folder: str | None = constant(None, "The folder after --config-dir; the program fills it in.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

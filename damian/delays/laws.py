@@ -76,8 +76,8 @@ def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "del
 
 _NO_STEPS = "is neither a number of steps >= 0 (3) nor a time (3s, 2min)"
 _NO_DELAY = (
-    "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a distribution "
-    "({law: uniform, low: 1, high: 7}; in Python Uniform(1, 7)) or a function"
+    "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, 3s..7s), a "
+    "distribution ({law: geometric, mean: 2}; in Python Geometric(2)) or a function"
 )
 
 
@@ -155,6 +155,21 @@ class Uniform(Law):
             chances = [float(low <= k) / (high - low + 1) for k in range(int(high) + 1)]
         weighted = [self.probability * chance for chance in chances]
         return TableSampler([[weighted[0] + 1 - self.probability, *weighted[1:]]], loss=loss)
+
+
+@dataclass(frozen=True)
+class Range(Uniform):
+    """Whole steps from ``low`` to ``high``, equally likely; ``law_of`` makes one of ``1..7`` or ``3s..7s``.
+
+    A worked timeline of ``Range(1, 2)``: a message sent at t = 0 arrives at t = 1 or at t = 2.
+    """
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        alike = isinstance(self.low, str) == isinstance(self.high, str)
+        low, high = in_steps(key, self.low, dt, _NO_DELAY), in_steps(key, self.high, dt, _NO_DELAY)
+        problem = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order"
+        checks.require(alike and low <= high, key, f"{self.low}..{self.high}", problem)
+        return Uniform(low, high).sampler(dt, loss, key)
 
 
 @LAWS.register("geometric")
@@ -373,6 +388,8 @@ def law_of(written: Any, key: str = "delay") -> Law:
         return Function(cast(Any, written))
     if isinstance(written, str) and (written in LAWS or ":" in written):
         raise InputError(f"{key}: {written} is not a delay; that law is written {{law: {written}}}")
+    if isinstance(written, str) and ".." in written:
+        return Range(*map(_number, written.split("..", 1)))
     if not isinstance(written, Mapping):
         return Constant(_number(written))
     kind = written.get("law")

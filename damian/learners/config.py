@@ -1,5 +1,6 @@
 """Settings of the networks and of the learners. A learner's settings name the class that learns with them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -124,6 +125,10 @@ class LearnerConfig(Settings):
     """Whether the sizes of the actor's layers also follow from what the critic observes."""
     learner: ClassVar[str] = ""
     """Path of the class that ``make`` builds, from environment, settings, setup and replay buffer."""
+
+    @classmethod
+    def class_for(cls, values: Mapping[str, Any]) -> type[Settings]:
+        return LEARNERS.get(values.get("name"), "learner")
 
     def check(self, setup: LearningSetup) -> None:
         """Check that this learner can learn in such a run.

@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from damian.common.atomic_files import write_atomically
+from damian.common.errors import InputError
 from damian.common.tables import markdown_table, read_csv, write_csv
 from damian.runs.metrics import Evaluation
 
@@ -18,9 +19,21 @@ REPLAY = "replay"
 CONFIG = "config.yaml"
 RESULTS = "result.csv"
 TABLE = "result.md"
+EXPORT = "export"
+FAILED = "failed.json"
+"""Words and error of a run of a sweep that was refused or could not go on."""
 TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
 DETERMINISTIC = ", deterministic"
 """Ending of the name of a policy whose most likely actions are taken, not drawn from its distribution."""
+
+
+def check_no_links(folder: Path, key: str) -> None:
+    """Refuse a folder in which a link stands where a run reads, writes or deletes; ``key`` names it."""
+    for each in (folder, folder / REPLAY, folder / EXPORT):
+        for path in each.iterdir() if each.is_dir() else ():
+            if path.is_symlink():
+                problem = "is a link, and links in a run folder are not followed"
+                raise InputError(f"{key}: {path} {problem}: put there what it leads to")
 
 
 def plot_learning_curve(

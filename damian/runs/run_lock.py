@@ -8,6 +8,7 @@ from filelock import FileLock, Timeout
 
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError
+from damian.runs.run_folder import check_no_links
 
 LOCK = ".lock"
 """The file that is locked; a process that was killed leaves it in the folder, where it does no harm."""
@@ -19,6 +20,7 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
     if not folder.is_dir():
         yield
         return
+    check_no_links(folder, key)
     lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
     with writing(folder):
         try:

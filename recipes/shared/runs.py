@@ -1,86 +1,160 @@
 """Runs in their folders: starting and resuming them, and taking settings and policy of a stored one."""
 
+import copy
+import json
 import random
-from collections.abc import Collection, Sequence
-from dataclasses import asdict, fields
+import sys
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
 
 from damian.common.atomic_files import remove_unfinished, write_atomically
-from damian.common.errors import InputError
-from damian.common.fields import filled, leaves
+from damian.common.errors import InputError, RunError
+from damian.common.fields import default_of, filled, leaves, nested, set_at, value_at
 from damian.common.registry import IMPORTED, stored_settings
-from damian.common.text_files import show
+from damian.common.text_files import read_text, show
 from damian.envs.config import ScenarioConfig
-from damian.learners.config import LEARNERS, LearnerConfig
+from damian.learners.config import LearnerConfig
 from damian.runs.checkpoint import digest
-from damian.runs.run_folder import CONFIG
+from damian.runs.run_folder import CHECKPOINT, CONFIG, FAILED, RESULTS, check_no_links
+from damian.runs.run_lock import locked
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
 
-from ..cli import Work, checked, command, composed, reason, shown, stored_words, texts
+from ..cli import ERRORS, Work, command, one_line_errors, option_folders, plain, reason, short
 from ..config import TrainConfig
-from ..known import SCHEMAS, check_words, key_of
+from ..known import SCHEMAS, key_of, known_settings
 from .settings import check_components
 
 OVERRIDES = "overrides"
-"""Entry of a run's record: the words of its command line, which programs that fly its policy apply too."""
+"""Entry of a run's record: the words of its command line, as they were typed."""
+JOB, SEED = "job", "seed"
+"""Entries of a run's record: its number in the sweep that it is of, and its seed."""
 POLICY = "policy_sha256"
 """Entry of a run that begins with a stored policy: the SHA-256 of its checkpoint."""
-
 
 # ------------------------------------------------------------------------------------------ starting
 
 
-def prepared(
+def start(work: Work, given: DictConfig, program: str = "train", again: bool = False) -> None:
+    """Do the work of a program with what Hydra has composed, in the folder that Hydra has made.
+
+    With ``again`` the same command in the same folder goes on with what is there. A run of a sweep always
+    does, and keeps what goes wrong in its folder, so that the others go on.
+    """
+    running = HydraConfig.get()
+    folder, words = short(Path(running.runtime.output_dir)), [*running.overrides.task]
+    if running.mode is not RunMode.MULTIRUN:
+        with one_line_errors(program):
+            _carry_out(work, plain(given, words, program), words, program, folder, again)
+        return
+    try:
+        (folder / FAILED).unlink(missing_ok=True)
+        _carry_out(work, plain(given, words, program), words, program, folder, sweeps=True)
+    except Exception as error:  # a run of a sweep stands alone, whatever its settings and the user's code do
+        if not isinstance(error, (InputError, RunError, OSError, *ERRORS)):
+            traceback.print_exc()
+        line = reason(error, program) or type(error).__name__
+        print(f"failed: {folder}: {line}", file=sys.stderr)
+        write_atomically(folder / FAILED, json.dumps({OVERRIDES: words, "error": line}) + "\n")
+
+
+def _carry_out(
+    work: Work,
+    values: Any,
+    words: list[str],
     program: str,
-    given: DictConfig,
-    words: Sequence[str],
-    own_folder: str | None,
     folder: Path,
     again: bool = False,
-) -> tuple[Any, Path]:
-    """Check the composed settings of a run and choose its folder; a resumed run keeps its stored settings."""
-    words = [word for word in words if not key_of(word).startswith("hydra")]
-    if program == "compare":
-        config = checked(given, program)
-        config.own_folder = own_folder
-        return config, folder
-    if given.resume is not None and program == "train":
-        folder = shown(Path(given.resume))
-        return resumed(folder, given, words), folder
-    if (folder / CONFIG).exists():
-        remedy = f"choose another folder, or continue the run with resume={folder}"
-        raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
-    if given.checkpoint is None or again:
-        config, overrides = checked(given, program), list(words)
-    else:
-        config, overrides = with_policy_of(given, program, words, own_folder)
-    config.overrides = overrides
-    check_components(config)
-    return config, folder
+    sweeps: bool = False,
+) -> None:
+    with only_named_code(values):
+        resumes = program == "train" and values["resume"] is not None
+        if resumes:
+            folder = short(Path(values["resume"]))
+            config: Any = resumed(folder, values, words)
+        elif values.get("checkpoint") is None or again:
+            config = filled(SCHEMAS[program], values)
+        else:
+            config = with_policy_of(values, words, program)
+        if program == "compare":
+            only_reads = config.report_only  # a comparison may be reported on while it runs
+        else:
+            config.overrides, only_reads = words, False
+            check_components(config)
+        if sweeps and (config := left_to_do(config, folder)) is None:
+            return
+        if not (again or sweeps or resumes) and (folder / CONFIG).exists():
+            remedy = f"choose another folder, or continue the run with resume={folder}"
+            raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
+        key = "resume" if resumes else "hydra.run.dir"
+        check_no_links(folder, key)
+        with nullcontext() if only_reads else locked(folder, key):
+            if again:
+                work(config, folder)
+            else:
+                perform(config, folder, work)
 
 
-def with_policy_of(
-    given: DictConfig, program: str, words: list[str], own_folder: str | None
-) -> tuple[Any, list[str]]:
-    """The settings and overrides of a run that flies, or begins with, the policy of a stored run."""
-    folder = run_folder(Path(given.checkpoint))
-    stored = stored_config(folder, "checkpoint")
-    before = stored_words(read_record(folder).get(OVERRIDES), "train", "checkpoint", own_folder)
-    defaults = {each.name: each.default for each in fields(TrainConfig)}
-    others = [f.name for f in fields(SCHEMAS[program]) if f.default != defaults.get(f.name, f.default)]
-    overrides = inherited(stored, before, words, others)
-    check_words(program, overrides, own_folder)
-    config = checked(composed(program, overrides, own_folder), program)
-    check_policy_fits(config, stored)
-    if changed := changes(config, stored):
-        print(f"changed since the training: {changed}")
-    return config, overrides
+def only_named_code(values: Mapping[str, Any]) -> AbstractContextManager[None]:
+    """While a run takes settings from a file, only code that the present command line names is imported."""
+    if not any(values.get(key) for key in ("checkpoint", "resume", "journal")):
+        return nullcontext()
+    return stored_settings([*texts(values)], bool(values["trust"]))
+
+
+def texts(values: Any) -> Iterator[str]:
+    """Every text in nested mappings and lists."""
+    if isinstance(values, str):
+        yield values
+    elif isinstance(values, Mapping | Sequence):
+        for each in values.values() if isinstance(values, Mapping) else values:
+            yield from texts(each)
+
+
+def left_to_do(config: TrainConfig, folder: Path) -> TrainConfig | None:
+    """The settings of a run that goes on in its folder, or begins; None if it is finished.
+
+    Raises:
+        InputError: the folder holds another run.
+    """
+    if not (folder / CONFIG).exists():
+        return config
+    check_stored(config, folder)
+    if (folder / RESULTS).exists():
+        policy = read_record(folder).get(POLICY)
+        if policy and policy != digest(checkpoint_file(Path(str(config.checkpoint)), "checkpoint")):
+            problem = f"its results are not of the policy that {config.checkpoint} holds now"
+            raise InputError(f"checkpoint: {folder}: {problem}: delete the folder")
+        return None
+    return replace(config, resume=str(folder)) if (folder / CHECKPOINT).exists() else config
+
+
+def check_stored(config: TrainConfig, folder: Path) -> None:
+    """Check that a run folder is empty or holds a run with the same settings."""
+    if not (folder / CONFIG).exists():
+        return
+    try:
+        stored = stored_values(folder, "hydra.run.dir")
+    except InputError as error:
+        raise InputError(f"{error}; delete the folder") from error
+    for key, new in leaves(config):
+        old = value_at(stored, key)
+        if old != new and key not in ("resume", "checkpoint", "learner.teacher", "trust"):
+            raise InputError(
+                f"{folder}: {key} is {old} in this stored run, and {new} is asked "
+                "for: delete the folder, or choose another one with hydra.run.dir"
+            )
 
 
 def perform(config: TrainConfig, folder: Path, work: Work) -> None:
@@ -103,14 +177,14 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     """Write the record of words, versions and machine into the run folder, then the settings."""
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    entries = {OVERRIDES: list(config.overrides), "device": device, "threads": config.threads}
+    entries: dict[str, Any] = {OVERRIDES: [*config.overrides], SEED: config.seed}
+    entries |= {"device": device, "threads": config.threads}
+    if HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN:
+        entries[JOB] = HydraConfig.get().job.num
     if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
         entries[POLICY] = digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
     write_record(folder, command(), **entries)
-    nested = OmegaConf.create()
-    for key, value in leaves(config):
-        OmegaConf.update(nested, key, value, force_add=True)
-    write_atomically(folder / CONFIG, OmegaConf.to_yaml(nested))
+    write_atomically(folder / CONFIG, yaml.safe_dump(nested(config), sort_keys=False, allow_unicode=True))
 
 
 # ------------------------------------------------------------------------------------------ stored runs
@@ -122,15 +196,23 @@ def run_folder(written: Path) -> Path:
 
 
 def stored_values(folder: Path, key: str) -> dict[str, Any]:
-    """The settings in a run folder as plain data: no text in them is resolved, and no code is imported."""
+    """The settings in a run folder as plain data: no text in them is resolved, and no code is imported.
+
+    ``key`` is the setting that names the folder. Links in the folder are refused: the folder may come from
+    anybody, and nothing outside of it is read, written or deleted for what it says.
+    """
     file = folder / CONFIG
     if not file.is_file():
         raise InputError(f"{key}: {folder} holds no {CONFIG}, so there is no run")
+    check_no_links(folder, key)
     check_version(folder, key)
     try:
-        return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(file)))
-    except Exception as error:  # a damaged file can raise anything
+        values = yaml.safe_load(read_text(file))
+    except (InputError, yaml.YAMLError) as error:
         raise InputError(f"{key}: {file}: {reason(error)}") from None
+    if not isinstance(values, dict) or not isinstance(values.get("learner"), dict):
+        raise InputError(f"{key}: {file}: it does not hold the settings of a training")
+    return values
 
 
 def stored_config(folder: Path, key: str) -> TrainConfig:
@@ -138,11 +220,13 @@ def stored_config(folder: Path, key: str) -> TrainConfig:
     values = stored_values(folder, key)
     try:
         with stored_settings():
-            name = values["learner"]["name"]
-            learner = LEARNERS.get(name, "learner")(name=name)
-            return filled(TrainConfig(learner=learner), values)
+            return filled(TrainConfig, {name: values[name] for name in values if name in COMMON})
     except Exception as error:  # a damaged file can raise anything
         raise InputError(f"{key}: {folder / CONFIG}: {reason(error)}") from None
+
+
+COMMON = {each.name for each in fields(TrainConfig)}
+"""Settings that the runs of all programs have."""
 
 
 def names_own_code(config: TrainConfig) -> bool:
@@ -150,7 +234,7 @@ def names_own_code(config: TrainConfig) -> bool:
     return not IMPORTED.isdisjoint(texts(asdict(config)))
 
 
-def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfig:
+def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> TrainConfig:
     """The settings of a run to resume; only ``frames`` and ``episodes`` may change."""
     allowed, stored = ("resume", "frames", "episodes", "trust"), read_record(folder).get(OVERRIDES) or ()
     if refused := [word for word in words if key_of(word) not in allowed and word not in stored]:
@@ -159,31 +243,64 @@ def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfi
         raise InputError(f"{refused[0]}: {problem}")
     config = stored_config(folder, "resume")
     checkpoint_file(folder, "resume")
-    config.resume = str(folder)
-    for key in {"frames", "episodes"} & set(map(key_of, words)):
-        setattr(config, key, given[key])
-    config.__post_init__()
-    check_components(config)
-    return config
+    changed = {key: values[key] for key in ("frames", "episodes") if key in map(key_of, words)}
+    return replace(config, resume=str(folder), **changed)
 
 
 # ------------------------------------------------------------------------------------------ flying
 
 
-def inherited(
-    stored: TrainConfig, before: Sequence[str], given: Sequence[str], own: Collection[str] = ()
-) -> list[str]:
-    """The given overrides after those of a stored run, which keeps the histories that its policy observes."""
-    keys = [*map(key_of, given), *own]
-    history = [] if {"delay.history", "aware"} & {*keys} else [f"delay.history={stored.delay.history}"]
-    messages = stored.delay.messages
-    history += [f"delay.messages={messages}"] if messages and "delay.messages" not in keys else []
-    return [*without(before, [*keys, *map(key_of, history)]), *history, *given]
+def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = "train") -> Any:
+    """The settings of a run that flies, or begins with, the policy of a stored run.
+
+    Words lie over what is stored: a group's option replaces the settings that its options set, a key its
+    value. What is not mentioned stays, and so do the histories that the policy observes.
+    """
+    folder = run_folder(Path(values["checkpoint"]))
+    stored = stored_config(folder, "checkpoint")
+    merged: dict[str, Any] = copy.deepcopy(nested(stored))
+    defaults = {each.name: default_of(each) for each in fields(TrainConfig)}
+    own = {f.name for f in fields(SCHEMAS[program]) if default_of(f) != defaults.get(f.name, MISSING)}
+    kept = {key: value_at(merged, key) for key in ("delay.history", "delay.messages")}
+    given = {key_of(word).partition("@")[0] for word in words} | {"checkpoint", "trust"} | (own & {*values})
+    mentioned = set[str]().union(*(reach(key, program) for key in given))
+    for key in sorted(mentioned):  # a section before its keys
+        set_at(merged, key, value_at(values, key))
+    for key in kept.keys() - mentioned:
+        set_at(merged, key, kept[key])
+    config = filled(SCHEMAS[program], merged)
+    check_policy_fits(config, stored)
+    if changed := changes(config, stored):
+        print(f"changed since the training: {changed}")
+    return config
 
 
-def without(overrides: Sequence[str], replaced: Collection[str]) -> list[str]:
-    """The overrides but those that set one of these keys and groups, or a key below them."""
-    return [w for w in overrides if not any(f"{key_of(w)}.".startswith(f"{key}.") for key in replaced)]
+MISSING = object()
+
+
+def reach(key: str, program: str) -> set[str]:
+    """The settings, and whole sections, that a word sets: of a group, those that any of its options sets.
+
+    A scenario says nothing of the networks: they are those of the policy.
+    """
+    found: set[str] = set()
+    for file in (file for folder in option_folders() for file in (folder / key).rglob("*.yaml")):
+        text = read_text(file)
+        written = yaml.safe_load(text) or {}
+        chosen = [name for each in written.pop("defaults", ()) if isinstance(each, dict) for name in each]
+        found |= {name.removeprefix("override /") for name in chosen if name.startswith("override /")}
+        found |= {*_settings_in(written, program)} if "@package _global_" in text else {key}
+    return found - {"model"} - {"tuning"} if key == "scenario" else found or {key}
+
+
+def _settings_in(written: Mapping[str, Any], program: str, path: str = "") -> Iterator[str]:
+    """The settings that nested mappings set."""
+    for name, value in written.items():
+        setting = known_settings(program).get(f"{path}{name}")
+        if setting and setting.is_section and isinstance(value, Mapping):
+            yield from _settings_in(value, program, f"{path}{name}.")
+        elif setting:
+            yield f"{path}{name}"
 
 
 def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from damian.recipes.train import run as main
+from damian.recipes.train import main
 
 
 @pytest.fixture

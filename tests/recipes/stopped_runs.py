@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from damian.recipes.train import run as main
+from damian.recipes.train import main
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.metrics_log import MetricsLog
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from helpers import check_refused
 
-from damian.recipes.advise import run as main
-from damian.recipes.train import run as train
+from damian.recipes.advise import main
+from damian.recipes.train import main as train
 
 HEAD = "ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"
 TABLE = f"""{HEAD}

@@ -6,24 +6,14 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
+import yaml
 
 import damian
+from damian.delays.laws import sampler_of
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
 from damian.recipes.shared.collectors import warn_of_memory
-
-
-def refusal(capsys, *words: str) -> str:
-    """The line with which the command refuses words."""
-    with pytest.raises(SystemExit) as stop:
-        main(words)
-    printed = capsys.readouterr()
-    assert stop.value.code == 2
-    assert printed.out == ""
-    assert printed.err.count("\n") == 1
-    return printed.err.removeprefix("error: ").strip()
 
 
 @pytest.mark.parametrize(
@@ -31,76 +21,83 @@ def refusal(capsys, *words: str) -> str:
     [
         "import damian.learners.config",
         "from damian.recipes.command import main; main(['train', '--help', 'delay'])",
-        "from damian.recipes.command import main; main(['train', 'agents=0'])",
+        "from damian.recipes.command import main; main(['train', 'agnts=3'])",
     ],
 )
-def test_settings_help_and_wrong_words_need_neither_torch_nor_pandas(code):
+def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
     code = f"import sys\ntry:\n    {code}\nfinally:\n    assert not {{'torch', 'pandas'}} & {{*sys.modules}}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "AssertionError" not in done.stderr
-    assert done.returncode == (2 if "agents=0" in code else 0)
+    assert done.returncode == (2 if "agnts=3" in code else 0)
+
+
+LATE = "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, 3s..7s)"
+RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order"
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["trian"], "trian: no such program; the programs are train, evaluate"),
+        (["train", "agents"], "agents: this word is not of the form KEY=VALUE"),
         (["train", "agnts=3"], "agnts: unknown setting; did you mean agents?"),
+        (["train", "--config-dir=.", "agnts=3"], "agnts: unknown setting; did you mean agents?"),
         (["train", "num_envs=8"], "num_envs: unknown setting; did you mean worlds?"),
+        (["train", "learner.lmbd=0.9"], "learner.lmbd: unknown setting; did you mean learner.lmbda?"),
+        (["train", "+delay.obz=1"], "delay.obz: unknown setting; did you mean delay.obs?"),
         (["train", "delay=3"], "delay: 3 is not an option of this group; write delay.obs=3"),
-        (
-            ["train", "region.where=name:x", "region=usecase"],
-            "region.where: unknown setting for region=usecase",
-        ),
-        (["train", "source.speed=3"], "source.speed: unknown setting for source=static; another source="),
         (["train", "-m", "delay=none,papr"], "delay: papr is not one of"),
-        (["train", "delay=-1"], "Config group override must be a string"),
+        (
+            ["train", "source.speed=3"],
+            "source.speed: 3.0 means nothing with source=static: only dynamic reads",
+        ),
+        (["train", "delay=-1"], "delay: -1 is not an option of this group; write delay.obs=-1"),
+        (["train", "model=3"], "model: 3 is not one of gru, mlp, small"),
         (["train", "seed=0,1"], "Ambiguous value for argument 'seed=0,1' 1. To use it as a list"),
         (["train", "agents=two"], "agents: two is not a whole number"),
         (["train", "frames=1.5e0"], "frames: 1.5 is not a whole number"),
         (["train", "agents=0"], "agents: 0 is not between 1 and 1000"),
+        (["train", "delay.obs=-1"], f"delay.obs: -1 {LATE}"),
+        (["train", "delay.obs=7..1"], f"delay.obs: 7..1 {RANGE}"),
+        (["train", "delay.obs=1..7s"], f"delay.obs: 1..7s {RANGE}"),
+        (["train", "delay.obs.high=3"], "delay.obs.law: None is not one of"),
         (["train", "clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
         (["train", "region=geojson"], "region.path: it is missing: region.kind=geojson needs it"),
+        (["train", "delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
+        (["train", "checkpoint=nowhere"], "checkpoint: nowhere holds no config.yaml"),
+        (["train", "resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
+        (["train", "-m", "seed=0,1", "settle=true"], None),
+        (["train", "-m", "seed=a,b"], None),
+        (["train", "logger=wandb"], "logger: wandb is not installed; pip install wandb"),
         (["compare", "experiment=usecases", "agents=3"], "agents: it is a setting of the runs"),
+        (["compare", "-m", "experiment=usecases"], "-m: not with damian compare, which has many runs anyway"),
+        (["export"], "checkpoint: it is missing"),
+        (["results"], "folders: it is not one folder, or two to compare"),
     ],
     ids=lambda part: part[-1] if isinstance(part, list) else "",
 )
-def test_a_mistake_is_answered_in_one_line(capsys, tmp_path, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    assert refusal(capsys, *words).startswith(message)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
-        (["checkpoint=nowhere"], "checkpoint: nowhere holds no config.yaml"),
-        (["resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
-    ],
-)
-def test_what_only_a_program_can_tell_is_one_line_too_and_leaves_no_folder(
+def test_a_mistake_is_answered_in_one_line_and_leaves_no_folder(
     capsys, tmp_path, monkeypatch, words, message
 ):
     monkeypatch.chdir(tmp_path)
-    assert message in refusal(capsys, "train", *words)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    printed = capsys.readouterr()
+    assert (stop.value.code, printed.out) == (2, "")
+    if message is None:  # a line for each run of a sweep
+        assert all(line.startswith("failed: ") for line in printed.err.splitlines())
+    else:
+        assert printed.err.count("\n") == 1
+        assert printed.err.startswith(f"error: {message}")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, monkeypatch):
     """On the command line, in a file, in a variable of a cluster, and in Python."""
     monkeypatch.setenv("TASK", "7")
-    words = (
-        "frames=1e6",
-        "seed=${oc.env:TASK}",
-        "model.hidden=[1e2,64]",
-        "delay.obs=133ms",
-        "clock.simulation=50ms",
-    )
-    file = tmp_path / "scenario" / "mine.yaml"
-    file.parent.mkdir()
-    file.write_text("# @package _global_\nworlds: 2e1\nepisode: {max_steps: 3.0e+1}\n", encoding="utf-8")
-    config = cli.settings("scenario=mine", *words, own_folder=str(tmp_path))
+    words = ["frames=1e6", "seed=${oc.env:TASK}", "model.hidden=[1e2,64]", "delay.obs=133ms"]
+    config = cli.settings(*words, "clock.simulation=50ms", "worlds=2e1", "episode.max_steps=3.0e+1")
     found = [config.frames, config.seed, *config.model.hidden, config.worlds, config.episode.max_steps]
     assert found == [1_000_000, 7, 100, 64, 20, 30]
     assert {type(number) for number in found} == {int}
@@ -108,44 +105,104 @@ def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, m
     assert damian.ClockConfig(simulation="50ms").steps("agents") == 1
 
 
+UNIFORM = "{law: uniform, low: 1, high: 7}"
+
+
+@pytest.mark.parametrize(
+    ("words", "key", "law"),
+    [
+        (["delay=lag", f"delay.obs={UNIFORM}"], "delay.obs", yaml.safe_load(UNIFORM)),
+        (["delay=paper", f"+delay.obs={UNIFORM}"], "delay.obs", yaml.safe_load(UNIFORM)),
+        (["delay=paper", "delay.obs=1..7"], "delay.obs", "1..7"),
+        (
+            ["delay=paper", f"delay.obs={UNIFORM}", "delay.obs.high=9"],
+            "delay.obs",
+            {"law": "uniform", "low": 1, "high": 9},
+        ),
+        (
+            ["delay=paper", "delay.obs.high=9s"],
+            "delay.obs",
+            {"law": "uniform", "low": "3s", "high": "9s", "probability": 0.15},
+        ),
+        (
+            ["links=updown", "links.delay={law: geometric}", f"links.delay={UNIFORM}"],
+            "links.delay",
+            yaml.safe_load(UNIFORM),
+        ),
+    ],
+)
+def test_a_law_replaces_the_one_before_it_whole_and_its_fields_change_it(words, key, law):
+    section, name = key.split(".")
+    assert getattr(getattr(cli.settings(*words), section), name) == law
+
+
+@pytest.mark.parametrize("option", ["burst", "paper"])
+def test_a_law_of_a_scenario_is_not_mixed_with_that_of_a_delay(capsys, tmp_path, monkeypatch, option):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "conf" / "scenario" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(
+        "# @package _global_\nepisode: {max_steps: 9}\ndelay: {obs: {law: uniform, low: 1, high: 7}}\n"
+    )
+    words = ["train", "--config-dir=conf", "scenario=mine", "model.hidden=8"]  # refused if nothing else is
+    for more, message in (
+        ([], "model.hidden: 8 is not a list"),
+        ([f"delay={option}"], "mixes laws of several files; write the one that you mean as a whole"),
+        ([f"delay={option}", "delay.obs=1..7"], "model.hidden: 8 is not a list"),
+        ([f"delay={option}", f"delay.obs={UNIFORM}"], "model.hidden: 8 is not a list"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*words, *more])
+        assert message in capsys.readouterr().err
+
+
+def test_a_range_is_uniform_over_whole_steps():
+    by_steps, by_time = (sampler_of(law, dt=1.0).chances[0].tolist() for law in ("1..3", "2s..4s"))
+    assert by_steps == pytest.approx([0, 1 / 3, 1 / 3, 1 / 3, 0])
+    assert by_time == pytest.approx([0, 0, 1 / 3, 1 / 3, 1 / 3, 0])
+
+
 def test_a_refused_run_removes_only_the_folders_that_it_has_made(capsys, tmp_path):
     (tmp_path / "mine").mkdir()
-    words = ("settle=true", f"hydra.run.dir={tmp_path}/mine/new/run")
-    assert "settle: True means nothing" in refusal(capsys, "train", *words)
+    with pytest.raises(SystemExit):
+        main(["train", "settle=true", f"hydra.run.dir={tmp_path}/mine/new/run"])
+    assert "settle: True means nothing" in capsys.readouterr().err
     assert list((tmp_path / "mine").iterdir()) == []
 
 
-def test_a_refused_job_of_a_sweep_leaves_no_folder(capsys, tmp_path):
-    words = ("-m", "settle=true", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
-    assert "settle: True means nothing" in refusal(capsys, "train", *words)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_path):
+def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     file = tmp_path / "my own" / "scenario" / "mine.yaml"
     file.parent.mkdir(parents=True)
-    words = "train", f"--config-dir={tmp_path / 'my own'}", "scenario=mine"
+    words = ["train", "--config-dir", "my own", "scenario=mine"]
     for text, message in (
         ("agents: 2\n\tseed: 3\n", "mine.yaml"),
-        ("model: {hidden: 8}\n", "model.hidden"),
-        ("agnts: 8\n", "agnts: unknown setting; did you mean agents?"),
+        ("model: {hidden: 8}\n", "error: model.hidden: 8 is not a list"),
+        ("model: 8\n", "error: model: 8 is not a section; write model=OPTION, or model.KEY=VALUE"),
+        ("agnts: 8\n", "error: agnts: unknown setting; did you mean agents?"),
     ):
         file.write_text(f"# @package _global_\n{text}")
-        assert message in refusal(capsys, *words)
-    file.write_text("# @package _global_\nagents: 2\n")
-    assert cli.settings("scenario=mine", own_folder=str(tmp_path / "my own")).agents == 2
+        with pytest.raises(SystemExit):
+            main(words)
+        assert message in capsys.readouterr().err
+    file.write_text("# @package _global_\nagents: 2e0\n")
+    main([*words, "--cfg", "job"])
+    assert "agents: 2.0" in capsys.readouterr().out
 
 
-def test_a_training_has_few_settings_and_each_is_documented():
-    found = cli.composed("train", [])
+def test_every_option_is_a_file_that_begins_with_its_launch_line_and_composes():
+    for group, options in groups().items():
+        for option in options:
+            lines = (CONF / group / f"{option}.yaml").read_text(encoding="utf-8").splitlines()
+            (first, *_) = [line for line in lines if not line.startswith("# @package")]
+            assert first.startswith("# damian "), (group, option)
+            if group not in ("experiment", "search"):
+                cli.composed(f"{group}={option}")
 
-    def count(node) -> int:
-        return sum(count(node[k]) if OmegaConf.is_dict(node[k]) else 1 for k in node if k != "hydra")
 
-    assert count(found) <= 121
-    assert len([*CONF.rglob("*.yaml")]) <= 50
-    undocumented = [k for k, each in known_settings("train").items() if each.default and not each.text]
-    assert [k for k in undocumented if k != "learner.name"] == []
+def test_every_setting_is_documented():
+    undocumented = [k for k, each in known_settings("train").items() if not (each.is_section or each.text)]
+    assert undocumented == []
 
 
 def test_what_a_scenario_says_of_the_learner_gives_way_to_the_command_line():
@@ -159,7 +216,7 @@ def test_what_a_scenario_says_of_the_learner_gives_way_to_the_command_line():
 
 def test_every_program_is_a_module_and_says_what_it_does(capsys):
     for name in PROGRAMS:
-        assert import_module(f"damian.recipes.{name.replace('-', '_')}").run
+        assert import_module(f"damian.recipes.{name}").main
     main([])
     printed = capsys.readouterr().out
     assert all(f"\n  {name} " in printed and what in printed for name, what in PROGRAMS.items())
@@ -170,7 +227,7 @@ def test_every_program_is_a_module_and_says_what_it_does(capsys):
 def test_help_explains_a_program_a_section_and_a_setting(capsys):
     main(["train", "--help"])
     page = capsys.readouterr().out
-    assert all(name in page for name in groups() if name != "experiment")
+    assert all(name in page for name in {*groups()} - {"experiment", "search"})
     main(["train", "--help", "delay", "learner.gamma"])
     printed = capsys.readouterr().out
     assert "delay.loss: float = 0.0\n    Probability that a message" in printed
@@ -180,21 +237,16 @@ def test_help_explains_a_program_a_section_and_a_setting(capsys):
     assert "agents: 4" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["train", "-m", "seed=a,b"], "seed: a is not a whole number"),
-        (["train", "-m", "seed=0,b"], "seed: b is not a whole number"),
-        (["train", "-m", "agents=3,0", "delay=none,paper"], "agents: 0 is not between 1 and 1000"),
-        (["train", "-m", "delay.obs={law: trace, path: no.csv}", "seed=0,1"], "no.csv: no such file"),
-        (["train", "logger=wandb"], "logger: wandb is not installed; pip install wandb"),
-    ],
-)
-def test_what_is_refused_leaves_no_folder(capsys, tmp_path, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    assert message in refusal(capsys, *words)
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize("place", ["damian", "recipes/train.py"])
+def test_a_program_is_a_script_and_a_word_of_the_command(place, tmp_path):
+    code = "from damian.recipes.command import main; main()"
+    start = ["-c", code, "train"] if place == "damian" else [str(CONF.parent / place)]
+    words = ["agents=1", "--cfg", "job"]
+    done = subprocess.run(
+        [sys.executable, *start, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "agents: 1" in done.stdout
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(capsys, tmp_path, monkeypatch):
@@ -202,15 +254,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(capsys, tmp_path, monkeypat
     Path("file").touch()
     with pytest.raises(SystemExit):
         main(["train", "-m", "seed=0,1", "hydra.sweep.dir=file/sweep"])
-    assert capsys.readouterr().err == f"error: {tmp_path}/file/sweep: Not a directory\n"
-    Path("run").mkdir()
-    Path("run/result.csv").write_text(
-        "policy,return,success_rate,steps,perceived_return,age\nx,1,0,1,1,0\n", encoding="utf-8"
-    )
-    Path("results.csv.part").mkdir()
-    with pytest.raises(SystemExit):
-        main(["results", "."])
-    assert capsys.readouterr().err.startswith("error: results.csv: it cannot be written: Is a directory")
+    assert capsys.readouterr().err == "error: file/sweep: Not a directory\n"
 
 
 def test_a_training_that_is_larger_than_the_machine_says_so(capsys):

@@ -15,8 +15,7 @@ from hydra import initialize_config_dir
 
 from damian.compare.comparison import TRAINED, Arm
 from damian.compare.config import CompareConfig, Experiment, HeldOut
-from damian.recipes.compare import includes, plan
-from damian.recipes.compare import run as main
+from damian.recipes.compare import includes, main, plan
 from damian.recipes.known import CONF
 from damian.recipes.shared import many_runs
 from damian.recipes.shared.runs import POLICY

@@ -32,7 +32,7 @@ def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train.py", *TRAINED, f"hydra.run.dir={folder}"])
-        train.run()
+        train.main()
     return folder
 
 
@@ -47,7 +47,7 @@ def fly(trained, tmp_path, monkeypatch) -> Callable[..., Path]:
         policy = [f"checkpoint={of}"] if of else []
         words = [*(TRAINED if program is train else []), *overrides, *policy, f"hydra.run.dir={folder}"]
         monkeypatch.setattr(sys, "argv", ["evaluate.py", *words])
-        program.run()
+        program.main()
         return tmp_path / folder
 
     return run_recipe

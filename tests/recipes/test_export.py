@@ -188,7 +188,7 @@ def test_an_actor_that_no_program_can_stand_for_is_refused_in_one_line(law, mess
 
 
 def test_what_cannot_be_exported_is_refused_in_one_line(capsys, tmp_path):
-    for words, message in (([], "give the run folder"), ([str(tmp_path)], "holds no config.yaml")):
+    for words, message in (([], "checkpoint: it is missing"), ([str(tmp_path)], "holds no config.yaml")):
         with pytest.raises(SystemExit):
             main(["export", *words])
         assert message in capsys.readouterr().err

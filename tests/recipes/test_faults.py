@@ -27,7 +27,7 @@ def begun(tmp_path_factory) -> Path:
         patch.chdir(folder)
         patch.setattr("sys.argv", ["train.py", *TINY, "seed=9", "hydra.run.dir=run"])
         with killed_after(4):
-            train.run()
+            train.main()
     return folder / "run"
 
 

@@ -14,8 +14,8 @@ from matplotlib.image import imread
 from PIL import Image
 from shapely.geometry import shape
 
-from damian.recipes.fly import run as main
-from damian.recipes.train import run as train
+from damian.recipes.fly import main
+from damian.recipes.train import main as train
 from damian.show.episode import Episode
 from damian.show.replay_page import page
 

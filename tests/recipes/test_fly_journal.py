@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from reports import write_journal
 
-from damian.recipes.fly import run as main
+from damian.recipes.fly import main
 from damian.show.episode import Episode
 
 WORDS = ["region=llanbedr", "delay=paper"]

@@ -96,18 +96,6 @@ def test_results_are_utf_8_whatever_the_locale_and_shown_also_where_it_lacks_a_l
     assert "| \\u0141\\u0105ka |" in done.stdout
 
 
-@pytest.mark.slow
-def test_a_sweep_in_several_processes_ends_with_its_table_too(tmp_path):
-    words = (
-        "hydra/launcher=joblib",
-        "hydra.launcher.n_jobs=2",
-        "delay.obs=1,2",
-        f"hydra.sweep.dir={tmp_path}",
-    )
-    main(["train", "-m", *SWEEP, *words])
-    assert (tmp_path / "table.md").read_text().startswith("| delay.obs |")
-
-
 def test_results_of_a_run_and_of_a_comparison_are_rows_too(sweep):
     run = next(path.parent for path in sweep.rglob("result.csv"))
     assert [*damian.results(run)["policy"]][:2] == ["untrained", "untrained, deterministic"]

@@ -28,7 +28,7 @@ def test_versions_are_those_of_what_is_imported_whatever_the_distribution_is_cal
     assert (packages["torchrl"], packages["torch"]) == (torchrl.__version__, torch.__version__)
 
 
-def test_a_command_can_be_typed_again_and_shows_no_password(monkeypatch):
-    words = ["delay.obs={law: uniform}", "it's", "-m", "+token=secret"]
+def test_a_command_can_be_typed_again(monkeypatch):
+    words = ["delay.obs={law: uniform}", "it's", "-m"]
     monkeypatch.setattr(sys, "argv", ["/x/bin/damian train", *words])
-    assert shlex.split(command()) == ["damian", "train", *words[:3], "token=..."]
+    assert shlex.split(command()) == ["damian", "train", *words]

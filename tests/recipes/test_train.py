@@ -50,7 +50,7 @@ def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["damian train", *TINY, f"hydra.run.dir={folder}"])
-        train_recipe.run()
+        train_recipe.main()
     return folder
 
 
@@ -151,15 +151,6 @@ def test_every_policy_is_evaluated_in_the_same_episodes(run):
     with (folder / "result.csv").open(newline="") as file:
         _, one, *others = [row[1:] for row in csv.reader(file)]
     assert others == [one] * 5
-
-
-@pytest.mark.slow
-def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
-    run("-m", *TINY, "agents=1,2", "hydra.sweep.dir=sweep")
-    tables = list((tmp_path / "sweep").glob("*/result.md"))
-    assert len(tables) == 2
-    agents = {OmegaConf.load(path.parent / "config.yaml").agents for path in tables}
-    assert agents == {1, 2}
 
 
 @pytest.mark.parametrize("case", [1, 2])

@@ -25,7 +25,7 @@ def search(tmp_path, monkeypatch):
 
     def run(*words, space=SPACE, folder="found"):
         monkeypatch.setattr(sys, "argv", ["damian tune", *TINY, *space, *words, f"hydra.run.dir={folder}"])
-        tune.run()
+        tune.main()
         return tmp_path / folder
 
     return run

@@ -1,0 +1,1 @@
+"""Configuration files of the programs; `ls conf/GROUP` lists what may be written for a group."""

@@ -1,0 +1,65 @@
+"""Means of groups of runs over their seeds, and paired differences to the first value of a setting."""
+
+from collections.abc import Sequence
+
+import pandas as pd
+
+from damian.common.tables import markdown_table
+from damian.compare.comparison import means_over_seeds, shown
+from damian.compare.config import LESS_IS_BETTER
+from damian.compare.statistics import FEWEST, improvement_interval, probability_of_improvement
+
+MEASURES = ["return", "success_rate", "steps", "perceived_return", "age"]
+"""Measures of the table of a sweep; success and steps only where some run succeeds."""
+NOTE = (
+    f"n: runs, one for each seed; [95 % interval over runs, none below {FEWEST}]; perceived: as far as the "
+    "server knew"
+)
+DIFFERENCE = (
+    "; difference: of the {score} to that of {first}, paired by seed; P > first: probability that a run of "
+    "the line beats one of the first"
+)
+
+
+def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> pd.DataFrame:
+    """A line for each policy of each group: means over seeds, and differences to the first value."""
+    succeeds, lines = (rows["success_rate"] > 0).any(), []
+    measures = [name for name in MEASURES if succeeds or name not in ("success_rate", "steps")]
+    measures = list(dict.fromkeys([*measures, score]))
+    for names, runs in rows.groupby([*groups, "policy"], sort=False):
+        labels = dict(zip([*groups, "policy"], names, strict=True))
+        group = ", ".join(f"{key}={labels[key]}" for key in groups) or "all runs"
+        line = {**labels, "group": group, "n": len(runs), **means_over_seeds(runs[measures])}
+        if groups and labels[groups[0]] != (first := rows[groups[0]].iloc[0]):
+            beside = {**labels, groups[0]: first}
+            line |= difference(runs, rows[(rows[[*beside]] == pd.Series(beside)).all(axis=1)], score)
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def difference(runs: pd.DataFrame, others: pd.DataFrame, score: str) -> dict[str, float]:
+    """The mean difference of a score by seed, and the probability of improvement, with their intervals."""
+    pairs = runs[["seed", score]].merge(others[["seed", score]], on="seed")
+    if pairs.empty:
+        return {}
+    new, old = pairs[f"{score}_x"], pairs[f"{score}_y"]
+    sign = -1 if score in LESS_IS_BETTER else 1
+    better = float(probability_of_improvement(sign * new.to_numpy(), sign * old.to_numpy()))
+    low, high = improvement_interval(better, len(pairs))
+    found = means_over_seeds(pd.DataFrame({"difference": new - old}))
+    return found | {"improvement": better, "improvement_low": low, "improvement_high": high}
+
+
+def as_table(lines: pd.DataFrame, groups: Sequence[str], score: str = "return") -> str:
+    """Lines of means as a Markdown table, with a note on its columns."""
+    head = [*groups, "policy", "n"]
+    measures = [name for name in dict.fromkeys([*MEASURES, score]) if name in lines]
+    columns, note = {name: name for name in measures}, NOTE
+    if "difference" in lines:
+        columns |= {"difference": "difference", "improvement": "P > first"}
+        note += DIFFERENCE.format(score=score, first=f"{groups[0]}={lines[groups[0]].iloc[0]}")
+    cells = [
+        [*(line[name] for name in head), *(shown(line, name) for name in columns)]
+        for line in lines.to_dict("records")
+    ]
+    return markdown_table([*head, *columns.values()], cells, left=len(groups) + 1) + f"\n\n{note}"
