@@ -7,7 +7,7 @@ import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import zip_longest
 
 import numpy as np
@@ -15,7 +15,6 @@ import shapely
 import torch
 from torch import Tensor
 
-from damian.common.counter_rng import number_of
 from damian.common.errors import InputError
 from damian.field.rows import DEGREES, METRES, Place, Report
 from damian.server.server import Server
@@ -24,8 +23,6 @@ from damian.world.battery import observed
 from damian.world.messages import Messages
 from damian.world.regions.geodesy import to_latlon, to_local
 
-KEPT, KEPT_ANYWAY = 512, 16
-"""Most and fewest reports of a UAV that are kept: a late one changes what newer ones left open."""
 DIGITS = {DEGREES: 8, METRES: 3}
 """Decimals of a place in answers: a millimetre."""
 
@@ -45,11 +42,6 @@ class Ground:
         """Where a landing point is, in ``columns``."""
         self.way = lru_cache(10_000)(self._way)
         """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
-
-    @cached_property
-    def mark(self) -> str:
-        """A text that stands for the landing points."""
-        return str(number_of(str(self.points.round(2).tolist())))
 
     def local(self, place: Place) -> tuple[float, float]:
         """A place, east and north of the origin of the region [m]."""
@@ -119,12 +111,9 @@ class FilledReport:
 class UavLog:
     """The reports of one UAV."""
 
-    def __init__(self, ground: Ground, n_stops: int, n_readings: int, kept_steps: int, dt: float) -> None:
-        self.ground, self.n_stops, self.n_readings, self.kept_steps = ground, n_stops, n_readings, kept_steps
-        self.dt = dt
+    def __init__(self, ground: Ground, n_stops: int, n_readings: int, dt: float) -> None:
+        self.ground, self.n_stops, self.n_readings, self.dt = ground, n_stops, n_readings, dt
         self.reports: list[FilledReport] = []
-        self.known_from = -math.inf
-        """Time since which all reports are kept [s]."""
 
     @property
     def newest(self) -> FilledReport | None:
@@ -165,12 +154,6 @@ class UavLog:
         self.reports.insert(at, filled)
         for i in range(at, len(self.reports)):
             self._fill(self.reports[i], self.reports[i - 1] if i else None)
-        too_old = self.reports[-1].step - self.kept_steps
-        while len(self.reports) > KEPT or (
-            len(self.reports) > KEPT_ANYWAY and self.reports[0].step < too_old
-        ):
-            del self.reports[0]
-            self.known_from = self.reports[0].report.time
         return filled
 
     def _fill(self, filled: FilledReport, before: FilledReport | None) -> None:

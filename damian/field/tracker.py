@@ -16,7 +16,7 @@ from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, show
 from damian.field.known import FilledReport, UavLog, messages_of
-from damian.field.node import REMEMBERED_STEPS, LateMessage, Memories, Node, Reported
+from damian.field.node import LateMessage, Memories, Node, Reported
 from damian.field.rows import Report
 from damian.world.messages import Messages
 from damian.world.state import State
@@ -74,8 +74,7 @@ class Tracker:
 
     def _new_log(self) -> UavLog:
         n_readings = sum(each.width for each in self.node.simulation.sensors.values())
-        kept = 2 * max(self.node.law_longest, REMEMBERED_STEPS)
-        return UavLog(self.node.ground, self.node.server.observation.stops, n_readings, kept, self.node.dt)
+        return UavLog(self.node.ground, self.node.server.observation.stops, n_readings, self.node.dt)
 
     # Reports.
 
@@ -119,7 +118,7 @@ class Tracker:
             log.add(report, 0, None)
             self._begin()
             return
-        if report.time < max(self.start, log.known_from):
+        if report.time < self.start:
             return
         now = self.step_of(self.clock)
         step = min(self.step_of(report.time), now)

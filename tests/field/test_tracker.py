@@ -173,6 +173,14 @@ def test_a_long_silence_is_skipped_without_a_difference(task, monkeypatch):
         assert torch.equal(seen[0][key], seen[1][key])
 
 
+def test_a_scenario_that_holds_messages_holds_reports_until_its_longest_delay():
+    tracker = begun(**TASKS["held back"])
+    tell(tracker, "a", START + 3, 7)
+    for second, point in ((6, 200), (7, 7)):
+        assert [*tracker.advance(START + second)] == []
+        assert tracker.held["a"].point == point
+
+
 def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
     tracker = begun()
     tell(tracker, "a", START + 5, 210)

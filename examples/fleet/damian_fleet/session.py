@@ -39,7 +39,7 @@ from damian_fleet.journal import (
     read_head,
     read_lines,
 )
-from damian_fleet.known import UavLog, stored_report
+from damian_fleet.known import UavLog, mark_of, stored_report
 from damian_fleet.orders import Decision
 from damian_fleet.rules import FieldRules
 
@@ -137,7 +137,7 @@ class AdviceSession:
         made = self.make(head.uavs, head.mark)
         if self._folder is not None:
             journal = Journal(self._folder / f"{name}{SUFFIX}")
-            journal.append(head.model_copy(update={"ground": made.ground.mark, "rules": rules_of(made)}))
+            journal.append(head.model_copy(update={"ground": mark_of(made.ground), "rules": rules_of(made)}))
             self._journals[name] = journal
         self.fleets[name] = made
         return True
@@ -277,7 +277,7 @@ class AdviceSession:
             if head.fleet != path.stem:
                 raise InputError(f"it is the journal of the fleet {head.fleet}: name it {head.fleet}{SUFFIX}")
             check_same(head.about, self.about)
-            if head.ground != self.make(head.uavs, head.mark).ground.mark:
+            if head.ground != mark_of(self.make(head.uavs, head.mark).ground):
                 raise InputError("it is of other landing points: give the region and the lattice that it had")
         self._journals[path.stem] = journal
 

@@ -63,7 +63,7 @@ class Truth:
     def __init__(self, node: Node, flying: Lockstep) -> None:
         self.node, self.flying = node, flying
         n_stops = node.server.observation.stops
-        self.logs = [UavLog(node.ground, n_stops, 0, 1000, node.dt) for _ in flying.copters]
+        self.logs = [UavLog(node.ground, n_stops, 0, node.dt) for _ in flying.copters]
         self.steps: list[Any] = []
         self.note()
 
