@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from context_law import Crowd
+from delay_twin import Crowd
 from helpers import random_actions
 from tensordict import TensorDictBase
 from torch import Tensor

@@ -1,5 +1,6 @@
 """Shared test helpers: the paper's use cases without Hydra, small scenarios, and functions that step them."""
 
+import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -27,7 +28,6 @@ from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
 from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
-from damian.world.state import State
 
 DATA = Path(__file__).parent / "data"
 
@@ -198,6 +198,14 @@ def all_same(some: Sequence[TensorDictBase], others: Sequence[TensorDictBase], a
     return len(some) == len(others) and all(same(*pair, atol) for pair in zip(some, others, strict=True))
 
 
+def saved_and_loaded(state: Any) -> Any:
+    """A state after it was saved to a file and loaded from it."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
 def heading(degrees: float) -> float:
     """Heading in [0, 1] of a continuous action, for a bearing clockwise from north [deg]."""
     return (degrees % 360) / 360
@@ -280,15 +288,6 @@ KEEPS_GOING = EpisodeConfig(max_steps=None)
 
 both_motions = pytest.mark.parametrize("motion", ["instant", "polynomial"])
 both_kinds = pytest.mark.parametrize("kind", ["discrete", "continuous"])
-
-
-def check_equal(one: State, other: State, rows=slice(None)):
-    """Assert that two states are equal bit for bit in the worlds ``rows``."""
-    for name, a, b in zip(one._fields, one, other, strict=True):
-        if isinstance(a, tuple):
-            check_equal(a, b, rows)
-        else:
-            assert a[rows].equal(b[rows]), name
 
 
 def one_uav(**changed) -> ScenarioConfig:

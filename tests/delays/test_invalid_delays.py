@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 
 import pytest
-from context_law import Crowd
-from transform_cases import ACTION, delayed, trace
+from delay_twin import ACTION, Crowd, delayed, trace
 
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig

@@ -4,10 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 import torch
-from delay_twin import Counting, last_actions, looking_back
-from helpers import play
-from tensordict import TensorDictBase
-from transform_cases import (
+from delay_twin import (
     ACTION,
     LAWS,
     N_AGENTS,
@@ -16,12 +13,17 @@ from transform_cases import (
     ROWS,
     STEPS,
     WORLDS,
+    Counting,
     after,
     before,
     choices,
     column,
     delayed,
+    last_actions,
+    looking_back,
 )
+from helpers import play
+from tensordict import TensorDictBase
 
 from damian.transforms import (
     ActionHistory,

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 import torch
-from delay_twin import Counting
-from environments import vmas
+from contract import vmas
+from delay_twin import ACTION, OBSERVATION, REWARD, STEPS, WORLDS, Counting
 from helpers import same
 from tensordict import TensorDictBase
 from torchrl.envs import (
@@ -19,7 +19,6 @@ from torchrl.envs import (
     Transform,
     TransformedEnv,
 )
-from transform_cases import ACTION, OBSERVATION, REWARD, STEPS, WORLDS
 
 from damian.delays.laws import Uniform
 from damian.transforms import (
