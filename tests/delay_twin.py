@@ -17,9 +17,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from damian.common import counter_rng
 from damian.delays.laws import Burst, Geometric, Law, Trace, Uniform
 from damian.delays.samplers import ContextSampler, MessageContext, Sampler
-from damian.transforms import (
-    StatefulTransform,
-)
+from damian.transforms import StatefulTransform
 
 LONGEST = 6
 LOST = 0.875
@@ -113,17 +111,6 @@ class Purse:
         arrived = [entry for entry in self.in_transit if done or entry[0] == now]
         self.in_transit = [entry for entry in self.in_transit if entry not in arrived]
         return sum(reward for _, reward in arrived)
-
-
-def looking_back(rewards: Sequence[float], steps: int, gamma: float) -> float:
-    """Cumulative reward (paper, eq. 4) at the latest of an episode's rewards so far."""
-    last = len(rewards) - 1
-    return sum(gamma ** (last - t) * rewards[t] for t in range(max(last - steps + 1, 0), last + 1))
-
-
-def last_actions(actions: Sequence[Any], steps: int, default: Any) -> list[Any]:
-    """The latest actions of an episode so far, oldest first."""
-    return [*[default] * steps, *actions][-steps:]
 
 
 class Counting(EnvBase):

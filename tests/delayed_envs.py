@@ -9,9 +9,7 @@ from delay_twin import Crowd
 from helpers import random_actions
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import (
-    EnvBase,
-)
+from torchrl.envs import EnvBase
 
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig

@@ -206,11 +206,6 @@ def saved_and_loaded(state: Any) -> Any:
     return torch.load(file, weights_only=True)
 
 
-def heading(degrees: float) -> float:
-    """Heading in [0, 1] of a continuous action, for a bearing clockwise from north [deg]."""
-    return (degrees % 360) / 360
-
-
 def clock(period: str) -> ClockConfig:
     """A clock with a simulation step of ``period``."""
     return ClockConfig(simulation=period)
@@ -308,28 +303,11 @@ def one_uav(**changed) -> ScenarioConfig:
     return ScenarioConfig(**(sections | changed))
 
 
-HERE = [[0.0, 0.0]]
-EAST = [[1.0, heading(90)]]
-"""Continuous actions of one UAV: hold, and 100 m east."""
-
-
-def go(env: UavEnv, *actions):
-    """Step through the actions, the same in every world; return the output of the last step."""
-    for action in actions:
-        after = act(env, torch.tensor(action).expand(*env.batch_size, env.n_agents, 2))
-    return after
-
-
 def fresh(scenario: ScenarioConfig, num_worlds: int = 1, **options) -> UavEnv:
     """A new environment after its first reset."""
     env = UavEnv(scenario, num_worlds=num_worlds, **options)
     env.reset()
     return env
-
-
-def flight(env: UavEnv) -> float:
-    """Duration of the flight of the only UAV that has just begun [s]."""
-    return (2 * env.state.vertical + env.state.cruise).item()
 
 
 def learning(model: ModelConfig, settle: int = 0, **changed: Any) -> LearningSetup:

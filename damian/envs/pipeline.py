@@ -120,7 +120,18 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
     remembers = server.grid is not None or scenario.delay.messages > 0
     transforms: list[Transform] = []
     if delayed:
-        transforms.append(uplink_transform(scenario, output_messages, reads_delay=remembers))
+        uplink = ObservationDelay(
+            scenario.delays.obs,
+            keys.MESSAGE,
+            keys.RECEIVED,
+            order=scenario.delay.order,
+            dt=scenario.clock.dt,
+            sent_key=keys.MESSAGE_SENT,
+            age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
+            delay_key=keys.DELAY if output_messages or remembers else None,
+            context_keys=CONTEXT_KEYS,
+        )
+        transforms.append(uplink)
     longest = scenario.delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
     dropped = []
@@ -133,21 +144,6 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         *transforms,
         ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras),
     ]
-
-
-def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:
-    """The delay of the messages to the server; ``reads_delay``: a later transform reads that delay."""
-    return ObservationDelay(
-        scenario.delays.obs,
-        keys.MESSAGE,
-        keys.RECEIVED,
-        order=scenario.delay.order,
-        dt=scenario.clock.dt,
-        sent_key=keys.MESSAGE_SENT,
-        age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
-        delay_key=keys.DELAY if output_messages or reads_delay else None,
-        context_keys=CONTEXT_KEYS,
-    )
 
 
 def remembering_transforms(

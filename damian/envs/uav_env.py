@@ -276,9 +276,12 @@ class UavEnv(EnvBase):
 
     def to_tensordict(self, outputs: Outputs) -> TensorDict:
         """Outputs as a TensorDict of batch size [B], with ``"agents"`` of batch size [B, N]."""
-        levels, make = _levels(outputs), TensorDict._new_unsafe  # shapes are right: checks would cost 4 %
-        shape = torch.Size((*self.batch_size, self.n_agents))
-        root, agents = dict(levels.pop((), {})), dict(levels.pop((keys.AGENTS,), {}))
+        shape, make = torch.Size((*self.batch_size, self.n_agents)), TensorDict._new_unsafe  # saves 4 %
+        levels: dict[tuple[str, ...], dict[str, Any]] = {(): {}, (keys.AGENTS,): {}}
+        for key, value in outputs.items():
+            *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
+            levels.setdefault(tuple(path), {})[name] = value
+        root, agents = levels.pop(()), levels.pop((keys.AGENTS,))
         for path, level in levels.items():
             agents[path[-1]] = make(level, shape, self.device)
         root[keys.AGENTS] = make(agents, shape, self.device)
@@ -324,15 +327,6 @@ class UavEnv(EnvBase):
             elif limits is not None:
                 specs[key] = Bounded(limits[0].expand(value.shape), limits[1].expand(value.shape), **like)
         return specs.to(self.device)
-
-
-def _levels(entries: dict[NestedKey, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
-    """Entries grouped by the path of the TensorDict that holds them, and by name within it."""
-    levels: dict[tuple[str, ...], dict[str, Any]] = {}
-    for key, value in entries.items():
-        *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
-        levels.setdefault(tuple(path), {})[name] = value
-    return levels
 
 
 def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:

@@ -5,16 +5,7 @@ import torch
 from contract import Servos
 from delay_twin import ACTION
 from tensordict import TensorDictBase
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    Composite,
-    MultiOneHot,
-    OneHot,
-    TensorSpec,
-    Unbounded,
-)
+from torchrl.data import Binary, Bounded, Categorical, Composite, MultiOneHot, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from damian.delays.laws import Uniform

@@ -5,14 +5,7 @@ import torch
 from contract import ACTION, LATE, OBSERVATION, Drift, uavs
 from delay_twin import Counting
 from tensordict import TensorDict
-from torchrl.envs import (
-    Compose,
-    ConditionalSkip,
-    GymEnv,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, ConditionalSkip, GymEnv, StepCounter, Transform, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.transforms import (
