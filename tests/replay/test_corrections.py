@@ -342,11 +342,6 @@ def test_late_rewards_alone_are_credited_in_any_environment(window):
     assert after["valid"].all()
 
 
-def test_a_reward_delay_that_does_not_tell_its_delays_is_refused():
-    with pytest.raises(InputError, match="RewardDelay: back-updating needs each delay"):
-        corrections_of(Compose(ActionDelay(2), RewardDelay(2)), ["reward"])
-
-
 @both_layouts
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(group, order):
@@ -407,59 +402,62 @@ def test_the_ends_stay_if_recompute_returns_none(group):
 
 # Mistakes.
 
-
-@pytest.mark.parametrize(
-    ("name", "other", "message"),
-    [
-        ("message", "none", r"message_key: \('next', 'none'\) is not in the steps"),
-        ("step_count", "none", r"step_count_key: none is not in the steps: StepCounter\(\) writes it"),
-    ],
-)
-def test_a_missing_or_misshapen_entry_is_one_line(name, other, message):
-    with pytest.raises(InputError, match=message):
-        stored(make_storage((), **{f"{name}_key": other}), rollout(make_env(()), 8))
+NAMES = {f"{name}_key": name for name in ("message", "received", "delay", "age")}
+LEAST = (8 + 2 * LONGEST) * WORLDS
+"""The least size of a storage of batches of 8 steps."""
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda entries: entries | {("next", "success"): entries["next", "reward"]},
-            "is not an entry after the steps",
-        ),
-        (lambda entries: {("next", "done"): entries["next", "done"]}, "are returned in part"),
-    ],
-)
-def test_a_mistake_in_recompute_is_one_line(change, message):
-    storage = make_storage((), lambda *arguments: change(recompute_of(())(*arguments)))
-    with pytest.raises(InputError, match=f"recompute: .*{message}"):
-        stored(storage, rollout(make_env(()), 8))
+def recomputing(change: Callable[[Any], Any]) -> BackupdateStorage:
+    """A storage whose ``recompute`` returns something else."""
+    return make_storage((), lambda *arguments: change(recompute_of(())(*arguments)))
 
 
-def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused():
-    steps, storage = rollout(make_env(()), 8), make_storage(())
-    with pytest.raises(InputError, match="step_count grows from world to world"):
-        stored(make_storage(()), steps.transpose(0, 1))
-    stored(storage, steps)
-    for batch in (steps.transpose(0, 1), steps[:2]):
-        with pytest.raises(InputError, match=r"steps: a batch of shape \[.*\] is not one of 3 worlds: give"):
-            stored(storage, batch)
-    with pytest.raises(InputError, match=r"steps: a batch of shape \[24\] is not \[T, B\]"):
-        storage.set(range(24), steps.reshape(-1))
-    with pytest.raises(InputError, match="longest: -1 steps is not at least 0 steps"):
-        BackupdateStorage(10, recompute_of(()), -1)
+def extend_twice(first: TensorDictBase, second: TensorDictBase) -> None:
+    storage = make_storage(())
+    stored(storage, first)
+    stored(storage, second)
 
 
-def test_a_storage_holds_a_batch_and_twice_the_longest_delay_or_is_refused():
-    steps, least = rollout(make_env(()), 8), 8 + 2 * LONGEST
-    names = {f"{name}_key": name for name in ("message", "received", "delay", "age")}
-    stored(BackupdateStorage(least * WORLDS, recompute_of(()), LONGEST, **names), steps)
-    with pytest.raises(InputError, match=f"{least} steps of {WORLDS} worlds need {least * WORLDS}"):
-        stored(BackupdateStorage((least - 1) * WORLDS, recompute_of(()), LONGEST, **names), steps)
-
-
-def test_steps_that_a_transform_has_joined_are_refused():
+def extend_joined(steps: TensorDictBase) -> None:
     n_step = MultiStepTransform(n_steps=3, gamma=0.9)
-    buffer = ReplayBuffer(storage=make_storage(()), transform=n_step, batch_size=4)
-    with pytest.raises(InputError, match="MultiStepTransform joins steps before they are corrected"):
-        buffer.extend(rollout(make_env(()), 20))
+    ReplayBuffer(storage=make_storage(()), transform=n_step, batch_size=4).extend(steps)
+
+
+REFUSED: dict[str, Callable[[TensorDictBase], Any]] = {
+    r"message_key: \('next', 'none'\) is not in the steps": lambda steps: stored(
+        make_storage((), message_key="none"), steps
+    ),
+    r"step_count_key: none is not in the steps: StepCounter\(\) writes it": lambda steps: stored(
+        make_storage((), step_count_key="none"), steps
+    ),
+    "recompute: .*is not an entry after the steps": lambda steps: stored(
+        recomputing(lambda entries: entries | {("next", "success"): entries["next", "reward"]}), steps
+    ),
+    "recompute: .*are returned in part": lambda steps: stored(
+        recomputing(lambda entries: {("next", "done"): entries["next", "done"]}), steps
+    ),
+    "step_count grows from world to world": lambda steps: stored(make_storage(()), steps.transpose(0, 1)),
+    r"steps: a batch of shape \[.*\] is not one of 3 worlds": lambda steps: extend_twice(steps, steps[:2]),
+    r"steps: a batch of shape \[24\] is not \[T, B\]": lambda steps: make_storage(()).set(
+        range(24), steps.reshape(-1)
+    ),
+    "MultiStepTransform joins steps before they are corrected": extend_joined,
+    "longest: -1 steps is not at least 0 steps": lambda _: BackupdateStorage(10, recompute_of(()), -1),
+    "longest: 2 steps, but a message takes 5 steps": lambda steps: stored(
+        BackupdateStorage(LEAST, recompute_of(()), 2, **NAMES), steps
+    ),
+    f"of {WORLDS} worlds need {LEAST}": lambda steps: stored(
+        BackupdateStorage(LEAST - 1, recompute_of(()), LONGEST, **NAMES), steps
+    ),
+    "RewardDelay: back-updating needs each delay": lambda _: corrections_of(
+        Compose(ActionDelay(2), RewardDelay(2)), ["reward"]
+    ),
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_a_mistake_is_one_line(line):
+    steps = rollout(make_env(()), 8)
+    stored(BackupdateStorage(LEAST, recompute_of(()), LONGEST, **NAMES), steps)  # which is large enough
+    with pytest.raises(InputError, match=line):
+        REFUSED[line](steps)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import torch
@@ -21,17 +21,12 @@ from damian.delays.laws import Burst, Law, Trace, Uniform, law_of, sampler_of
 from damian.delays.samplers import ContextSampler, MessageContext
 from damian.transforms import Channel
 
+N, WORLDS, STEPS = 3, [3, 5, 8], 25
+CLOCKS = 2 * STEPS + 2
+ALL = set(permutations(range(N), 2))
+
 Link = tuple[int, int]
 """Receiver and sender."""
-
-
-class Packet(NamedTuple):
-    """What is in transit to somebody."""
-
-    arrives: int
-    sent: int
-    to: Any
-    content: Any
 
 
 class World:
@@ -59,28 +54,21 @@ class World:
         self.turn, self.known, self.own_at_reset = turn, known, own_at_reset
         self.clock, self.began = 0, 0
 
-    def senders(self, wanted: Collection[Link]) -> list[int]:
-        """The agents that may send."""
-        waiting = {sender for _, sender in wanted}
-        if self.limit is None:
-            return sorted(waiting)
-        return sorted(waiting, key=lambda sender: self.turn(self.clock, sender))[: self.limit]
-
     def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
         """Send on the wanted links, and receive."""
         self.clock += 1
         if begins:
             self.began, self.in_transit, self.holds = self.clock, [], {}
-        senders = self.senders(wanted)
+        senders = [*{sender for _, sender in wanted}]
+        if self.limit is not None:
+            senders = sorted(senders, key=lambda sender: self.turn(self.clock, sender))[: self.limit]
         for link in wanted:
             delay = self.delay(self.clock, link, len(senders)) if link[1] in senders else None
             if delay is not None:
-                self.in_transit.append(Packet(self.clock + delay, self.clock, link, contents[link[1]]))
-        for packet in self.in_transit:
-            if packet.arrives == self.clock and (
-                packet.to not in self.holds or self.holds[packet.to][0] < packet.sent
-            ):
-                self.holds[packet.to] = (packet.sent, packet.content)
+                self.in_transit.append((self.clock + delay, link, self.clock, contents[link[1]]))
+        for arrives, link, sent, content in self.in_transit:
+            if arrives == self.clock and (link not in self.holds or self.holds[link][0] < sent):
+                self.holds[link] = (sent, content)
         if begins and self.known:
             self.holds = {(i, j): (self.clock, contents[j]) for i in self.agents for j in self.agents}
         self.own = contents
@@ -96,19 +84,6 @@ class World:
         return content, self.clock - sent, True
 
 
-def table(law: Any, streams: Tensor, n_steps: int, loss: float = 0.0) -> Callable[[int, int], int | None]:
-    """The delay that a law draws at a clock for a row; None if the message is lost."""
-    sampler = sampler_of(law_of(law), loss=loss)
-    delays = drawn(sampler, streams, n_steps).tolist()
-    return lambda clock, row: None if (d := delays[clock - 1][row]) == sampler.lost else d
-
-
-def turn(stream: Tensor, clock: int, sender: int) -> tuple[int, int]:
-    """Whoever has the smallest turn may send first."""
-    counters = (torch.tensor(counter) for counter in (clock, 4, sender))
-    return int(counter_rng.bits(stream, *counters)), sender
-
-
 Wants = Callable[[TensorDictBase, TensorDictBase | None, int], Collection[Link]]
 """The links on which a world wants to send, from the outputs, from the inputs (None at a reset)."""
 
@@ -117,25 +92,21 @@ def check_against_twin(
     env: TransformedEnv,
     make: Callable[[int, Tensor], World],
     wants: Wants,
-    n_steps: int = 25,
     forced: Callable[[int], list[int]] = lambda _: [],
     sent: Any = ("agents", "observation"),
-) -> list[TensorDictBase]:
+) -> None:
     """Compare every output of a rollout with partial resets with that of the twins.
 
     Args:
         env: environment with one ``Channel``.
         make: the twin of a world, given its number and the channel's random streams.
         wants: which links carry a message.
-        n_steps: number of steps.
         forced: worlds to reset after a step, beside those that are done.
         sent: key of what is sent, among the outputs, or among the inputs of a step.
     """
     torch.manual_seed(0)
     td, worlds = env.reset(), range(env.batch_size[0])
-    channel = env.transform[-1] if len(env.transform) else env.transform
-    memory = channel.memory
-    twins = [make(b, memory["streams"]) for b in worlds]
+    twins = [make(b, env.transform[-1].memory["streams"]) for b in worlds]
 
     def follow(outputs: TensorDictBase, inputs: TensorDictBase | None, mask: list[bool]) -> None:
         source = outputs if sent in outputs.keys(True) else inputs
@@ -147,8 +118,7 @@ def check_against_twin(
             assert_same(twins[b], outputs[b])
 
     follow(td, None, [True] * len(worlds))
-    seen = [td]
-    for t in range(n_steps):
+    for t in range(STEPS):
         td = env.rand_action(td)
         stepped = env.step(td)
         follow(stepped["next"], stepped, [True] * len(worlds))
@@ -158,25 +128,22 @@ def check_against_twin(
         if any(mask):
             td = env.reset(td.set("_reset", torch.tensor(mask).unsqueeze(-1)))
             follow(td, None, mask)
-        seen += [stepped["next"], td]
-    return seen
 
 
 def assert_same(twin: World, outputs: TensorDictBase) -> None:
     """The messages that each agent has received from each other one are those of the twin."""
-    got = [outputs["agents", name].tolist() for name in ("received", *FLAGS)]
+    got = [outputs["agents", name].tolist() for name in ("received", "received_age", "received_mask")]
     zeros = [0.0] * len(got[0][0][0])
     for i in twin.agents:
         for j in twin.agents:
             assert tuple(part[i][j] for part in got) == tuple(twin.seen(i, j, zeros)), (i, j)
 
 
-FLAGS = ("received_age", "received_mask")
-
-
-N, WORLDS, STEPS = 3, [3, 5, 8], 25
-CLOCKS = 2 * STEPS + 2
-ALL = set(permutations(range(N), 2))
+def table(law: Any, streams: Tensor, n_steps: int, loss: float = 0.0) -> Callable[[int, int], int | None]:
+    """The delay that a law draws at a clock for a row; None if the message is lost."""
+    sampler = sampler_of(law_of(law), loss=loss)
+    delays = drawn(sampler, streams, n_steps).tolist()
+    return lambda clock, row: None if (d := delays[clock - 1][row]) == sampler.lost else d
 
 
 def counting(channel: Channel, **options: Any) -> TransformedEnv:
@@ -195,7 +162,8 @@ def twin_of(law: Any, loss: float = 0.0, **rules: Any) -> Callable[[int, Tensor]
         delays = table(law, streams, CLOCKS, loss)
 
         def order(clock: int, sender: int) -> tuple:
-            return turn(streams[b * N * N + (N - 1) * N + sender], clock, sender)
+            stream = streams[b * N * N + (N - 1) * N + sender]
+            return int(counter_rng.bits(stream, *map(torch.tensor, (clock, 4, sender)))), sender
 
         def delay(clock: int, link: tuple, _: int) -> int | None:
             return delays(clock, b * N * N + link[0] * N + link[1])
