@@ -25,7 +25,7 @@ from damian.delays.scenario import CONTEXT_KEYS
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv, Skip
 from damian.envs.nodes import Belief, OnboardNode, ServerNode
-from damian.envs.uav_env import ALL_EXTRAS, UavEnv, make_server, make_simulation
+from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
@@ -63,22 +63,11 @@ def make_env(
     remote, skips = has_server_node(scenario), scenario.clock.skip
     needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
     needed |= {*["position"] * scenario.delays.reads_positions, *["duration"] * skips}
-    simulation = make_simulation(scenario, seed)
-    server = make_server(scenario, simulation)
-    env = UavEnv(
-        scenario,
-        num_worlds,
-        seed,
-        device,
-        {*extras, *needed},
-        simulation=simulation,
-        server=server,
-        messages_only=remote,
-    )
+    env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
     names = scenario.reward.terms if "reward_terms" in extras else []
     rewards = [keys.REWARD, *((*keys.REWARD_TERMS, name) for name in names)]
     skip = Skip(scenario.clock.skip_discount, rewards) if skips else None
-    pipeline = DelayedEnv(env, make_transforms(scenario, server, extras), skip)
+    pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras), skip)
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
     pipeline.set_seed(seed)
