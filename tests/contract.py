@@ -1,16 +1,15 @@
-"""The transforms and environments on which the contract is checked, and an environment of moving points."""
+"""Environments of every kind, and the transforms on them, on which the contract is checked."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
 import torch
-from environments import KINDS, Kind
 from helpers import square, walking
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
 
 from damian.delays.laws import Uniform
 from damian.envs.nodes import Belief, ServerNode
@@ -28,6 +27,99 @@ from damian.transforms import (
     StatefulTransform,
     set_seed,
 )
+
+
+class Kind(NamedTuple):
+    """An environment, and the keys of its entries."""
+
+    make: Callable[[], EnvBase]
+    observation: Any = ("agents", "observation")
+    action: Any = ("agents", "action")
+    reward: Any = ("agents", "reward")
+
+
+class Teams(EnvBase):
+    """Two worlds of two agents with flags only in the group, and a state and a team reward at the root.
+
+    The state counts the steps of an episode, which lasts 3 or 5 steps; each reward is 1. PettingZoo
+    environments with a root state look so.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(batch_size=torch.Size([2]))
+        agents = torch.Size([2, 2])
+        group = {"observation": Unbounded((*agents, 3))}
+        self.observation_spec = Composite(
+            agents=Composite(**group, shape=agents), state=Unbounded((2, 1)), shape=(2,)
+        )
+        self.action_spec = Composite(
+            agents=Composite(action=Bounded(-1.0, 1.0, (*agents, 2)), shape=agents), shape=(2,)
+        )
+        flag = Categorical(2, shape=(*agents, 1), dtype=torch.bool)
+        self.done_spec = Composite(
+            agents=Composite(done=flag, terminated=flag.clone(), shape=agents), shape=(2,)
+        )
+        self.reward_spec = Composite(
+            agents=Composite(reward=Unbounded((*agents, 1)), shape=agents),
+            team_reward=Unbounded((2, 1)),
+            shape=(2,),
+        )
+        self.time = torch.zeros(2)
+
+    def _outputs(self, done: torch.Tensor) -> TensorDict:
+        agents = {"observation": self.time.view(2, 1, 1).expand(2, 2, 3).clone()}
+        flag = done.view(2, 1, 1).expand(2, 2, 1)
+        agents |= {"done": flag.clone(), "terminated": flag.clone()}
+        return TensorDict({"agents": TensorDict(agents, [2, 2]), "state": self.time.view(2, 1).clone()}, [2])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get(("agents", "_reset"), None)
+        mask = torch.ones(2, dtype=torch.bool) if mask is None else mask.flatten(1).any(-1)
+        self.time = self.time.masked_fill(mask, 0)
+        return self._outputs(torch.zeros(2, dtype=torch.bool))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.time = self.time + 1
+        outputs = self._outputs(self.time >= torch.tensor([3, 5]))
+        outputs["agents", "reward"] = torch.ones(2, 2, 1)
+        return outputs.set("team_reward", torch.ones(2, 1))
+
+    def _set_seed(self, seed: int | None) -> None:
+        """The environment has no randomness."""
+
+
+def vmas(num_envs: int = 2, n_agents: int = 2, max_steps: int = 4, **options: Any) -> EnvBase:
+    """A multi-agent environment of VMAS: the first two numbers of an observation are the agent's position."""
+    pytest.importorskip("vmas")
+    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
+
+    sizes = {"num_envs": num_envs, "n_agents": n_agents, "max_steps": max_steps}
+    return VmasEnv("navigation", seed=0, **sizes, **options)
+
+
+def petting_zoo(n_agents: int = 2) -> EnvBase:
+    """A PettingZoo environment without batch dimensions, with a state at the root and flags in the group."""
+    spread = pytest.importorskip("mpe2.simple_spread_v3")
+    from torchrl.envs.libs.pettingzoo import PettingZooWrapper  # noqa: PLC0415
+
+    options = {"N": n_agents, "max_cycles": 4, "continuous_actions": True}
+    return PettingZooWrapper(spread.parallel_env(**options), return_state=True, seed=0)
+
+
+ROOT = ("observation", "action", "reward")
+KINDS = {
+    "CartPole": Kind(
+        lambda: GymEnv("CartPole-v1", categorical_action_encoding=True, max_episode_steps=4), *ROOT
+    ),
+    "Pendulum": Kind(lambda: GymEnv("Pendulum-v1", max_episode_steps=4), *ROOT),
+    "VMAS": Kind(lambda: vmas(collisions=False)),
+    "PettingZoo": Kind(petting_zoo, *(("agent", name) for name in ROOT)),
+    "PettingZoo, state": Kind(petting_zoo, "state", ("agent", "action"), ("agent", "reward")),
+    "flags in the group": Kind(Teams),
+    "flags in the group, root entries": Kind(Teams, "state", ("agents", "action"), "team_reward"),
+    "UAVs": Kind(lambda: UavEnv(square(), num_worlds=2, extras=["message"])),
+}
+
 
 LATE = Uniform(1, 3)
 ACTION, OBSERVATION, REWARD = ("agents", "action"), ("agents", "observation"), ("agents", "reward")
@@ -109,14 +201,12 @@ def _belief() -> Transform:
     return Belief(server, longest=0, delayed=False, own=True)
 
 
-def _server_node() -> Transform:
-    return ServerNode(unserved().server, ("agents", "message"))
-
-
 CASES = {
     "Belief": Case(uavs, _belief),
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
-    "ActionDelay, two entries": Case(Servos, lambda: ActionDelay(LATE, ["place", "gear"], loss=0.2)),
+    "ActionDelay, two entries": Case(
+        Servos, lambda: ActionDelay(LATE, ["place", "gear"], ["wish", "gear"], loss=0.2)
+    ),
     "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
     "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
     "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),
@@ -151,7 +241,7 @@ CASES = {
         ),
     ),
     "Channel, messages": Case(uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)),
-    "ServerNode": Case(unserved, _server_node),
+    "ServerNode": Case(unserved, lambda: ServerNode(unserved().server, ("agents", "message"))),
 }
 """Every transform on every kind of environment that it works on; the name before the comma is its class."""
 
@@ -202,26 +292,10 @@ TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
-def channel(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
-    """A channel between the agents of a group; it works only where there is one."""
-    return Channel(law, kind.observation, loss=0.1, **options)
-
-
 PAIRS = {f"{name} on {kind}": (KINDS[kind], make) for kind in KINDS for name, make in TRANSFORMS.items()} | {
-    f"Channel on {name}": (kind, channel) for name, kind in GROUPS.items()
+    f"Channel on {name}": (kind, lambda kind, law: Channel(law, kind.observation, loss=0.1))
+    for name, kind in GROUPS.items()
 }
 """Every kind of environment with every transform, and with a channel where that works."""
-DRAWING = {name: pair for name, pair in PAIRS.items() if name.partition("Delay")[1] or pair[1] is channel}
+DRAWING = {name: pair for name, pair in PAIRS.items() if "Delay" in name or "Channel" in name}
 drawing = pytest.mark.parametrize(("kind", "make"), DRAWING.values(), ids=DRAWING)
-
-
-def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> list[TensorDictBase]:
-    """Outputs of every step and every reset, with actions drawn from torch's generator."""
-    if seed is not None:
-        torch.manual_seed(seed)
-        set_seed(env, seed)
-    td, outputs = env.reset(), []
-    for _ in range(n_steps):
-        after, td = env.step_and_maybe_reset(env.rand_action(td))
-        outputs += [after["next"].clone(), td.clone()]
-    return outputs

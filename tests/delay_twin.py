@@ -1,8 +1,9 @@
-"""Reference implementations of delays in plain Python, for one agent at a time.
+"""Delays in plain Python, for one agent at a time, and the laws and environments on which they are tested.
 
 ``Counting`` is a small environment in which every observation tells its world, agent, step and episode.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -11,10 +12,45 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from damian.common import counter_rng
-from damian.delays.samplers import Sampler
+from damian.delays.laws import Burst, Geometric, Law, Trace, Uniform
+from damian.delays.samplers import ContextSampler, MessageContext, Sampler
+from damian.transforms import StatefulTransform
+
+LONGEST = 6
+LOST = 0.875
+"""Random number from which on a message is lost."""
+
+
+@dataclass(frozen=True)
+class Crowd(Law):
+    """Delays by sender, number of senders, time, a random number, and a column of an entry."""
+
+    entry: str = "position"
+    """Name of the entry."""
+    column: int = 0
+    """Column of the entry that the law looks at."""
+    loses: bool = True
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        return ContextSampler(self.delays, LONGEST, loss, loses=self.loses, reads=[self.entry])
+
+    def delays(self, context: MessageContext) -> Tensor:
+        """Every part is a whole number, apart from a quarter that is to be rounded up."""
+        place = (context.entries[self.entry][:, self.column] / 32).floor().abs() % 3
+        parity = (context.time / context.dt) % 2
+        steps = place + context.n_sending + context.sender + parity + (4 * context.uniform).floor() - 0.25
+        return torch.where(context.uniform >= LOST, -1.0, steps)
+
+
+def twin_delay(value: float, n_sending: int, sender: int, elapsed: int, uniform: float) -> int | None:
+    """The delay of ``Crowd`` for one message; None if it is lost."""
+    if uniform >= LOST:
+        return None
+    place = abs(math.floor(value / 32)) % 3
+    return min(math.ceil(place + n_sending + sender + elapsed % 2 + math.floor(4 * uniform) - 0.25), LONGEST)
 
 
 def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
@@ -35,11 +71,7 @@ class Message(NamedTuple):
 
 
 class Receiver:
-    """Receives the messages of one sender, and holds one of them.
-
-    Args:
-        order: hold the message that was sent last (``generation``) or that arrived last (``arrival``).
-    """
+    """Receives one sender's messages; holds that sent last (``generation``) or arrived last (``arrival``)."""
 
     def __init__(self, order: str) -> None:
         self.order = order
@@ -81,17 +113,6 @@ class Purse:
         return sum(reward for _, reward in arrived)
 
 
-def looking_back(rewards: Sequence[float], steps: int, gamma: float) -> float:
-    """Cumulative reward (paper, eq. 4) at the latest of an episode's rewards so far."""
-    last = len(rewards) - 1
-    return sum(gamma ** (last - t) * rewards[t] for t in range(max(last - steps + 1, 0), last + 1))
-
-
-def last_actions(actions: Sequence[Any], steps: int, default: Any) -> list[Any]:
-    """The latest actions of an episode so far, oldest first."""
-    return [*[default] * steps, *actions][-steps:]
-
-
 class Counting(EnvBase):
     """An environment in which every observation tells where it comes from; episodes end at random.
 
@@ -104,7 +125,6 @@ class Counting(EnvBase):
         n_agents: number of agents in each world, N.
         continuous: actions are two numbers in [-1, 3], which are rounded to an integer, instead of integers.
         ends: probability that an episode ends in a step.
-        tampered: (world, agent, step) whose observation and reward are falsified.
     """
 
     N_ACTIONS = 7
@@ -115,11 +135,9 @@ class Counting(EnvBase):
         n_agents: int = 2,
         continuous: bool = False,
         ends: float = 0.15,
-        tampered: tuple[int, int, int] | None = None,
     ) -> None:
         super().__init__(batch_size=[len(worlds)])
-        self.names, self.n_agents, self.ends, self.tampered = torch.tensor(worlds), n_agents, ends, tampered
-        self.total = 0
+        self.names, self.n_agents, self.ends, self.total = torch.tensor(worlds), n_agents, ends, 0
         worlds_shape, agents = self.batch_size, torch.Size((len(worlds), n_agents))
 
         def group(**specs: Any) -> Composite:
@@ -156,12 +174,7 @@ class Counting(EnvBase):
         observation = torch.stack(
             [names, agents, total, episode, self.x, self.executed, self.action_valid], -1
         ).double()
-        falsified = torch.zeros(shape, dtype=torch.bool)
-        if self.tampered is not None and self.tampered[2] == self.total:
-            falsified[self.tampered[:2]] = True
-        observation = observation - falsified.unsqueeze(-1) * 1000.0
         values = {"observation": observation, "message_sent": self._flag(0), "ready": self._flag(1)}
-        self.falsified = falsified
         return TensorDict({"agents": TensorDict(values, shape)}, self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
@@ -180,10 +193,62 @@ class Counting(EnvBase):
         self.executed = action
         self.action_valid = tensordict.get(("agents", "action_valid"), self.action_valid)
         outputs = self._outputs()
-        reward = (self.x + 100 * self.names.unsqueeze(-1) - 1000 * self.falsified).float()
+        reward = (self.x + 100 * self.names.unsqueeze(-1)).float()
         outputs["agents"].set("reward", reward.unsqueeze(-1))
         done = counter_rng.uniform(self.names, torch.tensor(self.total)) < self.ends
         return outputs.set("done", done.unsqueeze(-1)).set("terminated", done.unsqueeze(-1))
 
     def _set_seed(self, seed: int | None) -> None:
         """The random numbers depend only on the worlds' names and the step."""
+
+
+ACTION, REWARD, OBSERVATION = ("agents", "action"), ("agents", "reward"), ("agents", "observation")
+WORLDS, N_AGENTS, STEPS = [3, 5, 8, 13], 2, 40
+ROWS = [(world, agent) for world in range(len(WORLDS)) for agent in range(N_AGENTS)]
+
+PAPER = Uniform("3s", "7s", 0.15)
+LAWS = {
+    "none": lambda _: 0,
+    "constant": lambda _: 3,
+    "uniform": lambda _: Uniform(1, 4),
+    "paper": lambda _: PAPER,
+    "geometric": lambda _: Geometric(2, 6),
+    "burst": lambda _: Burst(0.2, 0.3, good=Uniform(0, 1), bad=5, bad_loss=0.0),
+    "trace": lambda folder: trace(folder, 4, 0, 7, 1, 0, 2, 9, 0, 0, 3),
+}
+"""Delay laws that lose no message."""
+
+
+def trace(folder: Any, *delays: Any) -> Trace:
+    """A trace of these delays, in a file of the folder."""
+    file = folder / f"{len(delays)}.csv"
+    file.write_text("\n".join(map(str, ["delay", *delays])))
+    return Trace(str(file))
+
+
+def delayed(*transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **options: Any) -> TransformedEnv:
+    """A ``Counting`` environment with transforms whose draws depend on the names of the worlds."""
+    for transform in transforms:
+        transform.seed_worlds(torch.tensor(worlds))
+    return TransformedEnv(Counting(worlds, N_AGENTS, **options), Compose(*transforms))
+
+
+def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor]:
+    """Actions for each step, [B, N]; those of a world do not depend on the other worlds."""
+    names, agents = torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)
+    return [counter_rng.bits(names, agents, torch.tensor([t])) % Counting.N_ACTIONS for t in range(n_steps)]
+
+
+def column(outputs: Sequence[TensorDictBase], *key: str) -> list:
+    """An entry of every output, as nested lists."""
+    return torch.stack([td[key] for td in outputs]).tolist()
+
+
+def before(outputs: Sequence[TensorDictBase], *key: str) -> list:
+    """An entry before each step, as nested lists."""
+    return column(outputs[:-1:2], *key)
+
+
+def after(outputs: Sequence[TensorDictBase], *key: str) -> list:
+    """An entry after each step, as nested lists."""
+    return column(outputs[1::2], *key)

@@ -5,13 +5,11 @@ from typing import Any
 
 import pytest
 import torch
-from context_law import Crowd
+from delay_twin import Crowd
 from helpers import random_actions
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import (
-    EnvBase,
-)
+from torchrl.envs import EnvBase
 
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig

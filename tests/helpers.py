@@ -1,5 +1,6 @@
 """Shared test helpers: the paper's use cases without Hydra, small scenarios, and functions that step them."""
 
+import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -27,7 +28,6 @@ from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
 from damian.world.regions.sources import RegionConfig
 from damian.world.signal_source import SourceConfig
-from damian.world.state import State
 
 DATA = Path(__file__).parent / "data"
 
@@ -198,9 +198,12 @@ def all_same(some: Sequence[TensorDictBase], others: Sequence[TensorDictBase], a
     return len(some) == len(others) and all(same(*pair, atol) for pair in zip(some, others, strict=True))
 
 
-def heading(degrees: float) -> float:
-    """Heading in [0, 1] of a continuous action, for a bearing clockwise from north [deg]."""
-    return (degrees % 360) / 360
+def saved_and_loaded(state: Any) -> Any:
+    """A state after it was saved to a file and loaded from it."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
 
 
 def clock(period: str) -> ClockConfig:
@@ -282,15 +285,6 @@ both_motions = pytest.mark.parametrize("motion", ["instant", "polynomial"])
 both_kinds = pytest.mark.parametrize("kind", ["discrete", "continuous"])
 
 
-def check_equal(one: State, other: State, rows=slice(None)):
-    """Assert that two states are equal bit for bit in the worlds ``rows``."""
-    for name, a, b in zip(one._fields, one, other, strict=True):
-        if isinstance(a, tuple):
-            check_equal(a, b, rows)
-        else:
-            assert a[rows].equal(b[rows]), name
-
-
 def one_uav(**changed) -> ScenarioConfig:
     """One UAV that starts near (60, 100) in a rectangle, too far to hear the source at (390, 100)."""
     region = RegionConfig(
@@ -309,28 +303,11 @@ def one_uav(**changed) -> ScenarioConfig:
     return ScenarioConfig(**(sections | changed))
 
 
-HERE = [[0.0, 0.0]]
-EAST = [[1.0, heading(90)]]
-"""Continuous actions of one UAV: hold, and 100 m east."""
-
-
-def go(env: UavEnv, *actions):
-    """Step through the actions, the same in every world; return the output of the last step."""
-    for action in actions:
-        after = act(env, torch.tensor(action).expand(*env.batch_size, env.n_agents, 2))
-    return after
-
-
 def fresh(scenario: ScenarioConfig, num_worlds: int = 1, **options) -> UavEnv:
     """A new environment after its first reset."""
     env = UavEnv(scenario, num_worlds=num_worlds, **options)
     env.reset()
     return env
-
-
-def flight(env: UavEnv) -> float:
-    """Duration of the flight of the only UAV that has just begun [s]."""
-    return (2 * env.state.vertical + env.state.cruise).item()
 
 
 def learning(model: ModelConfig, settle: int = 0, **changed: Any) -> LearningSetup:

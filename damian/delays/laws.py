@@ -21,7 +21,6 @@ from damian.common.text_files import data_file, named, parse_table, read_text
 from damian.delays.config import LONGEST, is_matrix
 from damian.delays.samplers import (
     ContextSampler,
-    HeldSampler,
     LagSampler,
     LinkSampler,
     MessageContext,
@@ -84,7 +83,8 @@ _NO_DELAY = (
 def in_steps(key: str, delay: Delay, dt: float, problem: str = _NO_STEPS) -> int:
     """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up."""
     if isinstance(delay, str):
-        steps = math.ceil(_seconds(key, delay, problem) / dt - 1e-9)
+        checks.require(delay.endswith(tuple(checks.UNITS_OF_TIME)), key, delay, problem)
+        steps = math.ceil(_exact_steps(key, delay, dt) - 1e-9)
     else:
         is_steps = isinstance(delay, Real) and not isinstance(delay, bool) and delay >= 0 and delay % 1 == 0
         checks.require(is_steps, key, delay, problem)
@@ -93,10 +93,9 @@ def in_steps(key: str, delay: Delay, dt: float, problem: str = _NO_STEPS) -> int
     return steps
 
 
-def _seconds(key: str, delay: str, problem: str = _NO_STEPS) -> float:
-    """Convert a time with its unit to seconds; it may be zero (``0s``)."""
-    checks.require(delay.endswith(tuple(checks.UNITS_OF_TIME)), key, delay, problem)
-    return checks.seconds(key, delay, zero=True)
+def _exact_steps(key: str, delay: Any, dt: float) -> float:
+    """Convert a delay to steps of ``dt`` seconds, whole or not; a time may be zero (``0s``)."""
+    return checks.seconds(key, delay, zero=True) / dt if isinstance(delay, str) else delay
 
 
 LAWS = Registry[type[Law]](
@@ -143,14 +142,14 @@ class Uniform(Law):
     """Probability that a message is late at all."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        low, high = in_steps(f"{key}.low", self.low, dt), in_steps(f"{key}.high", self.high, dt)
+        for name in ("low", "high"):
+            in_steps(f"{key}.{name}", getattr(self, name), dt)  # refuses what is not a delay
+        low, high = _exact_steps(f"{key}.low", self.low, dt), _exact_steps(f"{key}.high", self.high, dt)
         in_time = isinstance(self.low, str), isinstance(self.high, str)
-        if all(in_time):
-            low, high = _seconds(f"{key}.low", str(self.low)), _seconds(f"{key}.high", str(self.high))
         should = f"and high={self.high} are not two steps or two times in order"
         checks.require(low <= high and in_time[0] == in_time[1], f"{key}.low", self.low, should)
         if all(in_time):
-            chances = _rounded_up(low / dt, high / dt)
+            chances = _rounded_up(low, high)
         else:
             chances = [float(low <= k) / (high - low + 1) for k in range(int(high) + 1)]
         weighted = [self.probability * chance for chance in chances]
@@ -188,7 +187,7 @@ class Geometric(Law):
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         longest = in_steps(f"{key}.longest", self.longest, dt)
-        mean = _seconds(f"{key}.mean", self.mean) / dt if isinstance(self.mean, str) else self.mean
+        mean = _exact_steps(f"{key}.mean", self.mean, dt)
         checks.in_range(f"{key}.mean", mean, 0.0, unit="steps")
         failure = mean / (1 + mean)
         chances = [(1 - failure) * failure**k for k in range(longest)]
@@ -320,7 +319,7 @@ class Distance(Law):
         checks.place(f"{key}.receiver", self.receiver)
         longest = in_steps(f"{key}.longest", self.longest, dt)
         in_steps(f"{key}.base", self.base, dt)  # refuses what is not a delay
-        base = _seconds(f"{key}.base", self.base) / dt if isinstance(self.base, str) else self.base
+        base = _exact_steps(f"{key}.base", self.base, dt)
         loses, compute = math.isfinite(self.range), partial(self.delays, base)
         reads = {"reads": ["position"], "optional_reads": ["receiver_position"]}
         return ContextSampler(compute, longest, loss, loses=loses, **reads)
@@ -357,22 +356,6 @@ class Function(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         longest = in_steps(f"{key}.longest", self.longest, dt)
         return ContextSampler(self.function, longest, loss, loses=self.loses, reads=self.reads)
-
-
-@dataclass(frozen=True)
-class Held(Law):
-    """Every message is held until the longest delay of another law has passed, so that the delay is constant.
-
-    It lets methods for constant delays work with random ones. The same messages are lost.
-
-    A worked timeline of ``Held(Uniform(0, 3))``: a message sent at t = 0 that draws 1 is there at t = 1, is
-    held back, and counts as arrived at t = 3.
-    """
-
-    law: Law
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return HeldSampler(sampler_of(self.law, dt, loss, key))
 
 
 def law_of(written: Any, key: str = "delay") -> Law:
@@ -431,7 +414,8 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
 
     ``delay[receiver][sender]`` is the law of a link; the diagonal is not used.
     """
-    n = same_size({key: delay, "loss": loss})
+    loss_key = f"{key.removesuffix('delay')}loss"
+    n = same_size({key: delay, loss_key: loss})
     if n is None or isinstance(delay, Sampler):
         return sampler_of(delay, dt, loss, key)
     by_link = is_matrix(delay)
@@ -447,7 +431,7 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
         index.append(distinct.index(law))
     losses = torch.as_tensor(loss, dtype=torch.float64).expand(n, n)
     for probability in losses.flatten().tolist():
-        checks.in_range("loss", probability, 0.0, 1.0)
+        checks.in_range(loss_key, probability, 0.0, 1.0)
     return LinkSampler(samplers, torch.tensor(index), losses.flatten().clone())
 
 

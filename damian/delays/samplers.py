@@ -188,7 +188,13 @@ class Recorded(Sampler):
 
 
 class HeldSampler(Sampler):
-    """Gives every message the longest delay of another sampler; the same messages are lost."""
+    """Gives every message the longest delay of another sampler, as if it were held back until then.
+
+    Methods for constant delays then work with random ones. The same messages are lost.
+
+    A worked timeline, of a uniform delay of 0 to 3 steps: a message sent at t = 0 that draws 1 is there at
+    t = 1, is held back, and counts as arrived at t = 3.
+    """
 
     def __init__(self, drawn: Sampler) -> None:
         super().__init__(drawn.longest, drawn.loses)
@@ -320,7 +326,8 @@ class LinkSampler(Sampler):
     def __init__(self, samplers: Sequence[Sampler], law_index: Tensor, loss: Tensor) -> None:
         loses = any(sampler.loses for sampler in samplers) or bool((loss > 0).any())
         super().__init__(max(sampler.longest for sampler in samplers), loses)
-        self.n_agents, self.samplers = math.isqrt(len(law_index)), nn.ModuleList(samplers)
+        self.n_agents = math.isqrt(len(law_index))
+        self.samplers: Any = nn.ModuleList(samplers)
         self.sees_context = any(sampler.sees_context for sampler in samplers)
         self.reads = tuple(dict.fromkeys(name for sampler in samplers for name in sampler.reads))
         self._loses_on_links = bool((loss > 0).any())
@@ -331,10 +338,10 @@ class LinkSampler(Sampler):
         self.register_buffer("_loss", loss, persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        return _packed([sampler.initial_state(streams) for sampler in self._samplers])
+        return _packed([sampler.initial_state(streams) for sampler in self.samplers])
 
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
-        pairs = zip(self._samplers, self._split(state), strict=True)
+        pairs = zip(self.samplers, self._split(state), strict=True)
         return _packed([sampler.begin_episode(part, mask) for sampler, part in pairs])
 
     def forward(
@@ -343,7 +350,7 @@ class LinkSampler(Sampler):
         n_links = len(self._law_index)
         n_worlds, delay, states = len(streams) // n_links, torch.zeros_like(streams), []
         index = self._law_index.repeat(n_worlds)
-        for k, (sampler, part) in enumerate(zip(self._samplers, self._split(state), strict=True)):
+        for k, (sampler, part) in enumerate(zip(self.samplers, self._split(state), strict=True)):
             drawn, new_state = sampler(streams_for(sampler, streams, n_links), clock, part, context)
             drawn = torch.where(drawn < sampler.lost, drawn, self.lost)
             delay = torch.where(index == k, drawn, delay)
@@ -352,10 +359,6 @@ class LinkSampler(Sampler):
             draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LINK_LOSS_DRAW))
             delay = torch.where(draw < self._loss.repeat(n_worlds), self.lost, delay)
         return delay, _packed(states)
-
-    @property
-    def _samplers(self) -> list[Any]:
-        return list(self.samplers)
 
     def _split(self, state: Tensor) -> list[Tensor]:
         """The state of each sampler, [M, ...]."""

@@ -1,4 +1,4 @@
-"""Nodes that compute with the messages that have arrived: server, belief, UAVs (paper, section 3.4)."""
+"""Transforms with a row for each world: nodes (server, belief, UAVs; paper, section 3.4), and totals."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,9 @@ from damian.server.belief import (
 )
 from damian.server.server import Server
 from damian.transforms.base import Change, Memory, StatefulTransform
-from damian.transforms.entries import Entries, existing
+from damian.transforms.entries import Entries, add_spec, existing
+from damian.transforms.hold import SampleAndHold
+from damian.transforms.timeline import ObservationTimeline
 from damian.world.coverage import KnownCoverage
 
 
@@ -217,3 +219,65 @@ class Belief(WorldTransform):
                 size = torch.Size((*shape, n_cells))
                 observation_spec[key] = Bounded(0.0, 1.0, size, device=observation_spec.device)
         return observation_spec
+
+
+class EpisodeTotals(WorldTransform):
+    """Writes each episode's sum of rewards and number of steps (TorchRL's ``RewardSum``, ``StepCounter``)."""
+
+    stage = "history"
+
+    def __init__(self) -> None:
+        super().__init__(keys.REWARD, [keys.EPISODE_REWARD, keys.STEP_COUNT])
+        self.step_keys = self.in_keys
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        reward = self.env.full_reward_spec[keys.REWARD].zero()
+        return {"total": reward, "count": torch.zeros(len(reward), 1, dtype=torch.long, device=reward.device)}
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory = {name: old.masked_fill(expand_mask(mask, old), 0) for name, old in memory.items()}
+        return memory, self._outputs(memory)
+
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
+        memory = {"total": memory["total"] + entries[keys.REWARD], "count": memory["count"] + 1}
+        return memory, self._outputs(memory)
+
+    def _outputs(self, memory: Memory) -> Entries:
+        # Copies, because others may change what a step outputs in place.
+        return {keys.EPISODE_REWARD: memory["total"].clone(), keys.STEP_COUNT: memory["count"].clone()}
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        reward = self.env.full_reward_spec[keys.REWARD]
+        add_spec(observation_spec, keys.EPISODE_REWARD, reward.shape, reward.dtype)
+        add_spec(observation_spec, keys.STEP_COUNT, (*observation_spec.shape, 1), torch.long)
+        return observation_spec
+
+
+# Reports that arrive late, or not at all for many steps (``damian.field``).
+
+
+def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
+    """Note an agent's packed message [M] that arrives in the next step, ``lag`` >= 1 steps late.
+
+    Of a single world; what a belief remembers is changed in place.
+    """
+    if isinstance(transform, ObservationTimeline) and lag <= transform.slots:
+        row = {"kept": transform.encoded(message.view(1, 1, -1)).view(-1), "due": 1, "sent": True}
+        memory = memory | {name: memory[name].clone() for name in row}
+        for name, value in row.items():
+            memory[name][agent, lag - 1] = value
+    if isinstance(transform, Belief) and lag <= transform.longest:
+        messages = transform.server.messages(message.view(1, 1, -1))
+        slot = (memory["slot"] + 1 - lag) % len(memory["report"])
+        every = torch.ones_like(messages.spotted)
+        memory["report"][slot, agent] = report_rows(transform.grid, messages, every).view(-1)
+        memory["delay"][slot, agent] = lag
+    return memory
+
+
+def after_idle_steps(transform: StatefulTransform, memory: Memory, n_steps: int) -> Memory:
+    """The memory after steps in which no message arrived and no agent chose an action; beliefs stay."""
+    counted = {name: memory[name] + n_steps for name in ("elapsed", "since", "age") if name in memory}
+    if isinstance(transform, SampleAndHold):
+        counted["elapsed"] = counted["elapsed"] % transform.period
+    return memory | counted

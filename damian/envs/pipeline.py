@@ -25,7 +25,7 @@ from damian.delays.scenario import CONTEXT_KEYS
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv, Skip
 from damian.envs.nodes import Belief, OnboardNode, ServerNode
-from damian.envs.uav_env import ALL_EXTRAS, UavEnv, make_server, make_simulation
+from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
@@ -63,22 +63,11 @@ def make_env(
     remote, skips = has_server_node(scenario), scenario.clock.skip
     needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
     needed |= {*["position"] * scenario.delays.reads_positions, *["duration"] * skips}
-    simulation = make_simulation(scenario, seed)
-    server = make_server(scenario, simulation)
-    env = UavEnv(
-        scenario,
-        num_worlds,
-        seed,
-        device,
-        {*extras, *needed},
-        simulation=simulation,
-        server=server,
-        messages_only=remote,
-    )
+    env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
     names = scenario.reward.terms if "reward_terms" in extras else []
     rewards = [keys.REWARD, *((*keys.REWARD_TERMS, name) for name in names)]
     skip = Skip(scenario.clock.skip_discount, rewards) if skips else None
-    pipeline = DelayedEnv(env, make_transforms(scenario, server, extras), skip)
+    pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras), skip)
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
     pipeline.set_seed(seed)
@@ -120,7 +109,18 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
     remembers = server.grid is not None or scenario.delay.messages > 0
     transforms: list[Transform] = []
     if delayed:
-        transforms.append(uplink_transform(scenario, output_messages, reads_delay=remembers))
+        uplink = ObservationDelay(
+            scenario.delays.obs,
+            keys.MESSAGE,
+            keys.RECEIVED,
+            order=scenario.delay.order,
+            dt=scenario.clock.dt,
+            sent_key=keys.MESSAGE_SENT,
+            age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
+            delay_key=keys.DELAY if output_messages or remembers else None,
+            context_keys=CONTEXT_KEYS,
+        )
+        transforms.append(uplink)
     longest = scenario.delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
     dropped = []
@@ -133,21 +133,6 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         *transforms,
         ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras),
     ]
-
-
-def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:
-    """The delay of the messages to the server; ``reads_delay``: a later transform reads that delay."""
-    return ObservationDelay(
-        scenario.delays.obs,
-        keys.MESSAGE,
-        keys.RECEIVED,
-        order=scenario.delay.order,
-        dt=scenario.clock.dt,
-        sent_key=keys.MESSAGE_SENT,
-        age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
-        delay_key=keys.DELAY if output_messages or reads_delay else None,
-        context_keys=CONTEXT_KEYS,
-    )
 
 
 def remembering_transforms(

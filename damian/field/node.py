@@ -17,8 +17,7 @@ from damian.common import checks
 from damian.common.tensors import tree_map
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.memories import after_idle_steps, note_late
-from damian.envs.nodes import Belief, ServerNode
+from damian.envs.nodes import Belief, ServerNode, after_idle_steps, note_late
 from damian.envs.pipeline import observation_transforms, remembering_transforms
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.field.known import Ground

@@ -112,8 +112,7 @@ class BackupdateStorage(TimeStorage):
         self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
     ) -> None:
         """Write steps [T, B] at the indices ``cursor`` of the first dimension, and back-update."""
-        if data.dim() != 2:
-            raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
+        checks.require(data.dim() == 2, "steps", f"a batch of shape {list(data.shape)}", "is not [T, B]")
         should = "joins steps before they are corrected: leave it out, and join the steps that are read"
         checks.require("steps_to_next_obs" not in data, "transform", "MultiStepTransform", should)
         self._require_entries(data)
@@ -140,21 +139,17 @@ class BackupdateStorage(TimeStorage):
             should = "grows from world to world instead of step to step: give ReplayBuffer.extend [B, T]"
             checks.require(bool(along[0] >= along[1]), "step_count", self._count, should)
         n_worlds = self._n_worlds = data.shape[1] if self._n_worlds is None else self._n_worlds
-        if data.shape[1] != n_worlds:
-            raise InputError(
-                f"steps: a batch of shape {list(data.shape)} is not one of {n_worlds} worlds: give "
-                f"ReplayBuffer.extend [B, T], as collectors and rollouts return it"
-            )
+        should = f"is not one of {n_worlds} worlds: give ReplayBuffer.extend [B, T], as rollouts return it"
+        checks.require(data.shape[1] == n_worlds, "steps", f"a batch of shape {list(data.shape)}", should)
         needs = len(data) + 2 * self.longest + self.lookback
-        if self.max_size < needs * n_worlds:
-            raise InputError(
-                f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "
-                f"up to {self.longest} steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}"
-            )
+        should = (
+            f"is too little for batches of {len(data)} steps and delays of up to {self.longest} steps: "
+            f"{needs} steps of {n_worlds} worlds need {needs * n_worlds}"
+        )
+        checks.require(self.max_size >= needs * n_worlds, "max_size", self.max_size, should)
         for name, key, _ in delays:
-            longest = int(data[key].max())
-            if longest > self.longest:
-                raise InputError(f"longest: a {name} takes {longest} steps, more than {self.longest} steps")
+            takes = f"steps, but a {name} takes {int(data[key].max())} steps"
+            checks.require(bool(data[key].max() <= self.longest), "longest", self.longest, takes)
 
     def _with_added_entries(self, data: TensorDictBase) -> TensorDictBase:
         """Copy of steps [T, B], with the entries that the storage adds, before any back-updating."""
@@ -162,10 +157,8 @@ class BackupdateStorage(TimeStorage):
         data = data.copy().update({keys.VALID: torch.ones_like(done), keys.RESET_AFTER: done.clone()})
         data[self._backupdated] = torch.zeros_like(delay, dtype=torch.bool)
         if self._hindsight is not None:
-            data[self._hindsight], data[self._hindsight_age] = (
-                data[self._held].clone(),
-                data[self._age].long(),
-            )
+            data[self._hindsight] = data[self._held].clone()
+            data[self._hindsight_age] = data[self._age].long()
         return data
 
     def backupdate(self, n_steps: int) -> None:

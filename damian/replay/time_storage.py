@@ -28,7 +28,7 @@ class TimeStorage(LazyTensorStorage):
         """All stored steps, [T, B], as a ring: ``latest`` gives their order in time."""
         return cast(TensorDictBase, self._storage)
 
-    # Private names of TorchRL are used in this file only; ``test_time_storage.py`` shows if they break.
+    # Private names of TorchRL are used in this file only.
 
     @property
     def n_steps(self) -> int:

@@ -439,9 +439,18 @@ class StatefulTransform(Transform):
         if self._world_seeds is not None:
             worlds = self._world_seeds.to(device)
         else:
-            seed = _unseeded() if self._seed is None else self._seed
+            seed = self._seed
+            if seed is None:  # worker processes with the same state of torch's generator get different ones
+                process = multiprocessing.current_process().name
+                seed = int(torch.randint(2**62, ())) ^ counter_rng.number_of(process)
             worlds = counter_rng.world_seeds(seed, n_worlds, device)
-        name = torch.tensor(counter_rng.number_of(stream_name(self)), device=device)
+        # The name keeps these streams apart from those of all other transforms in the environment.
+        keys = (self.in_keys, self.in_keys_inv)
+        others = [other for other in all_transforms(self.container) if type(other) is type(self)]
+        alike = [other for other in others if (other.in_keys, other.in_keys_inv) == keys]
+        place = next((i for i, other in enumerate(alike) if other is self), 0)
+        number = counter_rng.number_of(f"{type(self).__name__} {keys[0]} {keys[1]} {place}")
+        name = torch.tensor(number, device=device)
         streams = counter_rng.bits64(worlds.view(-1, 1), name, torch.arange(n_agents, device=device))
         return streams_for(sampler, streams.flatten(), n_agents)
 
@@ -463,7 +472,14 @@ def check_order(transforms: Sequence[Transform]) -> None:
             shared = read.intersection([*second.out_keys, *second.out_keys_inv])
             if shared and STAGES.index(first.stage) > STAGES.index(second.stage):
                 problem = f"it reads {shared.pop()}, which the other one changes"
-        elif isinstance(first, StatefulTransform) and first.flushes_at_end and _ends_episodes(second):
+        elif (
+            isinstance(first, StatefulTransform)
+            and first.flushes_at_end
+            and (
+                isinstance(second, RandomTruncationTransform | TerminateTransform)
+                or (isinstance(second, StepCounter) and second.max_steps is not None)
+            )
+        ):
             problem = "what is in transit at the end of an episode would be lost"
         elif isinstance(first, StatefulTransform) and isinstance(second, NoopResetEnv):
             problem = "it would remember what was before the idle steps"
@@ -472,12 +488,6 @@ def check_order(transforms: Sequence[Transform]) -> None:
         if problem:
             names = type(first).__name__, type(second).__name__
             raise InputError(f"order of transforms: {names[0]} must come after {names[1]}: {problem}")
-
-
-def _ends_episodes(transform: Transform) -> bool:
-    if isinstance(transform, StepCounter):
-        return transform.max_steps is not None
-    return isinstance(transform, RandomTruncationTransform | TerminateTransform)
 
 
 def leaf_transforms(transform: Transform | None) -> list[Any]:
@@ -497,24 +507,6 @@ def all_transforms(env: EnvBase | None) -> list[Transform]:
 
 
 # Seeds.
-
-
-def stream_name(transform: Transform) -> str:
-    """The name that keeps the random streams of a transform apart from all others in its environment."""
-    name = _class_and_keys(transform)
-    others = all_transforms(transform.container)
-    alike = [other for other in others if type(other) is type(transform) and _class_and_keys(other) == name]
-    return f"{name} {next((i for i, other in enumerate(alike) if other is transform), 0)}"
-
-
-def _class_and_keys(transform: Transform) -> str:
-    return f"{type(transform).__name__} {transform.in_keys} {transform.in_keys_inv}"
-
-
-def _unseeded() -> int:
-    """A seed from torch's global generator; worker processes with the same state get different ones."""
-    drawn = int(torch.randint(2**62, ()))
-    return drawn ^ counter_rng.number_of(multiprocessing.current_process().name)
 
 
 def set_seed(env: EnvBase, seed: int) -> int | None:

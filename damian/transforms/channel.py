@@ -11,11 +11,10 @@ from torchrl.data import Bounded, Composite, TensorSpec
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
 from damian.delays.laws import link_sampler, same_size
-from damian.delays.line import BroadcastLine
+from damian.delays.line import DelayLine, slot_rows
 from damian.delays.samplers import MessageContext
 from damian.keys import STEPPED
 from damian.transforms.base import Change, Memory, StatefulTransform
-from damian.transforms.context import message_context
 from damian.transforms.entries import (
     Entries,
     add_spec,
@@ -38,6 +37,10 @@ class Channel(StatefulTransform):
     observes it, its age, and whether any has arrived in this episode. An agent knows its own message at once.
     The outputs of a reset are sent like those of a step; a chosen message exists from the first step on. No
     gradient flows through the channel.
+
+    A ``DelayLine`` delays only the time at which a message was generated, on every link [M]; the latest K
+    messages of each of the S senders lie in a ring (``contents_i`` [K, S, ...]), and what is held in
+    ``held_i`` [M, ...]. The memory also has the ``sender`` of each link, and a ``link`` of each sender.
 
     A worked timeline, with a delay of 3 steps: the messages of the reset, t = 0, arrive at t = 3, and those
     of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds their messages of
@@ -126,7 +129,7 @@ class Channel(StatefulTransform):
         for name in self.sampler.reads:
             given = placed and name in ("position", "receiver_position")
             checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
-        self.line = BroadcastLine(self.sampler)
+        self.line, self._n_slots = DelayLine(self.sampler, "generation"), self.sampler.longest + 1
         self.action_keys = existing([self.action_key])
         self.step_keys = existing([*self.in_keys, self.position_key, self.sent_key])
 
@@ -155,20 +158,27 @@ class Channel(StatefulTransform):
         streams = self.streams(tensordict.batch_size, contents[0].device, self.sampler, draws)
         links = torch.arange(len(streams), device=streams.device)
         receiver, sender = links // n, links % n
-        memory = self.line.init_memory(contents, streams, receiver // n * n + sender)
         hears = receiver % n != sender
         if self.hears is not None:
             hears = hears & torch.tensor(self.hears, device=streams.device).repeat(len(streams) // n**2)
-        memory |= {"hears": hears}
+        memory = self.line.init_memory([], streams) | {"sender": receiver // n * n + sender, "hears": hears}
+        memory["link"] = links.view(-1, n, n)[:, -1].flatten()
+        for i, content in enumerate(contents):
+            memory[f"contents_{i}"] = content.new_zeros(self._n_slots, *content.shape)
+            memory[f"held_{i}"] = content.new_zeros(len(links), *content.shape[1:])
         return memory | {"delay": torch.zeros_like(streams)} if self.delay_key else memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        self.line.write(memory, self._contents(entries, mask.device))
-        begun = self.line.reset(memory, mask)
+        contents = self._contents(entries, mask.device)
+        self._put(memory, contents)
+        begun, _ = self.line.reset(memory, [], mask)
+        for name in (f"held_{i}" for i in range(len(contents))):
+            begun[name] = begun[name].masked_fill(expand_mask(mask, begun[name]), 0)
         sending = mask & self._wanted(entries, mask) & (self.action_key is None)
         after = self._send(begun, entries, sending)
         if self.known_at_reset:
-            after = self.line.deliver_now(after, mask)
+            after["generated_at"] = torch.where(mask, after["clock"], after["generated_at"])
+            after = self._hold(after, mask)
             after |= {"delay": torch.zeros_like(after["delay"])} if self.delay_key else {}
         merged = {
             name: new if new is begun[name] else torch.where(expand_mask(mask, new), new, begun[name])
@@ -178,12 +188,12 @@ class Channel(StatefulTransform):
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         if self.action_key:
-            self.line.write(memory, [as_rows(entries[self.action_key], self.agents)])
+            self._put(memory, [as_rows(entries[self.action_key], self.agents)])
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         if not self.action_key:
-            self.line.write(memory, [as_rows(entries[key], self.agents) for key in self.in_keys])
+            self._put(memory, self._contents(entries, memory["hears"].device))
         active = torch.ones_like(memory["hears"])
         if STEPPED in entries:
             active = self.expand_worlds(entries[STEPPED].reshape(-1))
@@ -195,6 +205,22 @@ class Channel(StatefulTransform):
         if self.message_size:
             return [torch.zeros(self.agents.numel(), self.message_size, device=device)]
         return [as_rows(entries[key], self.agents) for key in self.in_keys]
+
+    def _put(self, memory: Memory, contents: list[Tensor]) -> None:
+        """Write what the senders send in the next step, [S, ...] each; the step may send it or not."""
+        rows = slot_rows((memory["clock"][memory["link"]] + 1) % self._n_slots)
+        for i, content in enumerate(contents):
+            memory[f"contents_{i}"].flatten(0, 1).index_copy_(0, rows, content)
+
+    def _hold(self, memory: Memory, mask: Tensor) -> Memory:
+        """Where the mask [M] is true, hold the messages that were generated at ``generated_at``."""
+        slot, held = memory["generated_at"] % self._n_slots, {}
+        rows = slot * len(memory["link"]) + memory["sender"]
+        for i in range(len(self.in_keys) or 1):
+            old = memory[f"held_{i}"]
+            new = memory[f"contents_{i}"].flatten(0, 1).index_select(0, rows)
+            held[f"held_{i}"] = torch.where(expand_mask(mask, old), new, old)
+        return memory | held
 
     def _wanted(self, entries: Entries, active: Tensor) -> Tensor:
         """Links among the active ones [M] on which an agent wants to send, [M] bool."""
@@ -215,8 +241,9 @@ class Channel(StatefulTransform):
         by_link = sent.view(-1, n, n)
         sent = (by_link & self._may_send(memory, by_link.any(1)).unsqueeze(1)).view(-1)
         context = self._context(memory, sent, position) if self.sampler.sees_context else None
-        memory, delay = self.line.step(memory, sent, context)
-        return memory | {"delay": delay} if self.delay_key else memory
+        memory, delivery = self.line.step(memory, [], sent, context)
+        memory = self._hold(memory, delivery.fresh)
+        return memory | {"delay": delivery.delay} if self.delay_key else memory
 
     def _context(self, memory: Memory, sent: Tensor, position: Tensor | None) -> MessageContext:
         """The circumstances of what is ``sent`` over the links [M]; positions are [B * N, 2]."""
@@ -225,7 +252,9 @@ class Channel(StatefulTransform):
         places = {"position": sender, "receiver_position": receiver}
         read = {} if position is None else {k: position.index_select(0, v) for k, v in places.items()}
         n_sending = sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n)
-        return message_context(memory, sender % n, receiver % n, n_sending, read, self.dt)
+        time = (memory["clock"] - memory["reset_at"]) * self.dt
+        uniform = counter_rng.uniform(memory["streams"], memory["clock"] + 1)
+        return MessageContext(sender % n, receiver % n, n_sending, time, uniform, self.dt, read)
 
     def _may_send(self, memory: Memory, wants: Tensor) -> Tensor:
         """Draw who may send if not all may, [B, N] bool, among those who want to, [B, N] bool."""
@@ -249,10 +278,11 @@ class Channel(StatefulTransform):
         own_time = now.masked_fill(now == 1, 0) if self.action_key else now  # nothing is chosen at a reset
         time = torch.where(is_own, own_time, time)
         entries: Entries = {}
-        pairs = zip(self.out_keys, self.line.newest(memory), self.line.held(memory), strict=False)
-        for key, new, old in pairs:
-            held = old.view(-1, n, *old.shape[1:])
-            value = torch.where(expand_mask(is_own, held), new.unsqueeze(1), held)
+        newest = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
+        for i, key in enumerate(self.out_keys[: len(self.in_keys) or 1]):
+            own = memory[f"contents_{i}"].flatten(0, 1).index_select(0, newest)
+            held = memory[f"held_{i}"].unflatten(0, (-1, n))
+            value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
             entries[key] = value.view(*shape, *value.shape[2:])
         if self.age_key is not None:
             entries[self.age_key] = (now - time.clamp(min=1)).to(torch.float32).view(shape)

@@ -59,21 +59,7 @@ class ContextReader:
             by_world = sent.view(-1, len(agents))
             n_sending = by_world.sum(-1, keepdim=True).expand_as(by_world).reshape(-1)
         sender, receiver = agents.repeat(len(streams) // len(agents)), torch.full_like(streams, -1)
+        time = (memory["clock"] + self._since_clock - memory["reset_at"]) * self._dt
+        uniform = counter_rng.uniform(streams, memory["clock"] + 1)
         read = {name: as_rows(entries[key], rows) for name, key in self.keys.items()}
-        return message_context(memory, sender, receiver, n_sending, read, self._dt, self._since_clock)
-
-
-def message_context(
-    memory: Memory,
-    sender: Tensor,
-    receiver: Tensor,
-    n_sending: Tensor,
-    entries: dict[str, Tensor],
-    dt: float,
-    since_clock: int = 0,
-) -> MessageContext:
-    """The context of M messages that are sent ``since_clock`` steps after the clock in a line's memory."""
-    clock = memory["clock"]
-    time = (clock + since_clock - memory["reset_at"]) * dt
-    uniform = counter_rng.uniform(memory["streams"], clock + 1)
-    return MessageContext(sender, receiver, n_sending, time, uniform, dt, entries)
+        return MessageContext(sender, receiver, n_sending, time, uniform, self._dt, read)

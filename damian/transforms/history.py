@@ -69,12 +69,6 @@ class ActionHistory(ActionTransform):
         self.age_key, self.reflected_after = sibling_key(self.action_key, age_key), reflected_after
         self.step_keys = existing([*self.in_keys, self.age_key])
 
-    @property
-    def _n_numbers(self) -> int:
-        """Number of numbers that represent an action, A."""
-        rows, initial = self.actions.rows, self.actions.initial
-        return initial.shape[len(rows) :].numel() if self.codes is None else self.codes.shape[-1]
-
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         _, initial, low, width, _ = self.actions
         initial, low, width = (self.action_rows(value) for value in (initial, low, width))
@@ -138,8 +132,9 @@ class ActionHistory(ActionTransform):
         return ((action.float() - scale["low"]) / scale["width"]).reshape(len(action), -1)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        rows, width = self.actions.rows, self.steps * self._n_numbers
-        key = self.out_keys[0]
+        rows, key, codes = self.actions.rows, self.out_keys[0], self.codes
+        numbers = self.actions.initial.shape[len(rows) :].numel() if codes is None else codes.shape[-1]
+        width = self.steps * numbers
         if not self.in_keys:
             add_spec(observation_spec, key, (*rows, width))
             return observation_spec

@@ -41,7 +41,7 @@ class RewardTransform(StatefulTransform):
 
     @property
     def row_dims(self) -> dict[str, int]:
-        return {"past": 1}
+        return {"past": 1, "due": 1}
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         specs = self.env.full_reward_spec
@@ -115,10 +115,6 @@ class RewardDelay(RewardTransform):
     def done_keys(self) -> list[NestedKey]:
         """Keys of the flags that end an episode of the reward, by the environment's specs."""
         return flag_keys("done", self.reward_key, self.env.done_keys)
-
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return {"past": 1, "due": 1}
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)

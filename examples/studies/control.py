@@ -48,7 +48,8 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common.tables import markdown_table
-from damian.delays.laws import Held, Uniform
+from damian.delays.laws import Uniform, sampler_of
+from damian.delays.samplers import HeldSampler
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.config import BpqlConfig
@@ -110,7 +111,7 @@ def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
 
     varies = task.shortest < task.longest
     law = Uniform(task.shortest, task.longest) if varies else task.longest
-    law = Held(law) if task.buffer else law
+    law = HeldSampler(sampler_of(law)) if task.buffer else law
     transforms: list[Transform] = [
         RewardSum(),
         StepCounter(),

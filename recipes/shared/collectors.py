@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from damian import keys
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.episode_totals import EpisodeTotals
+from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state

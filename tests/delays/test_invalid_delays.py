@@ -4,12 +4,11 @@ import math
 from dataclasses import dataclass
 
 import pytest
-from context_law import Crowd
-from transform_cases import ACTION, delayed, trace
+from delay_twin import ACTION, Crowd, delayed, trace
 
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.delays.laws import LONGEST, Burst, Held, Lag, Law, Uniform
+from damian.delays.laws import LONGEST, Burst, Lag, Law, Uniform
 from damian.delays.samplers import TableSampler
 from damian.delays.scenario import ScenarioDelays
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
@@ -73,7 +72,7 @@ def test_an_invalid_trace_raises_one_line_that_names_the_file_and_the_line(tmp_p
 
 @pytest.mark.parametrize("user", [Lag, lambda law: Burst(bad=law)], ids=["lag", "burst"])
 def test_a_law_with_memory_or_context_is_refused_as_an_inner_law(user, tmp_path):
-    for law in (trace(tmp_path, 1, 2), Held(Lag(Uniform(1, 5))), Crowd()):
+    for law in (trace(tmp_path, 1, 2), Lag(Uniform(1, 5)), Crowd()):
         with pytest.raises(InputError, match="is not a memoryless law"):
             user(law).sampler()
 

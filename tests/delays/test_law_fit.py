@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import delay_twin
 import numpy as np
 import pytest
 import torch
@@ -18,12 +19,9 @@ LOSSES = {**BURST, "good": 0, "bad": 0, "bad_loss": 1.0}
 
 def drawn(law, loss: float = 0.0, seed: int = 0) -> np.ndarray:
     """Delays [steps] of the messages of 30 senders: 15 send 200 messages each, the others 150."""
-    sampler, streams = sampler_of(law, loss=loss), counter_rng.world_seeds(seed, 30)
-    memory, steps = sampler.initial_state(streams), []
-    for t in range(200):
-        delay, memory = sampler(streams, torch.full_like(streams, t), memory)
-        steps.append(torch.where(delay < sampler.lost, delay, LOST_STEPS))
-    found = torch.stack(steps, 1).numpy()
+    sampler = sampler_of(law, loss=loss)
+    delays = delay_twin.drawn(sampler, counter_rng.world_seeds(seed, 30), 200).T
+    found = torch.where(delays < sampler.lost, delays, LOST_STEPS).numpy()
     found[::2, 150:] = NO_MESSAGE
     return found
 

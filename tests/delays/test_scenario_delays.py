@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import pytest
+from delay_twin import trace
 from helpers import square
-from transform_cases import trace
 
 from damian.delays import laws
 from damian.delays.config import DelayConfig, LinkConfig

@@ -7,27 +7,32 @@ from typing import Any
 
 import pytest
 import torch
-from context_law import LONGEST, Crowd, twin_delay
-from delay_twin import Counting, Purse, Receiver, drawn
-from delayed_envs import choices as uav_choices
-from helpers import everything, play
-from transform_cases import (
+from delay_twin import (
     ACTION,
+    LONGEST,
     N_AGENTS,
     OBSERVATION,
     REWARD,
     ROWS,
     STEPS,
     WORLDS,
+    Counting,
+    Crowd,
+    Purse,
+    Receiver,
     after,
     before,
     choices,
     column,
     delayed,
+    drawn,
+    twin_delay,
 )
-from transform_cases import (
+from delay_twin import (
     LAWS as TABLES,
 )
+from delayed_envs import choices as uav_choices
+from helpers import everything, play
 
 from damian.common import counter_rng
 from damian.delays.config import DelayConfig

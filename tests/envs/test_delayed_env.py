@@ -7,20 +7,13 @@ import torch
 from delayed_envs import DELAYS, after_steps, choices, delayed, every_delay
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, square
 from tensordict import TensorDictBase
-from torchrl.envs import (
-    Compose,
-    EnvBase,
-    RewardSum,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.episode_totals import EpisodeTotals
+from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.keys import (

@@ -6,26 +6,26 @@ import math
 
 import pytest
 import torch
-from helpers import (
-    EAST,
-    HERE,
-    MOTIONS,
-    both_motions,
-    clock,
-    flight,
-    fresh,
-    go,
-    one_uav,
-    sent_messages,
-    walking,
-)
+from helpers import MOTIONS, act, both_motions, clock, fresh, one_uav, sent_messages, walking
+from tensordict import TensorDictBase
 
+from damian.envs.uav_env import UavEnv
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 from damian.world.motion import MotionConfig
 
 FAR = [[390.0, 10.0]]
+HERE, EAST = [[0.0, 0.0]], [[1.0, 0.25]]
+"""Continuous actions of one UAV: hold, and 100 m east (a quarter of a turn from north)."""
+
+
+def go(env: UavEnv, *actions: list) -> TensorDictBase:
+    """Step through the actions; return the output of the last step."""
+    for action in actions:
+        after = act(env, torch.tensor([action]))
+    return after
+
 
 # Ends of episodes.
 
@@ -81,7 +81,7 @@ def test_the_battery_drain_of_a_flight_does_not_depend_on_the_length_of_a_step()
         origin, goal = (env.simulation.points[p.item()] for p in (env.state.origin, env.state.goal))
         length = torch.linalg.vector_norm(goal - origin)
         cost = flight_drain(env.state.vertical[0, 0], length, battery).item()
-        duration = flight(env)
+        duration = (2 * env.state.vertical + env.state.cruise).item()
         levels = [env.state.battery.item()]
         while not env.simulation.vehicles.on_ground(env.state).all():
             go(env, HERE)

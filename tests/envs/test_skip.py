@@ -6,11 +6,12 @@ from typing import Any
 
 import pytest
 import torch
-from context_law import Crowd
-from helpers import everything, same
+from delay_twin import Crowd
+from helpers import all_same, everything
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from damian.common.tensors import expand_mask
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
@@ -103,7 +104,7 @@ def by_single_steps(
         after, td = env.step_and_maybe_reset(td.set(ACTION, chosen))
         output = after["next"].clone()
         for key in (k for k in output.keys(True, True) if k == REWARD or "reward_terms" in k):
-            first, weight = (expand_worlds(x, output[key]) for x in (elapsed == 0, gamma**elapsed))
+            first, weight = (expand_mask(x, output[key]) for x in (elapsed == 0, gamma**elapsed))
             discounted = weight * output[key]
             sums[key] = torch.where(first, discounted, sums.get(key, discounted) + discounted)
         elapsed = elapsed + 1
@@ -117,15 +118,10 @@ def by_single_steps(
         for key, total in sums.items():
             output[key] = total
             if key != REWARD:  # TorchRL does not copy rewards to the next root
-                continued[key] = torch.where(expand_worlds(reset, total), 0, total)
+                continued[key] = torch.where(expand_mask(reset, total), 0, total)
         for world in now.nonzero().flatten().tolist():
             outputs[world] += [output[world].clone(), continued[world].clone()]
     return [rows[: 2 * N_DECISIONS] for rows in outputs], ends
-
-
-def expand_worlds(worlds: Tensor, like: Tensor) -> Tensor:
-    """Reshape [B] to [B, 1, ...], with the dimensions of another tensor."""
-    return worlds.view(-1, *[1] * (like.dim() - 1))
 
 
 def check_equal(
@@ -138,16 +134,8 @@ def check_equal(
     """
     merged = by_merged_steps(skips(scenario, gamma), interrupted)
     single, ends = by_single_steps(scenario, gamma, interrupted)
-    for world, (some, others) in enumerate(zip(merged, single, strict=True)):
-        for i, (one, other) in enumerate(zip(some, others, strict=True)):
-            assert same(one, other), (world, i, differing(one, other))
+    assert all(all_same(some, others) for some, others in zip(merged, single, strict=True))
     return torch.stack([torch.cat([td["duration"] for td in rows[::2]]) for rows in merged]), ends
-
-
-def differing(one: TensorDictBase, other: TensorDictBase) -> list[Any]:
-    """Keys of the entries that differ."""
-    keys = set(one.keys(True, True)) & set(other.keys(True, True))
-    return [k for k in keys if not one[k].equal(other[k])] or [set(one.keys()) ^ set(other.keys())]
 
 
 @pytest.mark.sample(3)

@@ -1,19 +1,24 @@
-"""``env.state_dict()`` of a whole environment: an equal one that loads it goes on in the same way."""
+"""Copies and states of whole environments: another environment goes on as they did, and shares no memory."""
 
-import io
+import pickle
+from multiprocessing.reduction import ForkingPickler
 
 import pytest
-import torch
-from delayed_envs import DELAYS
-from helpers import all_same, everything
+from delayed_envs import DELAYS, choices, delayed
+from helpers import all_same, both_motions, everything, play, saved_and_loaded
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, StepCounter
 
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
+from damian.keys import ACTION
 
-QUICK = ("everything", "polynomial")
+
+def some(fast: str) -> pytest.MarkDecorator:
+    """Every delay; all but the ``fast`` one are slow tests."""
+    names = [pytest.param(n, marks=[] if n == fast else pytest.mark.slow) for n in DELAYS]
+    return pytest.mark.parametrize("delays", names)
 
 
 def built(delays: str, motion: str, n_worlds: int = 4) -> DelayedEnv:
@@ -23,40 +28,36 @@ def built(delays: str, motion: str, n_worlds: int = 4) -> DelayedEnv:
     return env
 
 
-def through_a_file(state):
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
+@some("paper")
+def test_an_environment_sent_to_a_worker_process_shares_no_memory(delays):
+    env, alone = (delayed(everything(**DELAYS[delays])) for _ in range(2))
+    actions, outputs = choices(env, 12), []
+    for each in (env, alone):
+        td = each.reset()
+        for step, action in enumerate(actions):
+            if step == 6 and each is env:  # messages are in transit
+                play(pickle.loads(ForkingPickler.dumps(env)), actions)  # what a worker process receives
+            after, td = each.step_and_maybe_reset(td.set(ACTION, action))
+            outputs.append(after["next"])
+    assert all_same(outputs[:12], outputs[12:])
 
 
-@pytest.mark.parametrize(
-    ("delays", "motion"),
-    [
-        pytest.param(delays, motion, marks=[] if (delays, motion) == QUICK else [pytest.mark.slow])
-        for delays in DELAYS
-        for motion in ("instant", "polynomial")
-    ],
-)
+@some("everything")
+@both_motions
 def test_an_equal_environment_that_loads_a_state_goes_on_in_the_same_way(delays, motion):
     env, twin = built(delays, motion), built(delays, motion)
     twin.set_seed(5)
     step = env.rollout(9, break_when_any_done=False)[:, -1]["next"].exclude("reward")
-    state = through_a_file(env.state_dict())
+    state = saved_and_loaded(env.state_dict())
     twin.rollout(2)
     twin.load_state_dict(state)
-    actions = [env.rand_action(step.clone())[("agents", "action")] for _ in range(25)]
-    one, other = (played(each, step.clone(), actions) for each in (env, twin))
-    assert all(all_same(a, b) for a, b in zip(one, other, strict=True))
-
-
-def played(env, step, actions) -> list:
     steps = []
-    for action in actions:
-        step[("agents", "action")] = action
-        taken, step = env.step_and_maybe_reset(step)
-        steps.append(taken["next"])
-    return steps
+    for each in (env, twin):
+        td = step.clone()
+        for action in choices(env, 25):
+            taken, td = each.step_and_maybe_reset(td.set(ACTION, action))
+            steps.append(taken["next"])
+    assert all_same(steps[:25], steps[25:])
 
 
 def test_a_state_as_torchrls_collector_saves_it_leaves_the_worlds():

@@ -67,7 +67,7 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
 def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_terms(motion, kind):
     env = UavEnv(everything(motion, kind), num_worlds=16)
     generator = torch.Generator().manual_seed(0)
-    td = env.rollout(40, lambda td: td.set(*random_action_entry(env, generator)), break_when_any_done=False)
+    td = env.rollout(40, lambda td: td.set(ACTION, random_actions(env, generator)), break_when_any_done=False)
     for name in ("observation", "global_observation"):
         observation = td["next", "agents", name]
         ways = 4 * (3 * env.server.observation.timeline + 3)  # of the timeline, which come last
@@ -79,10 +79,6 @@ def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_t
     final = 1.0 * td["next", "success"] - 0.25 * (td["next", "done"] & ~td["next", "success"])
     torch.testing.assert_close(rest, final.expand_as(rest), atol=1e-5, rtol=0)
     assert td["next", "done"].any()
-
-
-def random_action_entry(env, generator):
-    return ("agents", "action"), random_actions(env, generator)
 
 
 # Worlds and seeds.

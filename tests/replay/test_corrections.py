@@ -1,28 +1,18 @@
-"""Back-updating in any environment, against a loop over a world's steps, and what a storage refuses."""
+"""Back-updating in any environment, against a loop over a world's steps, and what a storage refuses.
+
+``Remote`` has no UAVs; its receiver gets messages late, at the root or in a group of agents.
+"""
 
 import random
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import pytest
 import torch
-from remote import (
-    ENDS,
-    GAMMA,
-    LONGEST,
-    WORLDS,
-    Case,
-    Twin,
-    both_layouts,
-    key,
-    make_env,
-    make_storage,
-    recompute_of,
-    rollout,
-    stored,
-)
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ReplayBuffer
-from torchrl.envs import Compose, GymEnv, MultiStepTransform, StepCounter, TransformedEnv
+from torchrl.data import Bounded, Composite, ReplayBuffer, Unbounded
+from torchrl.envs import Compose, EnvBase, GymEnv, MultiStepTransform, StepCounter, Transform, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.delays.laws import Uniform
@@ -31,9 +21,218 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms import (
     ActionDelay,
     CumulativeReward,
+    ObservationDelay,
     RewardDelay,
+    SampleAndHold,
     set_seed,
 )
+
+LONGEST, WORLDS, AGENTS, LIMIT = 5, 3, 2, 12
+GAMMA = 0.7
+GROUPS = [(), ("agents",)]
+ENDS = ("done", "terminated", "truncated")
+both_layouts = pytest.mark.parametrize("group", GROUPS, ids=["root", "group"])
+
+
+def key(group: tuple[str, ...], name: str) -> NestedKey:
+    return (*group, name) if group else name
+
+
+def outcome(group: tuple[str, ...], message: Tensor, elapsed: Tensor) -> dict[NestedKey, Tensor]:
+    """What a receiver concludes from messages [*, 2] or [*, N, 2] after ``elapsed`` [*, 1] steps."""
+    alarm = message[..., 1] < 0.1
+    terminated = alarm.any(-1, keepdim=True) if group else alarm.unsqueeze(-1)
+    truncated = (elapsed >= LIMIT) & ~terminated
+    steps = elapsed.unsqueeze(-1) if group else elapsed
+    return {
+        key(group, "observation"): torch.cat([3 * message, message[..., :1]], -1),
+        key(group, "reward"): message[..., 1:] + steps,
+        **dict(zip(ENDS, (terminated | truncated, terminated, truncated), strict=True)),
+    }
+
+
+class Remote(EnvBase):
+    """Each message is the sender's random number of the step, behind one that no other message has."""
+
+    def __init__(self, group: tuple[str, ...]) -> None:
+        super().__init__(batch_size=[WORLDS])
+        self.group, self.shape_of_rows = group, (WORLDS, *[AGENTS] * bool(group))
+        self.n_sent, self.elapsed = 0, torch.zeros(WORLDS, 1, dtype=torch.long)
+
+        def spec(width: int) -> Composite | Unbounded:
+            return Unbounded((*self.shape_of_rows, width))
+
+        entries = {"message": spec(2), "observation": spec(3)}
+        self.observation_spec = self._nested(entries)
+        self.observation_spec["world"] = Unbounded((WORLDS,))
+        self.reward_spec = self._nested({"reward": spec(1)})
+        self.action_spec = Bounded(0.0, 1.0, (WORLDS, 1))
+        flag = Unbounded((WORLDS, 1), dtype=torch.bool)
+        self.done_spec = Composite({name: flag.clone() for name in ENDS}, shape=[WORLDS])
+
+    def _nested(self, entries: dict[str, Any]) -> Composite:
+        inner = Composite(entries, shape=self.shape_of_rows)
+        return Composite({self.group[0]: inner}, shape=[WORLDS]) if self.group else inner
+
+    def _outputs(self, *left_out: str) -> TensorDict:
+        self.n_sent += 1
+        n_rows = torch.Size(self.shape_of_rows).numel()
+        number = (100.0 * self.n_sent + torch.arange(n_rows)).view(self.shape_of_rows)
+        message = torch.stack([number, torch.rand(self.shape_of_rows)], -1)
+        entries = {key(self.group, "message"): message, "world": torch.arange(WORLDS).float()}
+        entries |= outcome(self.group, message, self.elapsed)
+        agents = {"agents": TensorDict({}, self.shape_of_rows)} if self.group else {}
+        outputs = TensorDict(agents, [WORLDS])
+        for name, value in entries.items():
+            if name not in left_out:
+                outputs[name] = value
+        return outputs
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        self.elapsed = self.elapsed * 0 if tensordict is None else self.elapsed * ~tensordict["_reset"]
+        return self._outputs(key(self.group, "reward"), *ENDS)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.elapsed = self.elapsed + 1
+        return self._outputs()
+
+    def _set_seed(self, seed: int | None) -> None:
+        torch.manual_seed(seed or 0)
+
+
+class Receiver(Transform):
+    """Replaces the outputs by those that follow from the messages received."""
+
+    def __init__(self, group: tuple[str, ...]) -> None:
+        super().__init__()
+        self.group = group
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        held = next_tensordict[key(self.group, "received")]
+        for name, value in outcome(self.group, held, next_tensordict["step_count"]).items():
+            next_tensordict[name] = value
+        return next_tensordict
+
+
+class Case(NamedTuple):
+    """How late rewards are, how many are summed, and how slow the receiver's clock is."""
+
+    latest: int | None = None
+    window: int = 1
+    period: int = 1
+    loss: float = 0.1
+    order: str = "generation"
+
+
+def make_env(group: tuple[str, ...], case: Case = Case()) -> TransformedEnv:  # noqa: B008 (never changed)
+    """The environment with late messages and what a case says."""
+    message, received, reward = (key(group, name) for name in ("message", "received", "reward"))
+    told = {"loss": case.loss, "order": case.order, "delay_key": "delay", "seed": 3}
+    transforms = [ObservationDelay(Uniform(0, LONGEST), [message], [received], **told)]
+    transforms += [StepCounter(), Receiver(group)]
+    if case.latest is not None:
+        transforms.append(RewardDelay(Uniform(0, case.latest), reward, delay_key="reward_delay", seed=4))
+    if case.window > 1:
+        transforms.append(CumulativeReward(case.window, GAMMA, reward))
+    if case.period > 1:
+        transforms.append(SampleAndHold(case.period, [key(group, "observation")]))
+    return TransformedEnv(Remote(group), Compose(*transforms))
+
+
+def rollout(env: TransformedEnv, n_steps: int) -> TensorDictBase:
+    torch.manual_seed(1)
+    return env.rollout(n_steps, break_when_any_done=False)
+
+
+def recompute_of(group: tuple[str, ...]) -> Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]:
+    def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        entries = outcome(group, messages, steps["next", "step_count"])
+        return {next_key(name): value for name, value in entries.items()}
+
+    return recompute
+
+
+def make_storage(group: tuple[str, ...], recompute: Any = None, **options: Any) -> BackupdateStorage:
+    names = {f"{name}_key": key(group, name) for name in ("message", "received", "delay", "age")}
+    recompute = recompute or recompute_of(group)
+    return BackupdateStorage(80 * WORLDS, recompute, LONGEST, **{**names, **options})
+
+
+def stored(storage: BackupdateStorage, steps: TensorDictBase, parts: int = 1) -> TensorDictBase:
+    """Write steps [B, T] in several parts; returns them as stored, [T, B]."""
+    buffer = ReplayBuffer(storage=storage)
+    for part in steps.split(steps.shape[1] // parts, 1):
+        buffer.extend(part)
+    return storage[storage.latest()]
+
+
+class Twin:
+    """What a receiver knows of the stored steps [T, B] of one world after the last of them, step by step."""
+
+    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...], case: Case) -> None:
+        self.steps, self.group, self.T, self.case = steps[:, world], group, len(steps), case
+        self.senders = [(i,) for i in range(AGENTS)] if group else [()]
+        self.start = [t - int(self.steps["step_count"][t]) for t in range(self.T)]
+        self.newest = [[self._newest(t, row) for row in self.senders] for t in range(self.T)]
+        self.terminated, self.truncated, self.valid, over = [], [], [], False
+        for t in range(self.T):
+            over = over and t != self.start[t]
+            self.valid.append(not over)
+            elapsed = t - self.start[t] + 1
+            terminated = any(self.message(t, row)[1] < 0.1 for row in self.senders)
+            reset = bool(self.steps["next", "done"][t])
+            self.terminated.append(terminated)
+            self.truncated.append((elapsed >= LIMIT or reset) and not terminated)
+            over = over or terminated or elapsed >= LIMIT or reset
+
+    def _newest(self, t: int, row: tuple[int, ...]) -> int:
+        """The step after which the newest message was sent; the step before the episode, if at its reset."""
+        delay = self.steps[next_key(key(self.group, "delay"))]
+        arrived = [g for g in range(self.start[t], t + 1) if 0 <= delay[(g, *row)] <= self.T - 1 - g]
+        return max(arrived, default=self.start[t] - 1)
+
+    def message(self, t: int, row: tuple[int, ...]) -> list[float]:
+        g, name = self.newest[t][self.senders.index(row)], key(self.group, "message")
+        at_reset = g < self.start[t]
+        return (
+            self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
+        ).tolist()
+
+    def observation(self, t: int, row: tuple[int, ...]) -> list[float]:
+        number, draw = self.message(t, row)
+        return [3 * number, 3 * draw, number]
+
+    def reward(self, t: int, row: tuple[int, ...]) -> float:
+        return self.message(t, row)[1] + t - self.start[t] + 1
+
+    def paid(self, t: int, row: tuple[int, ...]) -> bool:
+        """Has the reward that step t earned been received by the last step."""
+        if self.case.latest is None:
+            return True
+        delay = int(self.steps[next_key(key(self.group, "reward_delay"))][(t, *row)])
+        for later in range(t, self.T):
+            if self.start[later] != self.start[t]:
+                return False
+            if later - t >= delay or self.steps["next", "done"][later]:
+                return True
+        return False
+
+    def summed(self, t: int, row: tuple[int, ...]) -> float:
+        """The reward after the step: eq. 4 of the rewards that have been received."""
+        latest = range(max(self.start[t], t - self.case.window + 1), t + 1)
+        return sum(GAMMA ** (t - g) * self.reward(g, row) for g in latest if self.paid(g, row))
+
+    def held(self, t: int, row: tuple[int, ...]) -> list[float]:
+        """The observation after the step: that of the latest tick, or of the reset."""
+        tick = t - (t - self.start[t] + 1) % self.case.period
+        if tick < self.start[t]:
+            return self.steps[key(self.group, "observation")][(self.start[t], *row)].tolist()
+        return self.observation(tick, row)
+
+    def held_before(self, t: int, row: tuple[int, ...]) -> list[float]:
+        if t == self.start[t]:
+            return self.steps[key(self.group, "observation")][(t, *row)].tolist()
+        return self.held(t - 1, row)
 
 
 def random_case(rng: random.Random) -> Case:
@@ -143,11 +342,6 @@ def test_late_rewards_alone_are_credited_in_any_environment(window):
     assert after["valid"].all()
 
 
-def test_a_reward_delay_that_does_not_tell_its_delays_is_refused():
-    with pytest.raises(InputError, match="RewardDelay: back-updating needs each delay"):
-        corrections_of(Compose(ActionDelay(2), RewardDelay(2)), ["reward"])
-
-
 @both_layouts
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(group, order):
@@ -208,59 +402,62 @@ def test_the_ends_stay_if_recompute_returns_none(group):
 
 # Mistakes.
 
-
-@pytest.mark.parametrize(
-    ("name", "other", "message"),
-    [
-        ("message", "none", r"message_key: \('next', 'none'\) is not in the steps"),
-        ("step_count", "none", r"step_count_key: none is not in the steps: StepCounter\(\) writes it"),
-    ],
-)
-def test_a_missing_or_misshapen_entry_is_one_line(name, other, message):
-    with pytest.raises(InputError, match=message):
-        stored(make_storage((), **{f"{name}_key": other}), rollout(make_env(()), 8))
+NAMES = {f"{name}_key": name for name in ("message", "received", "delay", "age")}
+LEAST = (8 + 2 * LONGEST) * WORLDS
+"""The least size of a storage of batches of 8 steps."""
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda entries: entries | {("next", "success"): entries["next", "reward"]},
-            "is not an entry after the steps",
-        ),
-        (lambda entries: {("next", "done"): entries["next", "done"]}, "are returned in part"),
-    ],
-)
-def test_a_mistake_in_recompute_is_one_line(change, message):
-    storage = make_storage((), lambda *arguments: change(recompute_of(())(*arguments)))
-    with pytest.raises(InputError, match=f"recompute: .*{message}"):
-        stored(storage, rollout(make_env(()), 8))
+def recomputing(change: Callable[[Any], Any]) -> BackupdateStorage:
+    """A storage whose ``recompute`` returns something else."""
+    return make_storage((), lambda *arguments: change(recompute_of(())(*arguments)))
 
 
-def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused():
-    steps, storage = rollout(make_env(()), 8), make_storage(())
-    with pytest.raises(InputError, match="step_count grows from world to world"):
-        stored(make_storage(()), steps.transpose(0, 1))
-    stored(storage, steps)
-    for batch in (steps.transpose(0, 1), steps[:2]):
-        with pytest.raises(InputError, match=r"steps: a batch of shape \[.*\] is not one of 3 worlds: give"):
-            stored(storage, batch)
-    with pytest.raises(InputError, match=r"steps: a batch of shape \[24\] is not \[T, B\]"):
-        storage.set(range(24), steps.reshape(-1))
-    with pytest.raises(InputError, match="longest: -1 steps is not at least 0 steps"):
-        BackupdateStorage(10, recompute_of(()), -1)
+def extend_twice(first: TensorDictBase, second: TensorDictBase) -> None:
+    storage = make_storage(())
+    stored(storage, first)
+    stored(storage, second)
 
 
-def test_a_storage_holds_a_batch_and_twice_the_longest_delay_or_is_refused():
-    steps, least = rollout(make_env(()), 8), 8 + 2 * LONGEST
-    names = {f"{name}_key": name for name in ("message", "received", "delay", "age")}
-    stored(BackupdateStorage(least * WORLDS, recompute_of(()), LONGEST, **names), steps)
-    with pytest.raises(InputError, match=f"{least} steps of {WORLDS} worlds need {least * WORLDS}"):
-        stored(BackupdateStorage((least - 1) * WORLDS, recompute_of(()), LONGEST, **names), steps)
-
-
-def test_steps_that_a_transform_has_joined_are_refused():
+def extend_joined(steps: TensorDictBase) -> None:
     n_step = MultiStepTransform(n_steps=3, gamma=0.9)
-    buffer = ReplayBuffer(storage=make_storage(()), transform=n_step, batch_size=4)
-    with pytest.raises(InputError, match="MultiStepTransform joins steps before they are corrected"):
-        buffer.extend(rollout(make_env(()), 20))
+    ReplayBuffer(storage=make_storage(()), transform=n_step, batch_size=4).extend(steps)
+
+
+REFUSED: dict[str, Callable[[TensorDictBase], Any]] = {
+    r"message_key: \('next', 'none'\) is not in the steps": lambda steps: stored(
+        make_storage((), message_key="none"), steps
+    ),
+    r"step_count_key: none is not in the steps: StepCounter\(\) writes it": lambda steps: stored(
+        make_storage((), step_count_key="none"), steps
+    ),
+    "recompute: .*is not an entry after the steps": lambda steps: stored(
+        recomputing(lambda entries: entries | {("next", "success"): entries["next", "reward"]}), steps
+    ),
+    "recompute: .*are returned in part": lambda steps: stored(
+        recomputing(lambda entries: {("next", "done"): entries["next", "done"]}), steps
+    ),
+    "step_count grows from world to world": lambda steps: stored(make_storage(()), steps.transpose(0, 1)),
+    r"steps: a batch of shape \[.*\] is not one of 3 worlds": lambda steps: extend_twice(steps, steps[:2]),
+    r"steps: a batch of shape \[24\] is not \[T, B\]": lambda steps: make_storage(()).set(
+        range(24), steps.reshape(-1)
+    ),
+    "MultiStepTransform joins steps before they are corrected": extend_joined,
+    "longest: -1 steps is not at least 0 steps": lambda _: BackupdateStorage(10, recompute_of(()), -1),
+    "longest: 2 steps, but a message takes 5 steps": lambda steps: stored(
+        BackupdateStorage(LEAST, recompute_of(()), 2, **NAMES), steps
+    ),
+    f"of {WORLDS} worlds need {LEAST}": lambda steps: stored(
+        BackupdateStorage(LEAST - 1, recompute_of(()), LONGEST, **NAMES), steps
+    ),
+    "RewardDelay: back-updating needs each delay": lambda _: corrections_of(
+        Compose(ActionDelay(2), RewardDelay(2)), ["reward"]
+    ),
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_a_mistake_is_one_line(line):
+    steps = rollout(make_env(()), 8)
+    stored(BackupdateStorage(LEAST, recompute_of(()), LONGEST, **NAMES), steps)  # which is large enough
+    with pytest.raises(InputError, match=line):
+        REFUSED[line](steps)

@@ -20,7 +20,7 @@ from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
-from damian.envs.episode_totals import EpisodeTotals
+from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.replay.backupdate import BackupdateStorage

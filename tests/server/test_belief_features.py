@@ -9,7 +9,7 @@ from helpers import everything, square, walking
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.envs.uav_env import make_server, make_simulation
+from damian.envs.uav_env import UavEnv
 from damian.server.belief import predict
 from damian.server.features import BELIEF_RINGS, BELIEF_SECTORS, ObservationConfig, feature
 
@@ -24,9 +24,8 @@ def believing(own: bool = False, **changed) -> ScenarioConfig:
 @pytest.fixture(scope="module")
 def flown():
     """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K] of worlds in several regions."""
-    scenario = believing()
-    simulation = make_simulation(scenario, 0)
-    server = make_server(scenario, simulation)
+    env = UavEnv(believing(), messages_only=True)
+    simulation, server = env.simulation, env.server
     messages, steps = simulation.initial.sent, simulation.initial.steps
     torch.manual_seed(0)
     weight = torch.rand(len(steps), server.grid.prior.shape[-1]).square() * (

@@ -7,7 +7,7 @@ from torch import Tensor
 from twin import GLOBAL, LOCAL
 
 from damian.common.tensors import tree_map
-from damian.envs.uav_env import make_server, make_simulation
+from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages
@@ -21,13 +21,13 @@ def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=30.0, initial_conditions=16)
     observation = ObservationConfig(local_features=LOCAL, global_features=GLOBAL, own=True, age=True)
     scenario = everything(agents=n_agents, region=region, observation=observation)
-    simulation = make_simulation(scenario, 0)
+    env = UavEnv(scenario, messages_only=True)
     generator = torch.Generator().manual_seed(n_agents)
 
     def draw(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(B, n_agents, n_agents, *shape, generator=generator)
 
-    point = draw(0, len(simulation.points), 2).long()
+    point = draw(0, len(env.simulation.points), 2).long()
     known = Messages.blank(point)._replace(
         time=draw(0, 20).round(),
         position=draw(-100, 100, 2),
@@ -37,11 +37,7 @@ def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
         detected_time=draw(-10, 20).round().clamp(min=-1),
         detected_position=draw(-100, 100, 2),
     )
-    return (
-        make_server(scenario, simulation),
-        known,
-        torch.tensor([20, 30, 40]),
-    )
+    return env.server, known, torch.tensor([20, 30, 40])
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 5])

@@ -9,7 +9,7 @@ from belief_twin import belief, chance_at
 from helpers import everything, square, walking
 from torch import Tensor
 
-from damian.envs.uav_env import make_simulation
+from damian.envs.uav_env import UavEnv
 from damian.server.belief import (
     SourceGrid,
     _advance,
@@ -28,7 +28,7 @@ LONGEST = 4
 def make_grid(emission: float = 0.6, moves: bool = True, regions: int = 1) -> SourceGrid:
     """A small grid, over one or several regions."""
     emits = {"emission": "per_step", "emission_probability": emission}
-    airspace = make_simulation(square() if regions == 1 else everything(), 0).airspace
+    airspace = UavEnv(square() if regions == 1 else everything()).simulation.airspace
     source = walking(**emits) if moves else SourceConfig(**emits)
     return build_source_grid(airspace, source, radius=50.0, dt=1.0, cell=45.0)
 

@@ -3,20 +3,43 @@
 import pytest
 import torch
 from contract import Servos
-from plain_env import GROUP, Plain
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    MultiOneHot,
-    OneHot,
-    TensorSpec,
-)
-from torchrl.envs import TransformedEnv
-from transform_cases import ACTION
+from delay_twin import ACTION
+from tensordict import TensorDictBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, MultiOneHot, OneHot, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
 
 from damian.delays.laws import Uniform
 from damian.transforms import ActionDelay, ActionHistory
+
+GROUP = (3, 2)
+"""Worlds, and agents in each of them."""
+
+
+class Plain(EnvBase):
+    """Three worlds of two agents, whose actions, of any spec [3, 2, ...], have no effect."""
+
+    def __init__(self, action: TensorSpec) -> None:
+        super().__init__(batch_size=torch.Size(GROUP[:1]))
+        self.action_spec = self._agents(action=action)
+        self.observation_spec = self._agents(observation=Unbounded((*GROUP, 4)))
+        self.reward_spec = self._agents(reward=Unbounded((*GROUP, 1)))
+
+    def _agents(self, **specs: TensorSpec) -> Composite:
+        return Composite(agents=Composite(**specs, shape=GROUP), shape=self.batch_size)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+        return self.observation_spec.zero()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return (
+            self.observation_spec.zero()
+            .update(self.full_reward_spec.zero())
+            .update(self.full_done_spec.zero())
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """The environment has no randomness."""
+
 
 HISTORY = ("agents", "action_history")
 

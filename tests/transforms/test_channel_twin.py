@@ -1,29 +1,149 @@
 """Messages between agents do what an obvious program does, which follows one link at a time."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
 import pytest
 import torch
-from channel_twin import World, check_against_twin, table, turn
-from delay_twin import Counting
-from environments import petting_zoo, vmas
+from contract import petting_zoo, vmas
+from delay_twin import Counting, drawn
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs.utils import check_env_specs, step_mdp
 
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Law, Trace, Uniform
+from damian.delays.laws import Burst, Law, Trace, Uniform, law_of, sampler_of
 from damian.delays.samplers import ContextSampler, MessageContext
 from damian.transforms import Channel
 
 N, WORLDS, STEPS = 3, [3, 5, 8], 25
 CLOCKS = 2 * STEPS + 2
 ALL = set(permutations(range(N), 2))
+
+Link = tuple[int, int]
+"""Receiver and sender."""
+
+
+class World:
+    """Agents that send to each other.
+
+    Args:
+        n_agents: number of agents, N.
+        delay: delay of what is sent on a link at a clock [steps], None if it is lost.
+        limit: number of agents that may send in a step.
+        turn: who may send first at a clock: the agent with the smallest number.
+        known: does everyone know everyone's first message.
+        own_at_reset: is there an own message at the reset.
+    """
+
+    def __init__(
+        self,
+        n_agents: int,
+        delay: Callable[[int, Link, int], int | None],
+        limit: int | None = None,
+        turn: Callable[[int, int], tuple] | None = None,
+        known: bool = False,
+        own_at_reset: bool = True,
+    ) -> None:
+        self.agents, self.delay, self.limit = range(n_agents), delay, limit
+        self.turn, self.known, self.own_at_reset = turn, known, own_at_reset
+        self.clock, self.began = 0, 0
+
+    def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
+        """Send on the wanted links, and receive."""
+        self.clock += 1
+        if begins:
+            self.began, self.in_transit, self.holds = self.clock, [], {}
+        senders = [*{sender for _, sender in wanted}]
+        if self.limit is not None:
+            senders = sorted(senders, key=lambda sender: self.turn(self.clock, sender))[: self.limit]
+        for link in wanted:
+            delay = self.delay(self.clock, link, len(senders)) if link[1] in senders else None
+            if delay is not None:
+                self.in_transit.append((self.clock + delay, link, self.clock, contents[link[1]]))
+        for arrives, link, sent, content in self.in_transit:
+            if arrives == self.clock and (link not in self.holds or self.holds[link][0] < sent):
+                self.holds[link] = (sent, content)
+        if begins and self.known:
+            self.holds = {(i, j): (self.clock, contents[j]) for i in self.agents for j in self.agents}
+        self.own = contents
+
+    def seen(self, receiver: int, sender: int, zeros: Any) -> tuple[Any, int, bool]:
+        """Content and age of what a receiver holds of a sender, and whether it holds anything."""
+        since = self.clock - self.began
+        if receiver == sender:
+            return (self.own[sender], 0, True) if since or self.own_at_reset else (zeros, 0, False)
+        if (receiver, sender) not in self.holds:
+            return zeros, since, False
+        sent, content = self.holds[receiver, sender]
+        return content, self.clock - sent, True
+
+
+Wants = Callable[[TensorDictBase, TensorDictBase | None, int], Collection[Link]]
+"""The links on which a world wants to send, from the outputs, from the inputs (None at a reset)."""
+
+
+def check_against_twin(
+    env: TransformedEnv,
+    make: Callable[[int, Tensor], World],
+    wants: Wants,
+    forced: Callable[[int], list[int]] = lambda _: [],
+    sent: Any = ("agents", "observation"),
+) -> None:
+    """Compare every output of a rollout with partial resets with that of the twins.
+
+    Args:
+        env: environment with one ``Channel``.
+        make: the twin of a world, given its number and the channel's random streams.
+        wants: which links carry a message.
+        forced: worlds to reset after a step, beside those that are done.
+        sent: key of what is sent, among the outputs, or among the inputs of a step.
+    """
+    torch.manual_seed(0)
+    td, worlds = env.reset(), range(env.batch_size[0])
+    twins = [make(b, env.transform[-1].memory["streams"]) for b in worlds]
+
+    def follow(outputs: TensorDictBase, inputs: TensorDictBase | None, mask: list[bool]) -> None:
+        source = outputs if sent in outputs.keys(True) else inputs
+        for b in worlds:
+            if mask[b]:
+                no_content = [[0.0]] * len(twins[b].agents)
+                contents = source[sent][b].tolist() if source is not None else no_content
+                twins[b].step(contents, wants(outputs, inputs, b), begins=inputs is None)
+            assert_same(twins[b], outputs[b])
+
+    follow(td, None, [True] * len(worlds))
+    for t in range(STEPS):
+        td = env.rand_action(td)
+        stepped = env.step(td)
+        follow(stepped["next"], stepped, [True] * len(worlds))
+        td = step_mdp(stepped)
+        mask = td["done"].view(-1).tolist()
+        mask = [done or b in forced(t) for b, done in enumerate(mask)]
+        if any(mask):
+            td = env.reset(td.set("_reset", torch.tensor(mask).unsqueeze(-1)))
+            follow(td, None, mask)
+
+
+def assert_same(twin: World, outputs: TensorDictBase) -> None:
+    """The messages that each agent has received from each other one are those of the twin."""
+    got = [outputs["agents", name].tolist() for name in ("received", "received_age", "received_mask")]
+    zeros = [0.0] * len(got[0][0][0])
+    for i in twin.agents:
+        for j in twin.agents:
+            assert tuple(part[i][j] for part in got) == tuple(twin.seen(i, j, zeros)), (i, j)
+
+
+def table(law: Any, streams: Tensor, n_steps: int, loss: float = 0.0) -> Callable[[int, int], int | None]:
+    """The delay that a law draws at a clock for a row; None if the message is lost."""
+    sampler = sampler_of(law_of(law), loss=loss)
+    delays = drawn(sampler, streams, n_steps).tolist()
+    return lambda clock, row: None if (d := delays[clock - 1][row]) == sampler.lost else d
 
 
 def counting(channel: Channel, **options: Any) -> TransformedEnv:
@@ -42,7 +162,8 @@ def twin_of(law: Any, loss: float = 0.0, **rules: Any) -> Callable[[int, Tensor]
         delays = table(law, streams, CLOCKS, loss)
 
         def order(clock: int, sender: int) -> tuple:
-            return turn(streams[b * N * N + (N - 1) * N + sender], clock, sender)
+            stream = streams[b * N * N + (N - 1) * N + sender]
+            return int(counter_rng.bits(stream, *map(torch.tensor, (clock, 4, sender)))), sender
 
         def delay(clock: int, link: tuple, _: int) -> int | None:
             return delays(clock, b * N * N + link[0] * N + link[1])

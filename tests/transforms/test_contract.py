@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import io
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,10 +13,12 @@ import torch
 from contract import (
     CASES,
     GROUPS,
+    KINDS,
     LATE,
     PAIRS,
     TRANSFORMS,
     Case,
+    Kind,
     begun,
     cartpole,
     drawing,
@@ -25,12 +26,10 @@ from contract import (
     memory,
     observation_delay,
     onward,
-    played,
     uavs,
     unserved,
 )
-from environments import KINDS, Kind
-from helpers import all_same, same
+from helpers import all_same, same, saved_and_loaded
 from streams import check_independent
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, Transform, TransformedEnv
@@ -181,14 +180,6 @@ def test_in_the_middle_of_an_episode_no_other_state_is_loaded(case):
     assert all_same(onward(env, td.clone()), onward(twin, td.clone()))
 
 
-def saved_and_loaded(state):
-    """A state after it was saved to a file and loaded from it."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
 # Graphs.
 
 
@@ -297,8 +288,10 @@ IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
 
 @pytest.mark.parametrize("kind", GROUPS.values(), ids=GROUPS)
 def test_a_channel_without_delay_shows_current_messages_and_changes_nothing_else(kind):
-    undelayed = played(kind.make(), kind)
-    delayed = played(TransformedEnv(kind.make(), Channel(0, kind.observation)), kind)
+    undelayed, delayed = (
+        onward(env, begun(env, 0), 8)
+        for env in (kind.make(), TransformedEnv(kind.make(), Channel(0, kind.observation)))
+    )
     group = kind.observation[0]
     for td, other in zip(delayed, undelayed, strict=True):
         assert same(td.select(*other.keys(True, True)), other)
@@ -312,10 +305,8 @@ def test_a_channel_without_delay_shows_current_messages_and_changes_nothing_else
 @every_kind
 @pytest.mark.parametrize("identity", IDENTITIES.values(), ids=IDENTITIES)
 def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(kind, identity):
-    undelayed = played(kind.make(), kind)
-    transform = identity(kind)
-    env = TransformedEnv(kind.make(), transform)
-    delayed = played(env, kind)
+    envs = (kind.make(), TransformedEnv(kind.make(), identity(kind)))
+    undelayed, delayed = (onward(env, begun(env, 0), 8) for env in envs)
     pairs = zip(delayed, undelayed, strict=True)
     assert all_same([td.select(*other.keys(True, True)) for td, other in pairs], undelayed)
 

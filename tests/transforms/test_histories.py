@@ -4,10 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 import torch
-from delay_twin import Counting, last_actions, looking_back
-from helpers import play
-from tensordict import TensorDictBase
-from transform_cases import (
+from delay_twin import (
     ACTION,
     LAWS,
     N_AGENTS,
@@ -16,20 +13,17 @@ from transform_cases import (
     ROWS,
     STEPS,
     WORLDS,
+    Counting,
     after,
     before,
     choices,
     column,
     delayed,
 )
+from helpers import play
+from tensordict import TensorDictBase
 
-from damian.transforms import (
-    ActionHistory,
-    CumulativeReward,
-    ObservationDelay,
-    RewardDelay,
-    SampleAndHold,
-)
+from damian.transforms import ActionHistory, CumulativeReward, ObservationDelay, RewardDelay, SampleAndHold
 
 
 @pytest.fixture(params=LAWS)
@@ -58,7 +52,8 @@ def test_the_cumulative_reward_equals_equation_4(steps, gamma):
         episode = []
         for t in range(STEPS):
             episode.append(earned[t][w][n][0])
-            assert found[t][w][n][0] == looking_back(episode, steps, gamma)
+            latest = episode[::-1][:steps]
+            assert found[t][w][n][0] == sum(gamma**age * reward for age, reward in enumerate(latest))
             episode = [] if done[t][w][0] else episode
 
 
@@ -101,9 +96,10 @@ def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_
         recorded = []
         for t in range(STEPS):
             recorded += [chosen[t][w, n].item()] * (recorded_key is None or ready[t][w][n])
-            assert found[2 * t + 1, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
-            recorded = [] if done[t][w][0] else recorded
-            assert found[2 * t + 2, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
+            for at in (2 * t + 1, 2 * t + 2):  # after the step, and after a reset
+                latest = [*[default] * steps, *recorded][-steps:]
+                assert found[at, w, n].equal(torch.tensor(latest) / 6)
+                recorded = [] if done[t][w][0] else recorded
 
 
 @pytest.mark.sample(2)
@@ -123,7 +119,7 @@ def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_
         recorded: list[tuple[int, int]] = []
         for t in range(STEPS):
             recorded += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
-            latest = last_actions(recorded, 3, (-STEPS, default))
+            latest = [*[(-STEPS, default)] * 3, *recorded][-3:]
             since = t + 1 - ages[2 * t + 1][w][n][0]  # when the observation was generated
             expected = [action if since - at < reflected_after else default for at, action in latest]
             assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)

@@ -2,18 +2,10 @@
 
 import pytest
 import torch
-from contract import ACTION, LATE, OBSERVATION, Drift
+from contract import ACTION, LATE, OBSERVATION, Drift, uavs
 from delay_twin import Counting
-from plain_env import Plain
 from tensordict import TensorDict
-from torchrl.envs import (
-    Compose,
-    ConditionalSkip,
-    GymEnv,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, ConditionalSkip, GymEnv, StepCounter, Transform, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.transforms import (
@@ -49,7 +41,7 @@ IN_USE = {
 @pytest.mark.parametrize("transforms", IN_USE.values(), ids=IN_USE)
 def test_an_entry_that_there_is_already_is_not_replaced(transforms):
     with pytest.raises(InputError, match="is already an entry of the environment: choose another name"):
-        TransformedEnv(Plain(), Compose(*transforms())).rollout(3)
+        TransformedEnv(uavs(), Compose(*transforms())).rollout(3)
 
 
 MISTAKES = {

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 import torch
-from delay_twin import Counting
-from environments import vmas
+from contract import vmas
+from delay_twin import ACTION, OBSERVATION, REWARD, WORLDS, Counting
 from helpers import same
 from tensordict import TensorDictBase
 from torchrl.envs import (
@@ -19,7 +19,6 @@ from torchrl.envs import (
     Transform,
     TransformedEnv,
 )
-from transform_cases import ACTION, OBSERVATION, REWARD, STEPS, WORLDS
 
 from damian.delays.laws import Uniform
 from damian.transforms import (
@@ -71,11 +70,6 @@ def collect(env: EnvBase, n_steps: int = 30) -> TensorDictBase:
     return env.rollout(n_steps, break_when_any_done=False)
 
 
-def counted(n_steps: int = STEPS, **options: Any) -> TensorDictBase:
-    """Steps of ``Counting``, [B, T]."""
-    return collect(Counting(WORLDS, **options), n_steps)
-
-
 @pytest.mark.sample(5)
 @pytest.mark.parametrize("chain", CHAINS)
 @pytest.mark.parametrize("kind", KINDS)
@@ -94,7 +88,7 @@ def test_stored_steps_are_delayed_as_in_the_environment(kind, chain):
 
 
 def test_the_number_of_the_trajectory_tells_where_an_episode_begins():
-    data = counted(8, ends=0.0)
+    data = collect(Counting(WORLDS, ends=0.0), 8)
     again = torch.arange(8).expand(len(WORLDS), 8) == torch.tensor([2, 3, 4, 9]).unsqueeze(-1)
     data = data.set(("collector", "traj_ids"), again.long().cumsum(-1))
     ages = delay_trajectories(data, ObservationDelay(2, [OBSERVATION]))["agents", "age"]
