@@ -11,7 +11,7 @@ RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
 .PHONY: train test test-order test-deep test-slow test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick fleet benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
-	$(VENV)/bin/damian train scenario=delaybench/crowded "delay.obs={law: uniform, low: 1, high: 7}" aware=timeline \
+	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
 	  frames=1000000 hydra.run.dir=$(RUN) $(ARGS)
 	$(VENV)/bin/damian evaluate checkpoint=$(RUN) delay.obs=2 # which it was not trained for
 
