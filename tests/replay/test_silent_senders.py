@@ -1,10 +1,8 @@
 """Back-updating where a sender is silent for longer than any message takes, as a UAV in flight is."""
 
-import torch
 from helpers import square
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import ReplayBuffer
 
 from damian import keys
 from damian.delays.config import DelayConfig
@@ -13,59 +11,9 @@ from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.train import learning_env, replay_buffer
-from damian.replay.backupdate import BackupdateStorage
 from damian.runs.config import LoggerConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.motion import MotionConfig
-
-LONGEST = 3
-
-
-def silent_steps(n: int, delay: dict[int, int], held: list[int]) -> TensorDictBase:
-    """Steps [1, n] of one sender, whose message of step t is t, without an end.
-
-    Args:
-        n: number of steps.
-        delay: delay of each message by its step; the others are not sent.
-        held: the message that the receiver holds after each step.
-    """
-    t, false = torch.arange(n).view(1, n, 1), torch.zeros(1, n, 1, dtype=torch.bool)
-    received = torch.tensor(held).view(1, n, 1)
-    after = {
-        "message": t.float(),
-        "received": received.float(),
-        "delay": torch.tensor([delay.get(step, -1) for step in range(n)]).view(1, n, 1),
-        "age": (t - received).float(),
-        "reward": torch.zeros(1, n, 1),
-        **dict.fromkeys(("done", "terminated", "truncated"), false),
-    }
-    return TensorDict({"step_count": t, "next": TensorDict(after, [1, n])}, [1, n])
-
-
-def storage() -> tuple[BackupdateStorage, ReplayBuffer]:
-    """A storage in which the reward becomes the newest message known."""
-    names = {"message_key": "message", "received_key": "received", "delay_key": "delay", "age_key": "age"}
-    kept = BackupdateStorage(
-        60, lambda _, messages: {("next", "reward"): messages}, LONGEST, hindsight_key="hindsight", **names
-    )
-    return kept, ReplayBuffer(storage=kept)
-
-
-def entry(kept: BackupdateStorage, key: NestedKey = ("next", "reward")) -> list[float]:
-    """The numbers of an entry at the stored steps, in order of time."""
-    return kept[kept.latest()][key].flatten().tolist()
-
-
-def test_an_older_message_that_arrives_last_never_replaces_a_newer_one():
-    # The message of step 2 arrives in step 3, that of step 1 in step 4, and then none is sent.
-    steps = silent_steps(20, {0: 0, 1: 3, 2: 1}, [0, 0, 0, 2, *[1] * 16])
-    kept, buffer = storage()
-    for part in steps.split(2, 1):
-        buffer.extend(part)
-    assert entry(kept) == [0.0, 1.0, *[2.0] * 18]
-    # Every stored reward is 0, so that each message but the first one changes it.
-    assert entry(kept, "backupdated") == [False, *[True] * 19]
-    assert entry(kept, "hindsight_age") == [0, 0, *range(18)]
 
 
 def truth(env, steps: TensorDictBase) -> Tensor:

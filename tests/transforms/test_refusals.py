@@ -12,7 +12,6 @@ from damian.transforms import (
     ActionDelay,
     ActionHistory,
     Channel,
-    CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
@@ -94,11 +93,6 @@ WRONG = {
     "a time limit after a reward delay": (lambda: RewardDelay(2), lambda: StepCounter(max_steps=5)),
     "skipped steps before a delay": (lambda: ConditionalSkip(lambda td: td["done"]), delay),
 }
-RIGHT = {
-    "a history after an action delay": (lambda: ActionDelay(LATE), lambda: ActionHistory(2)),
-    "a history that appends after a delay": (delay, appending),
-    "sums of delayed rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
-}
 
 
 @pytest.mark.parametrize("nested", [False, True])
@@ -111,9 +105,3 @@ def test_a_wrong_order_of_transforms_is_refused(pair, nested):
         env = TransformedEnv(Drift(), Compose(one, other))
     with pytest.raises(InputError, match=r"order of transforms: .* must come after"):
         env.reset()
-
-
-@pytest.mark.parametrize("pair", RIGHT.values(), ids=RIGHT)
-def test_a_right_order_of_transforms_works(pair):
-    env = TransformedEnv(Drift(), Compose(*(make() for make in pair)))
-    assert env.rollout(6, break_when_any_done=False).shape == (3, 6)
