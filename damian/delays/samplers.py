@@ -160,11 +160,7 @@ _ROUNDING = 1e-10
 
 
 class Recorded(Sampler):
-    """Plays back recorded delays [steps], -1 if lost; a sender starts at a random one. Its state is the next.
-
-    A worked timeline of the delays 3 and 0: a sender that starts at the second sends at t = 0 what arrives at
-    once, and at t = 1 what arrives at t = 4.
-    """
+    """Plays back recorded delays [steps], -1 if lost, from a random one on; the state is the next one."""
 
     _delays: Tensor
 
@@ -188,12 +184,9 @@ class Recorded(Sampler):
 
 
 class HeldSampler(Sampler):
-    """Gives every message the longest delay of another sampler, as if it were held back until then.
+    """Holds every message back until the longest delay of another sampler, which loses the same messages.
 
-    Methods for constant delays then work with random ones. The same messages are lost.
-
-    A worked timeline, of a uniform delay of 0 to 3 steps: a message sent at t = 0 that draws 1 is there at
-    t = 1, is held back, and counts as arrived at t = 3.
+    Methods for constant delays then work with random ones.
     """
 
     def __init__(self, drawn: Sampler) -> None:
@@ -315,9 +308,6 @@ class LinkSampler(Sampler):
     Links are numbered receiver * N + sender; message m of the M of a step belongs to link m modulo N * N.
     Every distinct law has one sampler, which draws for all links. The states of all samplers lie side by
     side, [M, S].
-
-    A worked timeline: the link from agent 0 to agent 1 has a constant delay of 3 steps, the link to agent 2
-    one of 1 step. What agent 0 sends at t = 0 arrives at agent 2 at t = 1, and at agent 1 at t = 3.
     """
 
     _law_index: Tensor

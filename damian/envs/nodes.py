@@ -76,7 +76,7 @@ class ServerNode(_Node):
     Args:
         server: server node that does the computations.
         message_key: key of the packed messages that the server holds, [B, N, M].
-        dropped_keys: keys of entries to remove, because nothing reads them later and each one costs time.
+        dropped_keys: as in ``WorldTransform``.
         reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
     """
 
@@ -200,15 +200,13 @@ class Belief(WorldTransform):
         return window._asdict(), self._written(beliefs)
 
     def _written(self, beliefs: Beliefs) -> Entries:
-        """The entries to write."""
         own: Entries = {keys.OWN_BELIEF: self.from_rows(beliefs.own)} if self.own else {}
         return {keys.BELIEF: self.from_rows(beliefs.server), **own}
 
     @property
     def grid(self) -> SourceGrid:
-        """The grid of the server."""
-        if self.server.grid is None:
-            raise RuntimeError("the server has no grid, because no feature reads the belief")
+        """The grid of the server, which it has if a feature reads the belief."""
+        assert self.server.grid is not None
         return self.server.grid
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
