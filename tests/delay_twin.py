@@ -130,11 +130,7 @@ class Counting(EnvBase):
     N_ACTIONS = 7
 
     def __init__(
-        self,
-        worlds: Sequence[int],
-        n_agents: int = 2,
-        continuous: bool = False,
-        ends: float = 0.15,
+        self, worlds: Sequence[int], n_agents: int = 2, continuous: bool = False, ends: float = 0.15
     ) -> None:
         super().__init__(batch_size=[len(worlds)])
         self.names, self.n_agents, self.ends, self.total = torch.tensor(worlds), n_agents, ends, 0

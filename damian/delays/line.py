@@ -91,11 +91,7 @@ class DelayLine:
         return memory, Delivery(values, zero, zero == 0, zero)
 
     def step(
-        self,
-        memory: Memory,
-        values: list[Tensor],
-        sent: Tensor | None,
-        context: MessageContext | None = None,
+        self, memory: Memory, values: list[Tensor], sent: Tensor | None, context: MessageContext | None = None
     ) -> tuple[Memory, Delivery]:
         """Send ``values`` [M, ...] of the senders ``sent`` [M] (None: all), and deliver what arrives now."""
         clock, generated_at = memory["clock"] + 1, memory["generated_at"]

@@ -21,10 +21,7 @@ _TRAJECTORY = ("collector", "traj_ids")
 
 @torch.no_grad()
 def delay_trajectories(
-    data: TensorDictBase,
-    transform: Transform,
-    *,
-    action_spec: TensorSpec | None = None,
+    data: TensorDictBase, transform: Transform, *, action_spec: TensorSpec | None = None
 ) -> TensorDictBase:
     """Apply transforms to stored steps, as if the environment had had them when the steps were collected.
 

@@ -28,9 +28,7 @@ from delay_twin import (
     drawn,
     twin_delay,
 )
-from delay_twin import (
-    LAWS as TABLES,
-)
+from delay_twin import LAWS as TABLES
 from delayed_envs import choices as uav_choices
 from helpers import everything, play
 

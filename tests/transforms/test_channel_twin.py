@@ -182,13 +182,7 @@ def test_messages_arrive_as_their_law_says(law, known):
 
 @pytest.mark.parametrize("limit", [1, 2])
 def test_a_limit_and_a_flag_choose_who_sends(limit):
-    channel = Channel(
-        Uniform(0, 3),
-        limit=limit,
-        sent_key="message_sent",
-        loss=0.1,
-        known_at_reset=True,
-    )
+    channel = Channel(Uniform(0, 3), limit=limit, sent_key="message_sent", loss=0.1, known_at_reset=True)
 
     def wants(outputs: Any, _: Any, b: int) -> set:
         sent = outputs["agents", "message_sent"][b]
