@@ -32,10 +32,8 @@ class ScenarioDelays:
             "links.delay": self.links,
         }
         for key, sampler in laws.items():
-            known = [
-                *CONTEXT_KEYS,
-                *["receiver_position"] * (key == "links.delay" and links.kind == "matrix"),
-            ]
+            told_receiver = key == "links.delay" and links.kind == "matrix"
+            known = [*CONTEXT_KEYS, *["receiver_position"] * told_receiver]
             for name in sampler.reads:
                 problem = f"reads {name}, but a law can read only {', '.join(known)}"
                 checks.require(name in known, key, type(sampler).__name__, problem)

@@ -36,11 +36,6 @@ class WorldTransform(StatefulTransform):
     def row_key(self) -> NestedKey:
         return keys.DONE
 
-    @property
-    def created_keys(self) -> Sequence[NestedKey]:
-        # A node writes again what the environment has written.
-        return [] if self.stage == "server" else super().created_keys
-
     def _write(self, tensordict: TensorDictBase, change: Change) -> TensorDictBase:
         written = super()._write(tensordict, change)
         for key in self.dropped_keys:
@@ -57,6 +52,7 @@ class _Node(WorldTransform):
     """Base class of nodes that count the steps of an episode."""
 
     stage = "server"
+    created_keys = ()  # type: ignore[assignment]  # a node writes again what the environment has written
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         device = tensordict.get(self.in_keys[0]).device
