@@ -200,3 +200,12 @@ def test_rewards_of_any_scale_teach_the_same_if_values_are_normalised(case, adva
         spread = max((other - end).abs().max() for other in others) / moved
         assert moved > 1e-3
         assert spread < 1e-2 if normalize else spread > 5e-2
+
+
+def test_the_entropy_bonus_goes_linearly_to_its_end_over_the_frames_of_the_run():
+    env, _, batch = flown("discrete")
+    config = MappoConfig(epochs=1, minibatches=2, entropy_coeff=0.4, entropy_coeff_end=0.0)
+    learner = Mappo(env, config, learning(SMALL, frames=4 * batch.numel()))
+    numbers = [learner.learn(batch.clone()) for _ in range(6)]
+    weights = [-each["loss_entropy"] / each["entropy"] for each in numbers]
+    assert weights == pytest.approx([0.4, 0.3, 0.2, 0.1, 0.0, 0.0], abs=1e-6)
