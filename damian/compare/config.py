@@ -18,8 +18,6 @@ STORED = ("sampled", "deterministic")
 """Policies of a checkpoint: its actions are drawn, or the most likely ones."""
 SEEDS = 10
 """Seeds of a comparison, if their number is not given; with fewer, a report is marked as developing."""
-TAKEN = ("none", "random", "script")
-"""Names of an undelayed arm's delay and of the policies that fly beside each arm."""
 SET_BY_COMPARISON = ("seed", "resume", "checkpoint", "logger", "hydra")
 """Keys that a comparison sets for each of its runs."""
 SCORE_MEANS = "The measure that counts, of what truly happened, or as the server perceived it."
@@ -76,7 +74,7 @@ class Experiment(Settings):
         super().__post_init__()
         for kind in ("tasks", "delays", "arms", "held_out"):
             for name in getattr(self, kind):
-                good = re.fullmatch(r"[\w.+-]+", name) and name not in TAKEN
+                good = re.fullmatch(r"[\w.+-]+", name) and name not in ("none", "random", "script")
                 should = "cannot name a folder: use letters, digits, _ . + - but not none, random or script"
                 checks.require(bool(good), f"experiment.{kind}", name, should)
         for kind in ("tasks", "arms"):
@@ -132,8 +130,6 @@ class CompareConfig(Settings):
             problem = "cannot be the same for every run: the comparison sets it; leave it out"
             checks.require(not ours, "overrides", word, problem)
         for kind in ("tasks", "delays", "arms"):
-            none = getattr(self, kind) == [] and kind != "delays"
-            checks.require(not none, kind, [], "names none: leave it out, for all of them")
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))
         arms = self.chosen("arms")

@@ -12,6 +12,7 @@ from damian.compare.comparison import (
     HELD_OUT_MARK,
     MEASURED,
     NOT_LATE,
+    RUN,
     SCRIPTED,
     Comparison,
     shown,
@@ -21,29 +22,31 @@ from damian.compare.figures import curve
 
 def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
     """Return the whole comparison as Markdown, with ``notes`` as lines at the top."""
-    table, parts = comparison.table, ["\n".join(f"- {note}" for note in notes)]
+    table, runs = comparison.table, comparison.rows.drop_duplicates(RUN)
+    hours = f"{len(runs)} runs, which took {runs['seconds'].sum() / 3600:.2f} hours"
+    parts = ["\n".join(f"- {note}" for note in (*notes, hours))]
     for task in comparison.tasks():
+        frames = runs.loc[(runs["task"] == task) & (runs["frames"] > 0), "frames"].astype(int)
+        steps = (
+            " to ".join(f"{x:,}" for x in dict.fromkeys((frames.min(), frames.max())))
+            if len(frames)
+            else "no"
+        )
+        trained = (
+            "Policies of another task."
+            if HELD_OUT_MARK in task
+            else f"Trained for {steps} environment steps."
+        )
         for delay in comparison.delays(task) or [NOT_LATE]:
             lines = table[(table["task"] == task) & table["delay"].isin([NOT_LATE, delay])]
-            parts += [f"## {task}, delay {delay}", _length(comparison, task), _table(lines)]
+            parts += [f"## {task}, delay {delay}", trained, _table(lines)]
             if delay != NOT_LATE:
                 parts += _steps(comparison, task, delay)
     overall = [(arm, found["seeds"], shown(found, "J_norm")) for arm, found in comparison.overall().items()]
     if overall:
         head = ("method", "n", "interquartile mean of J_norm")
         parts += ["## All tasks and delays", markdown_table(head, overall)]
-    return "\n\n".join([*parts, "## Compute", _compute(comparison)]) + "\n"
-
-
-def _length(comparison: Comparison, task: str) -> str:
-    """How long the policies of a task were trained."""
-    if HELD_OUT_MARK in task:
-        return "Policies of another task."
-    runs = comparison.runs()
-    trained = runs.loc[(runs["task"] == task) & (runs["frames"] > 0), "frames"]
-    ends = dict.fromkeys((trained.min(), trained.max())) if len(trained) else ()
-    least_to_most = " to ".join(f"{frames:,.0f}" for frames in ends)
-    return f"Trained for {least_to_most or 'no'} environment steps."
+    return "\n\n".join(parts) + "\n"
 
 
 def _table(lines: pd.DataFrame) -> str:
@@ -53,10 +56,8 @@ def _table(lines: pd.DataFrame) -> str:
         labels = (line["arm"] + undelayed, line["regime"], line["policy"], line["seeds"])
         measured, compared = ([shown(line, name) for name in names] for names in (MEASURED, COMPARED))
         rows.append([*labels, *measured, line["compared_seeds"] or "-", *compared])
-    measured, compared = ([column.head for column in columns.values()] for columns in (MEASURED, COMPARED))
-    return markdown_table(
-        ["method", "regime", "policy", "n", *measured, "n compared", *compared], rows, left=3
-    )
+    head = ["method", "regime", "policy", "n", *MEASURED.values(), "n compared", *COMPARED.values()]
+    return markdown_table(head, rows, left=3)
 
 
 def _steps(comparison: Comparison, task: str, delay: str) -> list[str]:
@@ -79,12 +80,3 @@ def _steps(comparison: Comparison, task: str, delay: str) -> list[str]:
         rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
     title = f"Steps to the final training return (in hindsight, mean over a tenth) of *{best}*, {level:.1f}:"
     return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]
-
-
-def _compute(comparison: Comparison) -> str:
-    """Number and time of the runs of each arm."""
-    runs = comparison.runs()
-    of_arms = dict(iter(runs.groupby("arm")["seconds"]))
-    times = {arm: of_arms[arm] for arm in comparison.arms if arm in of_arms} | {"all": runs["seconds"]}
-    rows = [(arm, len(x), f"{x.mean():.0f}", f"{x.sum() / 3600:.2f}") for arm, x in times.items()]
-    return markdown_table(("method", "runs", "seconds a run", "hours of all runs"), rows)

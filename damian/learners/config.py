@@ -214,7 +214,6 @@ class SacConfig(LearnerConfig):
     batch_size: int = setting(512, "Decisions per update.", low=1, high=checks.STEPS)
     buffer_steps: int = setting(200000, "Environment steps in the replay buffer.", low=1)
     warm_up: int = setting(5000, "Environment steps before learning begins.", low=0)
-    normalize_reward: bool = setting(False, "Divide rewards by the root mean square of the returns so far.")
 
     learner: ClassVar[str] = "damian.learners.sac:Sac"
 

@@ -17,9 +17,8 @@ from damian import keys
 from damian.common.compiling import compiled
 from damian.learners.base import LearningSetup
 from damian.learners.config import MappoConfig
-from damian.learners.networks import COMPILE_OPTIONS, make_critic
+from damian.learners.networks import COMPILE_OPTIONS, NormalizedValue, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
-from damian.learners.reward_scale import update_value_scale, value_scale
 from damian.learners.schedule import LinearSchedule
 from damian.replay.backupdate import BackupdateStorage
 
@@ -194,7 +193,8 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     advantage, batch[keys.VALUE_TARGET] = generalized_advantage_estimate(
         gamma, lmbda, value, next_value, next_step[keys.REWARD], done, terminated, time_dim=-3
     )
-    update_value_scale(critic, batch[keys.VALUE_TARGET])
+    if isinstance(critic.module, NormalizedValue):
+        critic.module.norm.update(batch[keys.VALUE_TARGET].double())
     ready = batch[keys.READY].unsqueeze(-1)
     if config.normalize_advantage:
         decisions = advantage[ready] if ready.any() else torch.zeros(1, device=advantage.device)
@@ -202,6 +202,11 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     else:
         advantage = advantage / value_scale(critic)
     batch[keys.ADVANTAGE] = torch.where(ready, advantage, 0.0)
+
+
+def value_scale(critic: TensorDictModule) -> Tensor | float:
+    """Running standard deviation of a critic's value targets, [1]; 1 if its values are not normalised."""
+    return critic.module.norm.scale().float() if isinstance(critic.module, NormalizedValue) else 1.0
 
 
 def explained_variance(batch: TensorDictBase) -> Tensor:

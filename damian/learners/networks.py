@@ -11,14 +11,13 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
+from torchrl.modules import MLP, PopArtValueNorm, ProbabilisticActor, TanhNormal
 from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
 from damian.common import checks
 from damian.learners.config import ModelConfig
 from damian.learners.recurrent import AgentGRU
-from damian.learners.reward_scale import NormalizedValue
 
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
@@ -29,6 +28,8 @@ FIRST_WEIGHT, LEAST = 8.0, 1e-3
 """Initial weight of a skip connection, and the lower bound of the probabilities of which it takes the log."""
 POLICY_GAIN = 0.01
 """Gain of the policy's output layer, if its initial weights are orthogonal."""
+FORGETTING = 0.99
+"""Share of the running statistics of values that an update keeps: they reflect about the last 100 updates."""
 Network = TypeVar("Network", bound=nn.Module)
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
@@ -209,3 +210,19 @@ class SharedValue(nn.Module):
         """The value of observations [*, N, G], the same for each UAV, [*, N, 1]."""
         value = self.network(observations.flatten(-2)).unsqueeze(-2)
         return value.expand(*observations.shape[:-1], 1)
+
+
+class NormalizedValue(nn.Module):
+    """Values from a network whose outputs are values of mean 0 and standard deviation 1 (Yu et al. 2022)."""
+
+    def __init__(self, network: nn.Module, device: torch.device | None) -> None:
+        super().__init__()
+        self.network = network
+        # TorchRL's smallest variance, 1e-5, is that of rewards which are merely small.
+        norm = PopArtValueNorm(beta=FORGETTING, epsilon=1e-16, device=device)
+        self.norm = norm.double()  # the variance is a difference of squares
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return the values of observations [*, N, G] in the unit of the rewards, [*, N, 1]."""
+        value = self.network(observations)
+        return self.norm.denormalize(value).to(value.dtype)

@@ -17,7 +17,6 @@ from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.config import SacConfig
 from damian.learners.networks import ModelConfig, make_mlp
-from damian.learners.reward_scale import ReturnScale
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
 
@@ -59,19 +58,13 @@ class Sac:
         # The first message of an episode begins a belief that back-updating computes again.
         believes = keys.BELIEF in env.observation_spec.keys(True)
         self.unread = [key for key in _UNREAD if not (believes and key == keys.MESSAGE)]
-        self.return_scale = None
-        if config.normalize_reward:
-            self.return_scale = ReturnScale(env.full_reward_spec[keys.REWARD].zero(), config.gamma)
 
     def components(self) -> dict[str, Any]:
         """What a checkpoint stores, beside the replay buffer."""
-        networks = {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
-        return networks if self.return_scale is None else {**networks, "return_scale": self.return_scale}
+        return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Store a batch [B, T], and make a round of updates; means of ``NUMBERS``, nan before it begins."""
-        if self.return_scale is not None:
-            self.return_scale.update(batch)
         self.buffer.extend(batch.exclude(*self.unread))
         storage = cast(TimeStorage, self.buffer.storage)
         steps, order = storage.steps, storage.latest()
@@ -86,10 +79,7 @@ class Sac:
         rounds = []
         for _ in range(self.config.updates):
             sample = decisions.sample(self.config.batch_size)
-            drawn = transitions(steps, order, sample, self.config.gamma, self.observed)
-            if self.return_scale is not None:
-                drawn[next_key(keys.REWARD)] /= self.return_scale.value
-            numbers = self.update(drawn)
+            numbers = self.update(transitions(steps, order, sample, self.config.gamma, self.observed))
             rounds.append(torch.stack([numbers[name] for name in NUMBERS]))
         # A number that is read at once would make the device wait at every update.
         return dict(zip(NUMBERS, torch.stack(rounds).double().mean(0).tolist(), strict=True))

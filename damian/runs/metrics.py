@@ -68,37 +68,39 @@ def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = Tr
 
 def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     """Measures of the first episode of each world in a rollout [B, T]."""
-    horizon, next_step = rollout.shape[1], cast(TensorDictBase, rollout["next"])
-    elapsed = torch.arange(1, horizon + 1, device=rollout.device).expand(rollout.shape)
+    next_step = cast(TensorDictBase, rollout["next"])
+    elapsed = torch.arange(1, rollout.shape[1] + 1, device=rollout.device).expand(rollout.shape)
     message = next_step[keys.MESSAGE]
     over, belief = next_step.get(keys.SOURCE_OVER, None), _true_belief(rollout, server, elapsed)
     truth = server(server.messages(message), elapsed, over, belief=belief)
-    in_episode = _up_to_first_end(next_step[keys.DONE].squeeze(-1))
-    in_true_episode = in_episode & _up_to_first_end(truth.status.terminated)
-    success, true_success = (
-        _ever(next_step[keys.SUCCESS].squeeze(-1), in_episode),
-        _ever(truth.status.success, in_true_episode),
-    )
-    can_succeed = server.episode.success_share is not None
-    perceived_steps, steps = (
-        torch.where(succeeded | (not can_succeed), counted.sum(-1), horizon)
-        for succeeded, counted in ((success, in_episode), (true_success, in_true_episode))
-    )
+    done, success, reward = (next_step[k].squeeze(-1) for k in (keys.DONE, keys.SUCCESS, keys.REWARD))
+    in_episode = _up_to_first_end(done)
     held = server.messages(next_step.get(keys.RECEIVED, message))
     age = held.age(elapsed * server.dt) / server.dt
-    late, lost = _message_shares(next_step, in_episode)
+    sent, late, lost = cast(Tensor, next_step[keys.MESSAGE_SENT])[in_episode], 0.0, 0.0
+    if sent.any() and keys.DELAY in next_step.keys(True):
+        delay = cast(Tensor, next_step[keys.DELAY]).squeeze(-1)[in_episode][sent]
+        late, lost = _mean(delay > 0), _mean(delay < 0)
+    can_succeed = server.episode.success_share is not None
+    true_end = in_episode & _up_to_first_end(truth.status.terminated)
     return Evaluation(
-        episodes=len(in_episode),
-        success_rate=_mean(true_success),
-        steps=_mean(steps),
-        return_=_mean((truth.reward.mean(-1) * in_true_episode).sum(-1)),
-        perceived_success_rate=_mean(success),
-        perceived_steps=_mean(perceived_steps),
-        perceived_return=_mean((next_step[keys.REWARD].squeeze(-1).mean(-1) * in_episode).sum(-1)),
+        len(in_episode),
+        *_of_episodes(truth.status.success, truth.reward, true_end, can_succeed),
+        *_of_episodes(success, reward, in_episode, can_succeed),
         age=_mean(age[in_episode]),
         late=late,
         lost=lost,
     )
+
+
+def _of_episodes(
+    success: Tensor, reward: Tensor, counted: Tensor, can_succeed: bool
+) -> tuple[float, float, float]:
+    """Success rate, steps and return of the episodes of which the steps in a mask [B, T] count."""
+    succeeded, steps = (success & counted).any(-1), counted.sum(-1)
+    if can_succeed:
+        steps = torch.where(succeeded, steps, counted.shape[1])
+    return _mean(succeeded), _mean(steps), _mean((reward.mean(-1) * counted).sum(-1))
 
 
 def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Tensor | None:
@@ -115,20 +117,6 @@ def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Te
 def _up_to_first_end(ended: Tensor) -> Tensor:
     """Mask of the steps up to and including the first end, [B, T] bool."""
     return ended.int().cumsum(-1) - ended.int() == 0
-
-
-def _ever(flag: Tensor, counted: Tensor) -> Tensor:
-    return (flag & counted).any(-1)
-
-
-def _message_shares(next_step: TensorDictBase, counted: Tensor) -> tuple[float, float]:
-    """Shares of late and of lost messages among those sent in the counted steps [B, T]."""
-    sent = cast(Tensor, next_step[keys.MESSAGE_SENT])[counted]
-    delay = next_step.get(keys.DELAY, None)
-    if delay is None or not sent.any():
-        return 0.0, 0.0
-    delay = delay.squeeze(-1)[counted][sent]
-    return _mean(delay > 0), _mean(delay < 0)
 
 
 def _mean(numbers: Tensor) -> float:
@@ -243,7 +231,7 @@ class HindsightReturns:
         return torch.where(over, total[1:] - begun[:-1], torch.nan).T.float()
 
     def _store(self, steps: TensorDictBase, corrected: bool = False) -> None:
-        """Write steps [T, W] behind the latest ones, and correct all by what has arrived."""
+        """Write steps [T, W] behind the latest ones, and correct all unless they are ``corrected``."""
         index = torch.arange(self._written, self._written + len(steps))
         self._written += len(steps)
         write: Any = super(BackupdateStorage, self.storage).set if corrected else self.storage.set

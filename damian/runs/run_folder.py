@@ -1,6 +1,5 @@
 """Files of a run folder: their names, the learning curve, and the table of results."""
 
-import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,7 +46,7 @@ def plot_learning_curve(
     panels = {"hindsight_return": ("return", "return")}
     if any(row["perceived_success_rate"] > 0 for row in rows):
         panels["perceived_success_rate"] = ("success rate", "perceived_success_rate")
-    figure = Figure(figsize=(5 * len(panels), 3.4))
+    figure = Figure(figsize=(5 * len(panels), 3.4), layout="tight")
     axes = figure.subplots(1, len(panels), squeeze=False)
     for axis, (name, (label, measure)) in zip(axes[0], panels.items(), strict=True):
         points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
@@ -57,16 +56,12 @@ def plot_learning_curve(
             if policy in evaluations:  # a region may be too large for the script
                 level = evaluations[policy].row()[measure]
                 axis.axhline(level, color="tab:gray", linestyle=style, label=policy)
-        axis.set_xlabel("environment steps, all worlds")
+        axis.set(xlabel="environment steps, all worlds", ylabel=label)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     axes[0][0].legend(loc="best", fontsize="small")
     figure.suptitle(title, fontsize="medium")
-    figure.tight_layout()
-    image = io.BytesIO()
-    figure.savefig(image, dpi=120)
-    write_atomically(path, image.getvalue())
+    figure.savefig(path, dpi=120)
 
 
 LATE = """perceived: as far as the server knew; all else as it truly was; age: mean age of the messages at the
@@ -93,23 +88,16 @@ def read_results(path: Path) -> pd.DataFrame:
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
     """Evaluations of policies as a Markdown table; NAME``, deterministic`` gives columns of NAME's line."""
-    columns = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
-    columns |= {"return": "return"}
-    has_both = any(name.endswith(DETERMINISTIC) for name in rows)
-    likely = columns.copy() if has_both else {}
+    measures = [*["success_rate", "steps"] * can_succeed, "return"]
+    likely = measures if any(name.endswith(DETERMINISTIC) for name in rows) else []
     if late:
-        columns |= {"perceived return": "perceived_return", "age": "age", "late": "late", "lost": "lost"}
+        measures = [*measures, "perceived_return", "age", "late", "lost"]
     lines = []
     for name, evaluation in rows.items():
         if not name.endswith(DETERMINISTIC):
             row, other = evaluation.row(), rows.get(name + DETERMINISTIC)
-            found = [other.row()[measure] if other else math.nan for measure in likely.values()]
-            lines.append(
-                [name, *(_number(row[measure]) for measure in columns.values()), *map(_number, found)]
-            )
-    head = ["policy", *columns, *(f"{title}, deterministic" for title in likely)]
-    return markdown_table(head, lines)
-
-
-def _number(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.2f}"
+            numbers = [f"{row[measure]:.2f}" for measure in measures]
+            numbers += [f"{other.row()[measure]:.2f}" if other else "" for measure in likely]
+            lines.append([name, *numbers])
+    head = ["policy", *measures, *(f"{measure}, deterministic" for measure in likely)]
+    return markdown_table([title.replace("_", " ") for title in head], lines)

@@ -7,8 +7,10 @@ import pandas as pd
 import pytest
 import yaml
 from matplotlib.figure import Figure
+from scipy.stats import trim_mean
 
 from damian.compare.comparison import (
+    MEASURED,
     RANDOM,
     TRAINED,
     TRAINED_DETERMINISTIC,
@@ -17,9 +19,8 @@ from damian.compare.comparison import (
     Comparison,
     shown,
 )
-from damian.compare.figures import look, plot_curves, plot_matrix
+from damian.compare.figures import look, plot_matrix
 from damian.compare.report import markdown
-from damian.compare.statistics import interquartile_mean
 
 ARMS = {
     "best": Arm(delayed=False),
@@ -32,16 +33,7 @@ ARMS = {
 def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = TRAINED) -> dict:
     """A row of results in which every measure has the same value."""
     labels = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
-    names = (
-        "return",
-        "success_rate",
-        "steps",
-        "perceived_return",
-        "perceived_success_rate",
-        "perceived_steps",
-    )
-    of_run = {"frames": 400, "seconds": 36.0}
-    return labels | of_run | dict.fromkeys((*names, "age", "late", "lost", "backupdated", "episodes"), value)
+    return labels | {"frames": 400, "seconds": 36.0} | dict.fromkeys((*MEASURED, "episodes"), value)
 
 
 def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
@@ -54,7 +46,7 @@ def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float
     ]
 
 
-def comparison(rows: list[dict], arms: dict[str, Arm] = ARMS, curves: list[dict] = ()) -> Comparison:
+def comparison(rows: list[dict], arms: dict[str, Arm] = ARMS, curves: list[tuple] = ()) -> Comparison:
     columns = ["task", "delay", "arm", "seed", "frames", "hindsight_return", "perceived_success_rate"]
     return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), arms)
 
@@ -84,13 +76,6 @@ def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
     ).all()
 
 
-def test_recovery_is_left_out_if_the_delay_costs_nothing():
-    scores = SCORES | {"blind": [9.0, 9.5]}
-    aware = compared(comparison(rows_of("t", "late", scores)))["aware"]
-    assert aware["J_norm"] == 0.75
-    assert shown(aware, "recovery") == "-"
-
-
 def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
     rows = rows_of("t", "late", THREE)
     alone = compared(comparison(rows))
@@ -110,7 +95,7 @@ def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
         rows += rows_of(task, "none", {"best": best})
     overall = comparison(rows).overall()
     assert overall["aware"]["seeds"] == 3
-    assert overall["aware"]["J_norm"] == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
+    assert overall["aware"]["J_norm"] == pytest.approx(trim_mean(norms, 0.25), abs=1e-12)
     assert overall["aware"]["J_norm_low"] < overall["aware"]["J_norm"] < overall["aware"]["J_norm_high"]
     assert overall["blind"]["J_norm"] == 0
     assert comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")]).overall()
@@ -135,13 +120,8 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     cells = table.loc[7]
     assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", TRAINED]
     assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
-    value, low, high = (cells[f"return{end}"] for end in ("", "_low", "_high"))
-    assert value == pytest.approx(22 / 3)
-    assert low < value < high
-    assert cells["J_norm"] == pytest.approx(22 / 30)
-    assert cells["recovery"] == pytest.approx((22 / 3 - 4) / 6)
+    assert cells["return_low"] < cells["return"] < cells["return_high"]
     assert cells["improvement"] == cells["improvement_high"] == 1
-    assert cells["improvement_low"] == pytest.approx(0.5, abs=0.01)
     assert np.isnan([table.loc[3, "recovery"], table.loc[8, "J_norm"]]).all()
 
 
@@ -154,15 +134,8 @@ def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
         ("t", "none", "best"): [40.0],
     }
     points = [
-        {
-            "task": task,
-            "delay": delay,
-            "arm": arm,
-            "seed": seed,
-            "frames": x,
-            "hindsight_return": end * x / 100,
-        }
-        for (task, delay, arm), of_seeds in ends.items()
+        (*run, seed, x, end * x / 100, np.nan)
+        for run, of_seeds in ends.items()
         for seed, end in enumerate(of_seeds)
         for x in (0, 100)
     ]
@@ -172,11 +145,6 @@ def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
     assert rows["best"] == ["15", "15", "15"]
     assert rows["aware"] == ["53", "34", "never"]
     assert rows["blind"] == ["100", "81", "never"]
-
-
-def test_arms_that_train_nothing_are_drawn_without_curves(tmp_path):
-    plot_curves(comparison(rows_of("t", "late", SCORES)), tmp_path / "curves.png")
-    assert (tmp_path / "curves.png").exists()
 
 
 def test_the_matrix_shows_policies_for_every_delay_beside_those_of_each_delay(tmp_path, monkeypatch):
@@ -197,9 +165,11 @@ def test_the_matrix_shows_policies_for_every_delay_beside_those_of_each_delay(tm
     assert (every.get_linestyle(), each.get_linestyle()) == ("-", "--")
 
 
-def test_a_recovery_is_from_the_naive_arm_of_the_same_track():
-    scores = SCORES | {"flown": [9.0, 8.0]}  # naive, but trained undelayed: not the reference of late data
-    arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
+def test_a_recovery_is_from_the_naive_arm_of_the_same_track_if_the_delay_costs_something():
+    scores = SCORES | {"flown": [9.0, 9.5]}  # as good as undelayed
+    lines = compared(comparison(rows_of("t", "late", scores)))
+    assert shown(lines["aware"], "recovery") == "-"
+    arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}  # not the reference of late data
     lines = compared(comparison(rows_of("t", "late", scores), arms))
     assert lines["aware"]["recovery"] == pytest.approx((7.5 - 3) / (10 - 3))
     assert np.isnan(lines["flown"]["recovery"])  # the strongest naive arm of its track
@@ -221,11 +191,9 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
 
 
-def test_methods_of_an_experiment_look_different_and_keep_their_colours_without_the_others():
+def test_methods_of_an_experiment_look_different():
     for path in Path("conf/experiment").glob("*.yaml"):
         arms = {name: Arm(**given) for name, given in yaml.safe_load(path.read_text())["arms"].items()}
-        looks = {name: look(arms, name) for name in arms}
+        looks = [look(arms, name) for name in arms]
         for style in ("linestyle", "marker"):
-            assert len({(each["color"], each[style]) for each in looks.values()}) == len(arms)
-        for name, arm in arms.items():
-            assert look({name: arm}, name)["color"] == looks[name]["color"]
+            assert len({(each["color"], each[style]) for each in looks}) == len(arms)

@@ -8,6 +8,7 @@ import torch
 from helpers import everything, learning
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.multiagent import MAPPOLoss
@@ -169,3 +170,42 @@ def test_values_are_those_of_two_passes_over_the_batch(case):
     assert evaluated == [
         batch.numel() + 4 + int(ends[:, :-1].sum()) + 1
     ]  # last steps, ends, and the correction
+
+
+@pytest.mark.sample(2)
+@pytest.mark.parametrize(
+    ("case", "advantage"),
+    [("discrete", True), ("discrete", False), ("shared value", True), ("recurrent", True)],
+)
+def test_rewards_of_any_scale_teach_the_same_if_values_are_normalised(case, advantage):
+    env, _, batch = flown(case)
+
+    def learnt(scale: float, normalize: bool) -> Tensor:
+        """The change of the actor's weights by two batches with scaled rewards."""
+        torch.manual_seed(3)
+        config = MappoConfig(
+            epochs=2, minibatches=2, normalize_value=normalize, normalize_advantage=advantage
+        )
+        learner = Mappo(env, config, learning(CASES[case][1]))
+        begin = parameters_to_vector(learner.actor.parameters())
+        for part in batch.split(6, 1):
+            scaled = part.clone()
+            scaled[keys.next_key(keys.REWARD)] *= scale
+            learner.learn(scaled)
+        return (parameters_to_vector(learner.actor.parameters()) - begin).detach()
+
+    for normalize in (True, False):
+        end, *others = (learnt(scale, normalize) for scale in (1.0, 0.01, 100.0))
+        moved = end.abs().max()
+        spread = max((other - end).abs().max() for other in others) / moved
+        assert moved > 1e-3
+        assert spread < 1e-2 if normalize else spread > 5e-2
+
+
+def test_the_entropy_bonus_goes_linearly_to_its_end_over_the_frames_of_the_run():
+    env, _, batch = flown("discrete")
+    config = MappoConfig(epochs=1, minibatches=2, entropy_coeff=0.4, entropy_coeff_end=0.0)
+    learner = Mappo(env, config, learning(SMALL, frames=4 * batch.numel()))
+    numbers = [learner.learn(batch.clone()) for _ in range(6)]
+    weights = [-each["loss_entropy"] / each["entropy"] for each in numbers]
+    assert weights == pytest.approx([0.4, 0.3, 0.2, 0.1, 0.0, 0.0], abs=1e-6)

@@ -28,7 +28,7 @@ SLOW_CLOCKS = ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.ser
 FEW = ["learner.prediction_steps=2", "learner.prediction_batch=8", "learner.prediction_buffer=64"]
 CASES = {
     "recurrent": ["delay.obs=2", "aware=backupdate", "delay.act=1", "delay.history=2", "model.rnn=gru"],
-    "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1", "learner.normalize_reward=true"],
+    "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1"],
     "sac bursts": [*SAC, "scenario=tracking", "delay=burst", "delay.history=2"],
     "everything": [*WHOLE, "settle=true", "learner.steps=16", "frames=512"],
     "triggered": TRIGGERED,

@@ -6,16 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import square
 from tensordict import TensorDict
 from torch import nn
-from torchrl.collectors import Collector
 
-from damian.baselines.random import random_policy
 from damian.common.errors import InputError
-from damian.envs.pipeline import make_env
-from damian.runs.checkpoint import plain, read_checkpoint, restore, to_tensordict, write_checkpoint
-from damian.runs.training_state import CarriedStep, load_networks
+from damian.runs.checkpoint import read_checkpoint, restore, to_tensordict, write_checkpoint
+from damian.runs.training_state import load_networks
 
 
 @pytest.fixture
@@ -88,20 +84,3 @@ def test_a_component_that_does_not_fit_is_refused_in_one_line():
         restore({"actor": nn.Linear(3, 5)}, stored, Path("x.pt"), "checkpoint")
     with pytest.raises(InputError, match="it has no critic, only actor"):
         restore({"critic": nn.ReLU()}, stored, Path("x.pt"), "checkpoint")
-
-
-def test_torchrl_still_keeps_the_next_step_of_a_collector_where_it_is_stored_and_restored():
-    """If this fails with an AttributeError, TorchRL has renamed what ``CarriedStep`` uses."""
-
-    def make() -> Collector:
-        env = make_env(square(), 2, seed=1)
-        return Collector(env, random_policy(env), frames_per_batch=8, total_frames=-1)
-
-    collector, other = make(), make()
-    batch = next(iter(collector))
-    state = CarriedStep(collector).state_dict()
-    assert state["step"]["agents", "observation"].equal(batch["next", "agents", "observation"][:, -1])
-    CarriedStep(other).load_state_dict(plain(state))
-    restored = CarriedStep(other).state_dict()
-    assert (restored["step"] == state["step"]).all()
-    assert restored["trajectories"] == state["trajectories"]

@@ -1,6 +1,5 @@
 """Measures of episodes in evaluations and in training, and the files that hold them."""
 
-import csv
 import json
 import math
 from statistics import fmean
@@ -25,9 +24,8 @@ from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.replay.backupdate import BackupdateStorage
 from damian.runs.checkpoint import plain
-from damian.runs.metrics import EpisodeLog, Evaluation, HindsightReturns, evaluation
+from damian.runs.metrics import EpisodeLog, HindsightReturns, evaluation
 from damian.runs.metrics_log import MetricsLog
-from damian.runs.run_folder import save_results
 from damian.runs.run_record import check_version
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
@@ -66,6 +64,10 @@ def fly(scenario: ScenarioConfig, n_worlds: int = 24) -> tuple[TensorDictBase, S
     return env.rollout(HORIZON, random_policy(env), break_when_any_done=False), env.server
 
 
+POOLED = ("age", "late", "lost")
+"""Measures that are means over all messages, not over episodes."""
+
+
 def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
     """Ages of the messages held [steps], and whether each message sent is late or lost, in an episode."""
     agents, delays = world["next", "agents"], {"age": [], "late": [], "lost": []}
@@ -83,13 +85,13 @@ def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
 
 def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[str, Any]:
     """Measures of the first episode of a flight [T], counted step by step."""
-    row = {"perceived_return": 0.0, "return": 0.0, "success": False, "true_success": False}
+    row = {"perceived_return": 0.0, "return": 0.0, "perceived_success_rate": False, "success_rate": False}
     row |= {"steps": HORIZON}
     truly_over = False
     for t in range(1, HORIZON + 1):
         next_step = world["next"][t - 1]
         row["perceived_return"] += next_step["agents", "reward"].mean().item()
-        row["success"] |= next_step["success"].item()
+        row["perceived_success_rate"] |= next_step["success"].item()
         truth, steps = Messages.unpack(next_step["agents", "message"][None]), torch.tensor([t])
         undelayed, _, _ = server.reward_and_status(
             server.features(truth, steps), truth, steps, torch.zeros(1, dtype=torch.bool)
@@ -97,33 +99,20 @@ def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[
         if not truly_over:
             row["return"] += undelayed.mean().item()
         if truth.spotted.sum() >= needed and not truly_over:
-            row["true_success"] = truly_over = True
+            row["success_rate"] = truly_over = True
             row["steps"] = t
         if next_step["done"].item():
             break
-    row["perceived_steps"] = t if row["success"] else HORIZON
+    row["perceived_steps"] = t if row["perceived_success_rate"] else HORIZON
     return row | delays_by_hand(world, t)
 
 
-def by_hand(flight: TensorDictBase, server: Server, needed: int) -> tuple[dict[str, float], list[dict]]:
-    """The measures of an ``Evaluation`` by name, and those of each episode."""
+def by_hand(flight: TensorDictBase, server: Server, needed: int) -> dict[str, float]:
+    """The measures of an ``Evaluation`` by name."""
     rows = [episode_by_hand(world, server, needed) for world in flight]
-
-    def mean(name: str) -> float:
-        return sum(row[name] for row in rows) / len(rows)
-
-    def mean_over_all(name: str) -> float:
-        values = [value for row in rows for value in row[name]]
-        return sum(values) / len(values)
-
-    averaged = ("perceived_steps", "perceived_return", "steps", "return")
-    means = {
-        "episodes": len(rows),
-        "perceived_success_rate": mean("success"),
-        "success_rate": mean("true_success"),
-    }
-    pooled = {name: mean_over_all(name) for name in ("age", "late", "lost")}
-    return means | {name: mean(name) for name in averaged} | pooled, rows
+    found = {name: fmean(row[name] for row in rows) for name in rows[0] if name not in POOLED}
+    pooled = {name: fmean(x for row in rows for x in row[name]) for name in POOLED}
+    return found | pooled | {"episodes": len(rows)}
 
 
 @pytest.mark.sample(2)
@@ -131,7 +120,7 @@ def by_hand(flight: TensorDictBase, server: Server, needed: int) -> tuple[dict[s
 @pytest.mark.parametrize("delay", DELAYS)
 def test_an_evaluation_equals_counting_step_by_step(motion, delay):
     flight, server = fly(joint_spotting(motion, DELAYS[delay]))
-    expected, _ = by_hand(flight, server, needed=2)
+    expected = by_hand(flight, server, needed=2)
     assert evaluation(flight, server).row() == pytest.approx(expected, rel=1e-5)
     assert 0 < expected["perceived_success_rate"] <= 1
     assert 0 < expected["success_rate"] < 1
@@ -183,24 +172,15 @@ def training_batch() -> TensorDictBase:
     return env.rollout(40, random_policy(env), break_when_any_done=False)
 
 
-def ended_episodes(batch: TensorDictBase) -> list[dict[str, float]]:
-    """Return, success and steps of each ended episode, in the order in which they end."""
-    running, ended = [[0.0, 0] for _ in range(len(batch))], []  # return and steps of each world's episode
-    for t in range(batch.shape[1]):
-        for world, sums in enumerate(running):
-            next_step = batch["next"][world, t]
-            sums[0] += next_step["agents", "reward"].mean().item()
-            sums[1] += 1
-            if next_step["done"]:
-                success = float(next_step["success"])
-                ended.append(
-                    {
-                        "perceived_return": sums[0],
-                        "perceived_success_rate": success,
-                        "perceived_steps": float(sums[1]),
-                    }
-                )
-                running[world] = [0.0, 0]
+def ended_episodes(world: TensorDictBase) -> list[dict[str, float]]:
+    """Return, success and steps of each ended episode of a world [T]."""
+    total, steps, ended = 0.0, 0, []
+    for step in world["next"]:
+        total += step["agents", "reward"].mean().item()
+        steps += 1
+        if step["done"]:
+            ended.append(dict(zip(EpisodeLog.NAMES, (total, float(step["success"]), steps), strict=True)))
+            total, steps = 0.0, 0
     return ended
 
 
@@ -211,8 +191,9 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
         state, log = log.state_dict(), EpisodeLog(len(batch))
         log.load_state_dict(state)
         log.add(part)
-    latest = [ended_episodes(world.unsqueeze(0))[-3:] for world in batch]
-    assert log.finished == len(ended_episodes(batch)) > 50
+    ended = [ended_episodes(world) for world in batch]
+    latest = [episodes[-3:] for episodes in ended]
+    assert log.finished == sum(map(len, ended)) > 50
     means = log.means()
     assert means.pop("hindsight_return") == means["perceived_return"]  # nothing is late
     for name, mean in means.items():
@@ -262,17 +243,6 @@ def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_no
 
 
 # Tables and files.
-
-ROW = Evaluation(4, 0.25, 50.0, 1.5, 0.75, 30.0, 2.5, 0.125, 0.5, 0.1)
-
-
-def test_results_are_written_with_every_measure(tmp_path):
-    table = save_results({"one": ROW, "other": ROW}, tmp_path, can_succeed=False, late=False)
-    assert (tmp_path / "result.md").read_text() == table + "\n"
-    with (tmp_path / "result.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row.pop("policy") for row in rows] == ["one", "other"]
-    assert [{name: float(x) for name, x in row.items()} for row in rows] == [ROW.row()] * 2
 
 
 def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
