@@ -50,19 +50,6 @@ class Reader(Reinforce):
 """
 
 
-BROKEN = """
-from dataclasses import dataclass
-from learner import Reinforce, ReinforceConfig
-
-@dataclass
-class RaisingConfig(ReinforceConfig):
-    def make(self, env, setup, buffer):
-        learner = super().make(env, setup, buffer)
-        learner.learn = lambda batch: {"loss": batch["nothing"]}
-        return learner
-"""
-
-
 def last_metrics(folder: Path) -> dict[str, str]:
     with (folder / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file))[-1]
@@ -122,29 +109,24 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
     assert "| naive | R0 |" in (compared / "table.md").read_text()
 
 
-@pytest.mark.sample(3)
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("word", "message"),
     [
-        (["learner=learnr:X"], "learner: learnr:X: No module named 'learnr'; learnr must be installed"),
-        (["learner=reader:ReaderConfig"], "learner: reader:ReaderConfig reads hindsight, which needs aware="),
-        (
-            ["logger.custom=[law:Satellite]"],
-            "law:Satellite is not a function (folder) -> logger, nor a class",
-        ),
+        ("learner=reader:ReaderConfig", "learner: reader:ReaderConfig reads hindsight, which needs aware="),
+        ("logger.custom=[law:Satellite]", "law:Satellite is not a function (folder) -> logger, nor a class"),
     ],
 )
-def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
+def test_a_mistake_is_one_clear_line(run, folder, capsys, word, message):
     (folder / "reader.py").write_text(READER)
-    (folder / "faulty.py").write_text(BROKEN)
-    check_refused(lambda: run(*TINY, *overrides), message, capsys)
+    check_refused(lambda: run(*TINY, word), message, capsys)
     assert not (folder / "run").exists()
 
 
 def test_an_error_in_the_first_update_is_one_line_after_the_progress_bar(run, folder, capsys):
-    (folder / "faulty.py").write_text(BROKEN)
+    (folder / "faulty.py").write_text(READER.replace('batch["next", "agents", "reward"]', 'batch["nothing"]'))
+    words = ["learner=faulty:ReaderConfig", "delay.obs=3", "aware=backupdate"]
     with pytest.raises(SystemExit) as stopped:
-        run(*TINY, "learner=faulty:RaisingConfig")
+        run(*TINY, *words)
     assert stopped.value.code == 2
     *_, last = capsys.readouterr().err.strip().splitlines()
-    assert last.startswith("error: faulty:RaisingConfig: KeyError: ")
+    assert last.startswith("error: faulty:ReaderConfig: KeyError: ")
