@@ -11,7 +11,6 @@ from scipy.stats import trim_mean
 
 from damian.compare.config import LESS_IS_BETTER, Arm
 from damian.compare.statistics import (
-    LEAST_GAP,
     Floats,
     bootstrap,
     improvement_interval,
@@ -201,8 +200,8 @@ class Comparison:
             probability = float(probability_of_improvement(own, max(of_naive, key=np.mean)))
             ends = (probability, *improvement_interval(probability, len(paired)))
             found |= {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
-            if not np.isnan(_recovery(array, LEAST_GAP)):
-                found |= _estimates(["recovery"], _recovery, array)
+            if not np.isnan(recovery(array[0])):
+                found |= _estimates(["recovery"], lambda drawn: recovery(drawn[..., 0, :, :], 0.0), array)
         return found
 
     def overall(self) -> dict[str, dict[str, float]]:
@@ -226,19 +225,10 @@ class Comparison:
         return found
 
 
-# Statistics of scores [*, 1, arms, seeds] to [*]: undelayed, random, naive arms, and at last an arm.
-
-
 def _norms(scores: Floats) -> Floats:
-    """J_norm of the last arm's mean score."""
+    """J_norm of the last arm's mean score, [*, 1, arms, seeds] to [*]; first come undelayed and random."""
     means = scores.mean(-1)[..., 0, :]
     return normalised(means[..., -1], means[..., 0], means[..., 1])
-
-
-def _recovery(scores: Floats, least: float = 0.0) -> Floats:
-    """Recovery of the last arm."""
-    means = scores.mean(-1)[..., 0, :]
-    return recovery(means[..., -1], means[..., 2:-1].max(-1), means[..., 0], means[..., 1], least)
 
 
 def _interquartile_norms(scores: Floats) -> Floats:

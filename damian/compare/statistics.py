@@ -32,17 +32,18 @@ def normalised(score: Floats, undelayed: Floats, random: Floats) -> Floats:
     return (score - random) / np.where(span > 0, span, np.nan)
 
 
-def recovery(
-    aware: Floats, naive: Floats, undelayed: Floats, random: Floats, least: float = LEAST_GAP
-) -> Floats:
+def recovery(scores: Floats, least: float = LEAST_GAP) -> Floats:
     """Share of the delay's cost that a method wins back, ``(aware - naive) / (undelayed - naive)``.
 
-    All scores are means over seeds, and broadcast against each other. It is nan where undelayed - naive is
-    not positive or less than ``least`` of undelayed - random, or where undelayed does not beat random.
+    Scores are [*, arms, seeds], of undelayed, random, naive arms, and the aware one, to [*]; all of them are
+    means over seeds, and naive is the best. It is nan where undelayed - naive is not positive or less than
+    ``least`` of undelayed - random, or where undelayed does not beat random.
     """
-    gap = np.asarray(undelayed - naive, dtype=float)
+    means = scores.mean(-1)
+    undelayed, random, naive = means[..., 0], means[..., 1], means[..., 2:-1].max(-1)
+    gap = undelayed - naive
     enough = (gap > 0) & (undelayed > random) & (gap >= least * (undelayed - random))
-    return (aware - naive) / np.where(enough, gap, np.nan)
+    return (means[..., -1] - naive) / np.where(enough, gap, np.nan)
 
 
 def resampled(scores: Floats, draws: int) -> Floats:

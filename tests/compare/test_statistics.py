@@ -20,7 +20,8 @@ from damian.compare.statistics import (
     ("naive", "defined"), [(8.0, True), (9.0, True), (9.01, False), (10.0, False), (11.0, False)]
 )
 def test_recovery_is_nan_if_the_delay_costs_less_than_a_tenth(naive, defined):
-    assert np.isnan(recovery(9.5, naive, 10.0, 0.0)) == (not defined)
+    scores = np.array([[10.0], [0.0], [naive], [9.5]])
+    assert np.isnan(recovery(scores)) == (not defined)
 
 
 def test_all_arms_of_a_stratum_share_their_resamples_and_strata_do_not():
@@ -50,12 +51,8 @@ def test_the_interval_of_a_recovery_equals_that_over_all_possible_draws():
     for draw in itertools.product(range(3), repeat=3):
         a, n, u = (float(np.mean(arm[list(draw)])) for arm in (aware, naive, undelayed))
         ratios.append((a - n) / (u - n))
-
-    def ratio(scores):
-        a, n, u = np.moveaxis(scores.mean(-1), -1, 0)
-        return recovery(a, n, u, 0.0)
-
-    low, high = interval(ratio(resampled(np.stack([aware, naive, undelayed])[None], draws=20_000)))
+    arms = np.stack([undelayed, np.zeros(3), naive, aware])
+    low, high = interval(recovery(resampled(arms[None], draws=20_000), 0.0))
     np.testing.assert_allclose((low[0], high[0]), exact_interval(ratios, [3**-3] * 27), rtol=1e-12)
 
 
