@@ -10,7 +10,6 @@ is the probability of each of its K cells [*, K], and ``region`` the index of th
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -132,7 +131,6 @@ def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarra
     """Moves of the source in steps of ``dt``, counted from walks, [S, 2] metres."""
     # Independent moves like these get as far in STEPS_PER_MOVE steps as the source does.
     rng, polygons = np.random.default_rng(_SEED), polygons[:_WALKS]
-    source = replace(source, position=None)  # where it begins is not told
     time = torch.arange(_STEPS + 1, dtype=torch.float64) * dt
     found = []
     for polygon in polygons:

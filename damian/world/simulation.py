@@ -1,6 +1,5 @@
 """The physics of B parallel worlds: decisions, flights, the source, and the messages that the UAVs send."""
 
-import copy
 import math
 from typing import Any
 
@@ -11,16 +10,15 @@ from torch import Tensor
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
-from damian.world.airspace import Airspace, build_airspace, nearest_points
+from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
 from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
-from damian.world.regions.places import local_places
-from damian.world.regions.region import Region
+from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
 from damian.world.sensors import sensors_of
-from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, locate
+from damian.world.signal_source import Walk, draw_walks, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import MOTION_MODELS
 
@@ -79,7 +77,10 @@ class Simulation:
         condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
         fresh = fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
-        return self._read_anew(fresh) if self.sensors else fresh
+        if not self.sensors:
+            return fresh
+        state = self.layout.unpack(fresh)  # the first messages get the readings of this episode
+        return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
 
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
         """Simulate one step; actions of UAVs that are not ready change nothing.
@@ -199,11 +200,6 @@ class Simulation:
             return state.sent.readings
         return torch.cat([sensor.read(state, self) for sensor in self.sensors.values()], -1)
 
-    def _read_anew(self, worlds: PackedState) -> PackedState:
-        """Worlds at the start of an episode, whose first messages get the readings of this episode."""
-        state = self.layout.unpack(worlds)
-        return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
-
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """Position of the source [B, 2], whether it emits [B], and whether its walk is over [B]."""
         config = self.config.source
@@ -269,69 +265,46 @@ def _draw_initial_conditions(
     source over at most K stops, [Q, K].
     """
     per_region = config.region.initial_conditions // len(airspace.regions)
-    walks, starts = [], []
+    place, walks, starts = config.source.position, [], []
     for index, region in enumerate(airspace.regions):
-        walks.append(draw_walks(region.polygon, _in_region(config.source, region), per_region, rng))
+        start = None if place is None else local_places("source.position", [place], region)[0]
+        walks.append(draw_walks(region.polygon, config.source, per_region, rng, start))
         starts.append(_draw_starts(config, airspace, index, per_region, rng))
     stops = max(walk.arrive.shape[1] for walk in walks)
-    padded = [_pad(walk, stops) for walk in walks]
-    region = torch.arange(len(airspace.regions)).repeat_interleave(per_region)
-    walk = tree_map(lambda *parts: torch.cat(parts), *padded)
-    return region, torch.cat(starts), walk
+    walk = tree_map(lambda *parts: torch.cat(parts), *(_pad(walk, stops) for walk in walks))
+    return torch.arange(len(airspace.regions)).repeat_interleave(per_region), torch.cat(starts), walk
 
 
 def _pad(walk: Walk, stops: int) -> Walk:
     """Pad walks to the given number of stops; the source never reaches the padded ones."""
-    missing = stops - walk.arrive.shape[1]
-
-    def repeat_last(field: Tensor) -> Tensor:
-        last = field[:, -1:]
-        return torch.cat([field, last.expand(-1, missing, *last.shape[2:])], 1)
-
-    never = walk.arrive.new_full((len(walk.arrive), missing), torch.inf)
-    return tree_map(repeat_last, walk)._replace(arrive=torch.cat([walk.arrive, never], 1))
-
-
-def _in_region(source: SourceConfig, region: Region) -> SourceConfig:
-    """The source with its given position, if any, in local metres of a region."""
-    if source.position is None:
-        return source
-    moved = copy.copy(source)  # not checked again
-    moved.position = local_places("source.position", [source.position], region)[0].tolist()
-    return moved
+    last, index = walk.arrive.shape[1] - 1, torch.arange(stops)
+    padded = tree_map(lambda field: field[:, index.clamp(max=last)], walk)
+    return padded._replace(arrive=padded.arrive.masked_fill(index > last, torch.inf))
 
 
 def _draw_starts(
     config: WorldConfig, airspace: Airspace, region: int, n: int, rng: np.random.Generator
 ) -> Tensor:
     """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for each."""
-    if config.region.start_positions is not None:
-        return _given_starts(config, airspace, region).expand(n, -1).clone()
+    given, together = config.region.start_positions, config.region.start_together
     n_points = int(airspace.n_points[region])
-    if config.region.start_together:
+    if given is None and together:
         return torch.as_tensor(rng.integers(n_points, size=(n, 1))).repeat(1, config.agents)
-    return torch.as_tensor(rng.random((n, n_points))).topk(config.agents, dim=-1).indices
-
-
-def _given_starts(config: WorldConfig, airspace: Airspace, region: int) -> Tensor:
-    """Landing points nearest to the given start positions, [N]."""
-    given, name = config.region.start_positions or [], airspace.regions[region].name
-    local = torch.as_tensor(local_places("region.start_positions", given, airspace.regions[region]))
-    regions = torch.full((len(local),), region)
-    points = nearest_points(airspace.cells, airspace.exact_points, regions, local, 1).squeeze(-1)
-    distinct = config.region.start_together or len(points.unique()) == len(points)
+    if given is None:
+        return torch.as_tensor(rng.random((n, n_points))).topk(config.agents, dim=-1).indices
+    points = airspace.nearest(local_places("region.start_positions", given, airspace.regions[region]), region)
+    name = airspace.regions[region].name
     problem = f"lead to the same landing point of {name}: take others, or region.start_together=true"
+    distinct = together or len(points.unique()) == len(points)
     checks.require(distinct, "region.start_positions", given, problem)
-    return points
+    return points.expand(n, -1).clone()
 
 
 def _nearest_other(points: Tensor) -> Tensor:
     """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for padded ones."""
     distance, real = torch.full((len(points),), torch.inf), points.isfinite().all(-1)
     places = np.asarray(shapely.points(points[real].double().numpy()))
-    nearest = shapely.STRtree(places).query_nearest(
-        places, exclusive=True, return_distance=True, all_matches=False
-    )
-    (index, _), found = (torch.as_tensor(each) for each in nearest)
+    options = {"exclusive": True, "return_distance": True, "all_matches": False}
+    (index, _), found = map(torch.as_tensor, shapely.STRtree(places).query_nearest(places, **options))
     distance[real.nonzero().squeeze(-1)[index]] = found.float()
     return distance

@@ -10,13 +10,11 @@ from typing import Any, cast
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import MultiPoint, MultiPolygon, Polygon
 
 from damian.common import checks
 from damian.common.errors import InputError
-
-Floats = NDArray[np.float64]
+from damian.world.regions.geodesy import Floats
 
 RESOLUTION = 0.01
 """Distances of landing points that differ by less are not told apart [m]."""

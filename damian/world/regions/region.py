@@ -1,8 +1,8 @@
 """Operative regions in local metres about their centroid, and places that settings give in them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import shapely
@@ -60,6 +60,37 @@ def centred(region: Region) -> Region:
 def to_grid(metres: Floats) -> Floats:
     """Lengths [*] rounded to 1/65536 m."""
     return np.round(metres * 65536) / 65536
+
+
+def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
+    """Places of the settings in local metres of a region, [P, 2]; all of them must lie inside.
+
+    Each is ``[x, y]``, metres east and north in the coordinates in which the region is given (those of
+    ``region.vertices``; of a file: about the area's centroid), or, where a file gives the region,
+    ``{lat: 53.1, lon: -4.5}`` in degrees. ``key`` is that of the setting, for errors.
+    """
+    local = np.array([_local_place(key, place, region) for place in places])
+    inside = shapely.contains_xy(region.polygon, local)
+    if not inside.all():
+        first = int(np.argmin(inside))
+        given, (x, y) = places[first], local[first]
+        shown = f"{given} (at [{x:g}, {y:g}] m)" if isinstance(given, Mapping) else f"{[*given]} m"
+        west, south, east, north = np.round(np.tile(region.offset, 2) + region.polygon.bounds, 2)
+        bounds = f"x {west:.10g} to {east:.10g} m, y {south:.10g} to {north:.10g} m"
+        raise InputError(f"{key}: {shown} is not inside {region.name} ({bounds})")
+    return local
+
+
+def _local_place(key: str, place: Any, region: Region) -> Floats:
+    """A place in local metres, [2]."""
+    if not isinstance(place, Mapping):
+        return to_grid(np.array(place, float) - region.offset)
+    problem = (
+        f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in metres, or "
+        "take a region from a FIR table or GeoJSON file"
+    )
+    checks.require(region.origin is not None, key, place, problem)
+    return np.stack(to_local(place["lat"], place["lon"], cast(tuple[float, float], region.origin)))
 
 
 def local_region(
