@@ -14,14 +14,7 @@ from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.server.features import (
-    ServerContext,
-    check_features,
-    feature_of,
-    observe,
-    observe_own,
-    stack,
-)
+from damian.server.features import ServerContext, check_features, feature_of, observe, observe_own, stack
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
@@ -139,9 +132,8 @@ class Server:
         """Move the tables to a device, in place."""
         self._scales = self._scales.to(device)
         moving = (Tensor, FootprintTables, SourceGrid)
-        self._context = ServerContext._make(
-            each.to(device) if isinstance(each, moving) else each for each in self._context
-        )
+        moved = (each.to(device) if isinstance(each, moving) else each for each in self._context)
+        self._context = ServerContext._make(moved)
         return self
 
     def messages(self, rows: Tensor) -> Messages:
@@ -175,9 +167,9 @@ class Server:
         """Observations, rewards and status; without ``source_over`` the source never ends."""
         features = self.features(messages, steps, coverage=coverage, belief=belief)
         result = self.reward_and_status(features, messages, steps, source_over)
-        known = (
-            KnownCoverage(self.counted(messages), features["coverage"]) if self.remembers_coverage else None
-        )
+        known = None
+        if self.remembers_coverage:
+            known = KnownCoverage(self.counted(messages), features["coverage"])
         return ServerOutputs(*self.observations(features), *result, known)
 
     def features(
@@ -244,6 +236,5 @@ class Server:
 
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
-        region = self.region_of(messages)
-        scales = self._scales
+        region, scales = self.region_of(messages), self._scales
         return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)

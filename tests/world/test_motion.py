@@ -9,13 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.world.motion import (
-    MotionConfig,
-    flight_levels,
-    minimum_time,
-    poses,
-    time_law,
-)
+from damian.world.motion import MotionConfig, flight_levels, minimum_time, poses, time_law
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
 CASES = GOLDEN["uav_trajectories"]["cases"]
@@ -40,26 +34,19 @@ def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(c
     expected = torch.tensor([row[2:] for row in rows], dtype=torch.float64)
     elapsed = torch.tensor([start[r[0]] + r[1] for r in rows], dtype=torch.float64)
     elapsed.requires_grad_(True)
-    n = len(rows)
-    position, cruised = poses(
-        torch.tensor(case["A"], dtype=torch.float64).expand(n, 2),
-        torch.tensor(case["B"], dtype=torch.float64).expand(n, 2),
-        torch.full((n,), case["flight_level"], dtype=torch.float64),
-        elapsed,
-        torch.full((n,), case["T_takeoff"], dtype=torch.float64),
-        torch.full((n,), case["T_flight"], dtype=torch.float64),
-        case["degree"],
-    )
+    names = ("A", "B", "flight_level", "T_takeoff", "T_flight")
+    origin, target, level, *times = (torch.tensor([case[name]] * 15, dtype=torch.float64) for name in names)
+    position, cruised = poses(origin, target, level, elapsed, *times, case["degree"])
     velocity, acceleration = [], []
     for axis in position.unbind(-1):
         (v,) = torch.autograd.grad(axis.sum(), elapsed, create_graph=True)
         velocity.append(v)
         acceleration.append(torch.autograd.grad(v.sum(), elapsed, retain_graph=True)[0])
     torch.testing.assert_close(position.detach(), expected[:, :3], atol=1e-4, rtol=0)
-    way = torch.linalg.vector_norm(expected[:, :2] - torch.tensor(case["A"]), dim=-1)
+    way = torch.linalg.vector_norm(expected[:, :2] - origin, dim=-1)
     torch.testing.assert_close(cruised.detach(), way, atol=1e-4, rtol=0)
     # Derivatives jump where two phases meet, so they are compared only inside the phases.
-    inside = [i for i in range(n) if i % 5 in (1, 2, 3)]
+    inside = [i for i in range(15) if i % 5 in (1, 2, 3)]
     torch.testing.assert_close(torch.stack(velocity, -1)[inside], expected[inside, 3:6], atol=1e-4, rtol=0)
     torch.testing.assert_close(torch.stack(acceleration, -1)[inside], expected[inside, 6:], atol=1e-4, rtol=0)
 

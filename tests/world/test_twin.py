@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 import torch
 import twin
-from helpers import (
-    KEEPS_GOING,
-    act,
-    both_kinds,
-    clock,
-    everything,
-    fresh,
-    random_actions,
-    sent_messages,
-)
+from helpers import KEEPS_GOING, act, both_kinds, clock, everything, fresh, random_actions, sent_messages
 from twin import GLOBAL, LOCAL
 
 from damian.envs.config import ScenarioConfig
@@ -80,10 +71,8 @@ def twins(env: UavEnv) -> list[twin.World]:
 
 def check_observation(world: twin.World, observation: torch.Tensor):
     """Assert that the critic's observation [N, G] of one world equals the twin's."""
-    columns = [
-        np.array(values).reshape(len(world.uavs), -1)
-        for values in (world.observe()[name] for name in OBSERVED)
-    ]
+    features = world.observe()
+    columns = [np.array(features[name]).reshape(len(world.uavs), -1) for name in OBSERVED]
     difference = np.abs(np.concatenate(columns, 1) - observation.numpy())
     # Bearings and drifts are angles over a full turn, so 0 equals 1.
     widths = np.cumsum([0, *[c.shape[1] for c in columns]])
