@@ -37,7 +37,6 @@ class Simulation:
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         shortest = self._shortest_flights()
-        self._require_moves(shortest)
         self.shortest_flight = shortest if config.battery.enabled else None
         self.initial = self._initial_state(region, start, stops, seed)
         self.layout = StateLayout(self.initial)
@@ -91,10 +90,6 @@ class Simulation:
         state = self.decide(state, action, action_valid)
         state = self.vehicles.move(state)
         return self._sense(state._replace(steps=state.steps + 1), action_valid)
-
-    def ready(self, state: State) -> Tensor:
-        """Whether each UAV may choose an action now, [B, N] bool."""
-        return self.vehicles.ready(state)
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
@@ -176,23 +171,21 @@ class Simulation:
         return stuck | (observed(state.battery, self.config.battery) <= 0)
 
     def _shortest_flights(self) -> Tensor:
-        """Length of the shortest flight from each landing point [m], 0 if no action flies, [R*L]."""
-        if self.config.actions.kind == "discrete":
-            length = self.candidates.distance  # if this point is out of reach, the UAV holds
-            length = length.where(length > 0, torch.inf).amin(-1)
-        else:
-            length = torch.cat([_nearest_other(points) for points in self.airspace.points])
-        return length.where(length.isfinite(), 0.0)
+        """Length of the shortest flight from each landing point [m], 0 if no action flies, [R*L].
 
-    def _require_moves(self, shortest: Tensor) -> None:
-        """Refuse actions if none of them leads from any landing point to another one, [R*L] metres away."""
+        Actions are refused if none of them leads from any landing point to another one.
+        """
         actions = self.config.actions
-        moves = shortest > 0
-        if actions.kind == "continuous":  # a landing point is nearest beyond half of the way to it
-            moves = moves & (shortest < 2 * self.candidates.max_distance)
+        if actions.kind == "discrete":
+            length = self.candidates.distance  # if this point is out of reach, the UAV holds
+            length, longest = length.where(length > 0, torch.inf).amin(-1), torch.inf
+        else:  # a landing point is nearest beyond half of the way to it
+            length = torch.cat([_nearest_other(points) for points in self.airspace.points])
+            longest = 2 * self.candidates.max_distance
+        moves = self.airspace.max_points == 1 or bool((length < longest).any())
         problem = "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
-        alone = self.airspace.max_points == 1
-        checks.require(alone or bool(moves.any()), "actions.distances", actions.distances, problem)
+        checks.require(moves, "actions.distances", actions.distances, problem)
+        return length.where(length.isfinite(), 0.0)
 
     def _readings(self, state: State) -> Tensor:
         """Readings of all sensors beside each other, [B, N, K]."""
@@ -225,7 +218,7 @@ class Simulation:
         goal = start + region.unsqueeze(-1) * self.airspace.max_points
         number = torch.arange(n)
         zeros = torch.zeros(goal.shape)
-        place = gather_rows(self.points, goal)
+        place, n_readings = gather_rows(self.points, goal), sum(each.width for each in self.sensors.values())
         state = State(
             seed=counter_rng.world_seeds(seed, n),
             episode=torch.zeros_like(number),
@@ -246,9 +239,7 @@ class Simulation:
             source_over=torch.zeros_like(number, dtype=torch.bool),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
-            sent=Messages.blank(
-                goal.unsqueeze(-1).repeat(1, 1, stops), sum(sensor.width for sensor in self.sensors.values())
-            ),
+            sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, stops), n_readings),
         )
         state = self._sense(state)
         landed = torch.full_like(state.sent.landed, -1.0)

@@ -58,9 +58,8 @@ def test_every_term_equals_that_of_a_plain_loop(seed, n_agents, given_weights, i
         for i in range(n_agents):
             values = {name: inputs[name][b, i].item() for name in BUILT_IN}
             expected = twin.terms(values, int(counters.motions[b, i]), task)
-            assert {name: value[b, i].item() for name, value in ours.items()} == pytest.approx(
-                expected, abs=1e-6
-            )
+            found = {name: value[b, i].item() for name, value in ours.items()}
+            assert found == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_built_in_term_can_be_used_again_with_parameters_of_its_own():
@@ -92,10 +91,9 @@ def test_every_end_of_an_episode_equals_that_of_a_plain_loop(
     dt = float(rng.choice([1.0, 0.5]))
     steps = rng.integers(1, 40, 6)
     worlds = [(float(n * dt), uavs) for n, (_, uavs) in zip(steps, worlds, strict=True)]
-    for now, uavs in worlds:
-        for uav in uavs:
-            if uav.heard_at is not None:  # All detections happen at the end of a step.
-                uav.heard_at = now if uav.spots else float(rng.integers(round(now / dt) + 1)) * dt
+    for now, uav in [(now, uav) for now, uavs in worlds for uav in uavs if uav.heard_at is not None]:
+        # All detections happen at the end of a step.
+        uav.heard_at = now if uav.spots else float(rng.integers(round(now / dt) + 1)) * dt
     messages, _ = messages_of(worlds)
     over = torch.zeros(6, dtype=torch.bool)
     ours = status(messages, torch.as_tensor(steps), over, dt, episode)

@@ -117,7 +117,7 @@ def test_recorded_flights_have_the_same_ends_and_durations():
     env = ready_env(usecase(1, motion=motion), 1)
     points = settings_points(env)
     for row in flights:
-        assert env.simulation.ready(env.state).all()
+        assert env.simulation.vehicles.ready(env.state).all()
         act(env, torch.tensor([[row["action"]]]))
         state = env.state
         assert points[state.origin].squeeze().tolist() == pytest.approx(row["start"], abs=1e-4)

@@ -94,7 +94,7 @@ def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
     worlds, generator = twins(env), torch.Generator().manual_seed(0)
     begun = spotting = 0
     for step in range(1, 41):
-        ready = env.simulation.ready(env.state).tolist()
+        ready = env.simulation.vehicles.ready(env.state).tolist()
         output = act(env, random_actions(env, generator))
         goals = env.simulation.points[env.state.goal].tolist()
         sent, told = sent_messages(output), output["agents", "message_sent"].tolist()

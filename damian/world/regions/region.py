@@ -102,27 +102,25 @@ def local_region(
 ) -> Region:
     """Build a region in metres about the centroid of its area on the sphere from polygon parts in degrees.
 
-    Edges are straight in local metres: nearly great circles, not parallels of latitude.
+    Edges are straight in local metres: nearly great circles, not parallels of latitude. ``source`` begins
+    error messages.
 
     Args:
         parts: for each part its rings, the shell first; each [V, 2] degrees (longitude, latitude).
         name: of the region.
         levels: lowest and highest flight level [FL], if known.
-        source: prefix of error messages.
         excluded: parts that are cut out.
     """
-    reference, unit = parts[0][0][0, 0], "deg (longitude, latitude)"
-    polygons, holes = (
-        [
-            polygon_from_rings([_unwrap_longitude(ring, reference) for ring in rings], source, unit)
-            for rings in some
-        ]
-        for some in (parts, excluded)
-    )
+
+    def united(some: Sequence[Sequence[Floats]]) -> Polygon | MultiPolygon:
+        unwrapped = [[_unwrap_longitude(ring, parts[0][0][0, 0]) for ring in rings] for rings in some]
+        polygons = [polygon_from_rings(rings, source, "deg (longitude, latitude)") for rings in unwrapped]
+        return cast(Polygon | MultiPolygon, shapely.union_all(polygons))
+
     # Parts that were cut at the antimeridian share an edge, which a valid MultiPolygon must not.
-    shape = cast(Polygon | MultiPolygon, shapely.union_all(polygons))
+    shape = united(parts)
     if excluded:
-        shape = cast(Polygon | MultiPolygon, shape - shapely.union_all(holes))
+        shape = cast(Polygon | MultiPolygon, shape - united(excluded))
         if shape.is_empty:
             raise InputError(f"{source}: all of it is excluded; take a larger region")
     if shape.bounds[2] - shape.bounds[0] > 180:
