@@ -72,10 +72,6 @@ class SourceGrid(NamedTuple):
         """The row of ``log_reports`` that stands for no report."""
         return len(self.log_reports) - 1
 
-    def to(self, device: torch.device) -> "SourceGrid":
-        """Copy of the grid on another device."""
-        return self._make(each.to(device) if isinstance(each, Tensor) else each for each in self)
-
 
 def build_source_grid(
     airspace: Airspace, source: SourceConfig, radius: float, dt: float, cell: float | None = None

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.tensors import gather_rows
+from damian.common.tensors import gather_rows, move_attributes
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext, check_features, feature_of, observe, observe_own, stack
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
-from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
+from damian.world.coverage import KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.simulation import Simulation
 
@@ -72,11 +72,11 @@ class Server:
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._n_readings = sum(widths.values())
-        footprints: FootprintTables | None = None
+        footprints = None
         if "coverage" in self.names:
             polygons = [region.polygon for region in airspace.regions]
             footprints = build_tables(polygons, airspace.points.double().cpu().numpy(), simulation.radius)
-        grid: SourceGrid | None = None
+        grid = None
         if observation.belief:
             cell = observation.belief_cell
             grid = build_source_grid(airspace, simulation.config.source, simulation.radius, self.dt, cell)
@@ -130,10 +130,7 @@ class Server:
 
     def to(self, device: torch.device) -> "Server":
         """Move the tables to a device, in place."""
-        self._scales = self._scales.to(device)
-        moving = (Tensor, FootprintTables, SourceGrid)
-        moved = (each.to(device) if isinstance(each, moving) else each for each in self._context)
-        self._context = ServerContext._make(moved)
+        move_attributes(self, device)
         return self
 
     def messages(self, rows: Tensor) -> Messages:

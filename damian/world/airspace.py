@@ -11,7 +11,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.tensors import gather_rows, tree_map
+from damian.common.tensors import gather_rows
 from damian.world.config import RegionConfig
 from damian.world.regions.polygon import RESOLUTION, Floats, landing_lattice, largest_vertex_distance
 from damian.world.regions.region import Region
@@ -75,10 +75,6 @@ class Airspace(NamedTuple):
         """The landing points nearest to places [P, 2] m, as ids within their region, [P]."""
         regions, target = torch.full((len(places),), region), torch.as_tensor(places)
         return nearest_points(self.cells, self.exact_points, regions, target, 1).squeeze(-1)
-
-    def to(self, device: torch.device) -> "Airspace":
-        """Copy of the airspace on another device."""
-        return tree_map(lambda each: each.to(device) if isinstance(each, Tensor) else each, self)
 
 
 def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -> Airspace:

@@ -37,10 +37,6 @@ class FootprintTables(NamedTuple):
     masks: Tensor
     cells_per_metre: float
 
-    def to(self, device: torch.device | str) -> "FootprintTables":
-        """Copy of the tables on another device."""
-        return self._replace(masks=self.masks.to(device))
-
 
 def build_tables(
     polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],

@@ -111,14 +111,6 @@ class Candidates:
         offset = gather_rows(points, nearest) - points[own, None, None]
         return Ranking(nearest, torch.linalg.vector_norm(offset, dim=-1)), within
 
-    def to(self, device: torch.device) -> "Candidates":
-        """Move the tables to a device, in place."""
-        self.airspace = self.airspace.to(device)
-        if self.config.kind == "discrete":
-            self.ranking = Ranking(*(table.to(device) for table in self.ranking))
-            self.distance, self.hold = self.distance.to(device), self.hold.to(device)
-        return self
-
 
 @torch.library.custom_op("damian::nearest_inside", mutates_args=())
 def _nearest_inside(

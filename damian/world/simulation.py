@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import gather_rows, tree_map
+from damian.common.tensors import gather_rows, move_attributes, tree_map
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
@@ -52,14 +52,8 @@ class Simulation:
 
     def to(self, device: torch.device) -> "Simulation":
         """Move all tensors to a device, in place."""
-        self.airspace = self.airspace.to(device)
-        self.candidates.to(device)
-        self.vehicles.to(device)
-        self.points = self.points.to(device)
-        if self.shortest_flight is not None:
-            self.shortest_flight = self.shortest_flight.to(device)
-        for name in ("walk", "initial", "packed_initial"):
-            setattr(self, name, tree_map(lambda t: t.to(device), getattr(self, name)))
+        for owner in (self, self.candidates, self.vehicles):
+            move_attributes(owner, device)
         return self
 
     def reset(self, worlds: PackedState, mask: Tensor) -> PackedState:

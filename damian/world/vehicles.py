@@ -1,7 +1,6 @@
 """Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
 
 from abc import ABC, abstractmethod
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -43,13 +42,6 @@ class MotionModel(ABC):
         self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
         self.charge = float(charge_gain(torch.tensor(dt), config.battery))
         self.chargers = _charging_points(config, airspace)
-
-    def to(self, device: torch.device) -> Self:
-        """Move all tensors to a device, in place."""
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                setattr(self, name, value.to(device))
-        return self
 
     @abstractmethod
     def ready(self, state: State) -> Tensor:

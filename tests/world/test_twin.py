@@ -26,7 +26,9 @@ OBSERVED = [*TWIN_FEATURES, *LOCAL]
 
 def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> ScenarioConfig:
     """Every reward term and feature except the coverage; uneven distances, so that no two points tie."""
-    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0}
+    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0, "individual": 0.8, "system": 1.5}
+    task |= {"drift": "printed" if since else "smooth", "desired_spotting": 0.7, "desired_distance": 0.4}
+    task |= {"desired_distance_not_spotting": 0.6, "desired_distance_spotting": 0.2}
     return ScenarioConfig(
         agents=n_agents,
         region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, initial_conditions=24),
@@ -126,9 +128,7 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         reward=RewardConfig(spotted=0.0, coverage=1.0),
         episode=KEEPS_GOING,
     )
-    env = fresh(scenario, num_worlds=3)
-    generator = torch.Generator().manual_seed(0)
-    radius = env.simulation.radius
+    env, generator = fresh(scenario, num_worlds=3), torch.Generator().manual_seed(0)
     trails = env.state.position[..., :2].unsqueeze(2).expand(-1, -1, window, -1)
     for _ in range(5):
         output = act(env, random_actions(env, generator))
@@ -136,5 +136,5 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         trails = torch.cat([newest, trails[:, :, :-1]], 2)
         for b, region in enumerate(env.state.region.tolist()):
             polygon = env.simulation.airspace.regions[region].polygon
-            expected = twin.exact_share(polygon, trails[b].double().numpy(), radius)
+            expected = twin.exact_share(polygon, trails[b].double().numpy(), env.simulation.radius)
             assert output["agents", "reward"][b, :, 0].tolist() == pytest.approx(expected, abs=0.01)

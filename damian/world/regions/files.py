@@ -36,13 +36,9 @@ class _Feature(NamedTuple):
     """Whether UAVs must keep out of it."""
 
     @property
-    def polygons(self) -> list[list[Any]]:
-        return list(_polygons(self.geometry))
-
-    @property
     def fault(self) -> str:
         """Why it cannot be a region; empty if it can."""
-        if self.polygons:
+        if any(_polygons(self.geometry)):
             return "is excluded" if self.is_excluded else ""
         kind = self.geometry.get("type")
         return f"is a {kind}{' without corners' * (kind in _AREAS)}" if kind else "has no geometry"
@@ -72,7 +68,11 @@ def read_area(path: str | os.PathLike[str], index: Any = None, where: Any = None
             features = read(path)
             chosen = _choose(features, index, where)
             parts, excluded = (
-                [[_degrees(ring, each) for ring in rings] for each in some for rings in each.polygons]
+                [
+                    [_degrees(ring, each) for ring in rings]
+                    for each in some
+                    for rings in _polygons(each.geometry)
+                ]
                 for some in (chosen, [each for each in features if each.is_excluded])
             )
         except InputError:
