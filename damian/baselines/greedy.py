@@ -195,7 +195,7 @@ class Searcher(Greedy):
         ground = self.points[region]
         chance = detection_chance(self.grid, belief, regions).expand(-1, known.time.shape[1], -1)
         here = own.trail[..., :1] % self.points.shape[1]
-        rows = report_rows(self.grid, own, ~own.in_flight)
+        rows = report_rows(self.grid, own)
         each = belief.expand(*rows.shape, -1)
         stays = chance_of_staying(self.grid, each, rows.unsqueeze(-1))
         chance = chance.scatter(-1, here, stays).masked_fill(self.taken(known), 0.0)

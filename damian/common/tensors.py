@@ -40,6 +40,19 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
     return tree._make(values)
 
 
+def to_device(value: Any, device: torch.device) -> Any:
+    """Copy of a tensor, or of nested named tuples of tensors and other values, on another device."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    return value._make(to_device(each, device) for each in value) if hasattr(value, "_make") else value
+
+
+def move_attributes(owner: object, device: torch.device) -> None:
+    """Move the tensors among an object's attributes to a device, in place."""
+    for name, value in vars(owner).items():
+        setattr(owner, name, to_device(value, device))
+
+
 def tree_where(mask: Tensor, new: Tree, old: Tree) -> Tree:
     """Take the rows of ``new`` where the mask [*] is true and of ``old`` elsewhere; tensors are [*, ...]."""
     return tree_map(lambda a, b: torch.where(expand_mask(mask, a), a, b), new, old)

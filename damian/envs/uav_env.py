@@ -222,7 +222,7 @@ class UavEnv(EnvBase):
 
     def _state_outputs(self, state: State, features: Features | None = None) -> Outputs:
         """The outputs that depend on a state and, if given, on the features of its messages."""
-        outputs: Outputs = {keys.READY: self.simulation.ready(state)}
+        outputs: Outputs = {keys.READY: self.simulation.vehicles.ready(state)}
         if features is not None:
             observation, global_observation = self.server.observations(features)
             outputs |= {keys.OBSERVATION: observation, keys.GLOBAL_OBSERVATION: global_observation}

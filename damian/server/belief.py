@@ -10,7 +10,6 @@ is the probability of each of its K cells [*, K], and ``region`` the index of th
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +42,6 @@ STEPS_PER_MOVE = 4
 """Steps over which a move is measured: straight moves get further than those that turn in each step."""
 _RARE = 1e-6
 """Weight of a move that was never counted."""
-_POINTS_AT_ONCE = 256
 
 
 class SourceGrid(NamedTuple):
@@ -73,10 +71,6 @@ class SourceGrid(NamedTuple):
     def no_report(self) -> int:
         """The row of ``log_reports`` that stands for no report."""
         return len(self.log_reports) - 1
-
-    def to(self, device: torch.device) -> "SourceGrid":
-        """Copy of the grid on another device."""
-        return self._make(each.to(device) if isinstance(each, Tensor) else each for each in self)
 
 
 def build_source_grid(
@@ -132,15 +126,13 @@ def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarra
     """Moves of the source in steps of ``dt``, counted from walks, [S, 2] metres."""
     # Independent moves like these get as far in STEPS_PER_MOVE steps as the source does.
     rng, polygons = np.random.default_rng(_SEED), polygons[:_WALKS]
-    source = replace(source, position=None)  # where it begins is not told
     time = torch.arange(_STEPS + 1, dtype=torch.float64) * dt
     found = []
     for polygon in polygons:
         walk = draw_walks(polygon, source, math.ceil(_WALKS / len(polygons)), rng)
-        n_walks = len(walk.stop)
         every = tree_map(lambda t: t.repeat_interleave(len(time), 0), walk)
-        place = locate(every, time.repeat(n_walks), source.after_walk == "loop").position
-        place = place.view(n_walks, -1, 2)
+        place = locate(every, time.repeat(len(walk.stop)), source.after_walk == "loop").position
+        place = place.view(len(walk.stop), -1, 2)
         found.append((place[:, STEPS_PER_MOVE:] - place[:, :-STEPS_PER_MOVE]).reshape(-1, 2))
     return torch.cat(found).numpy() / math.sqrt(STEPS_PER_MOVE)
 
@@ -177,10 +169,8 @@ def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
     """
     silent = 1 - detects
     again = renewed * silent + (1 - renewed) * silent / (1 - emits * detects)
-    fresh, repeated = (
-        torch.stack(each, 1).flatten(0, 1)
-        for each in ((silent, detects), (again, renewed * detects + 1 - renewed))
-    )
+    fresh = torch.stack([silent, detects], 1).flatten(0, 1)
+    repeated = torch.stack([again, renewed * detects + 1 - renewed], 1).flatten(0, 1)
     return torch.cat([fresh, repeated, torch.ones_like(fresh[:1])]).log()
 
 
@@ -200,8 +190,7 @@ def _staying(grid: SourceGrid) -> Tensor:
     """The table ``SourceGrid.next_staying``, from the repeated reports of ``SourceGrid.log_reports``."""
     again = grid.log_reports[grid.no_report // 2 : -1].exp()
     again[::2] = 1 - again[::2]
-    again = _one_step_before(grid, again)
-    return torch.cat([again, torch.zeros_like(again[:1])])
+    return torch.cat([_one_step_before(grid, again), torch.zeros_like(again[:1])])
 
 
 def _detected_shares(
@@ -215,12 +204,8 @@ def _detected_shares(
     inside |= ~inside.any(-1, keepdims=True)  # a corner of the region between the samples
     weight = torch.as_tensor(inside / inside.sum(-1, keepdims=True), dtype=torch.float32)
     sample = torch.as_tensor(sample.reshape(-1, 2), dtype=torch.float32)
-    return torch.cat(
-        [
-            ((torch.cdist(part, sample) <= radius).view(len(part), *weight.shape) * weight).sum(-1)
-            for part in points.nan_to_num(posinf=1e30).split(_POINTS_AT_ONCE)
-        ]
-    )
+    parts = [torch.cdist(part, sample) <= radius for part in points.nan_to_num(posinf=1e30).split(256)]
+    return torch.cat([(part.view(len(part), *weight.shape) * weight).sum(-1) for part in parts])
 
 
 # The filter.
@@ -235,7 +220,7 @@ def repeated(grid: SourceGrid, rows: Tensor, before: Tensor) -> Tensor:
     return torch.add(rows, same, alpha=grid.no_report // 2)  # takes a third of the time of ``where``
 
 
-def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor) -> Tensor:
+def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor | bool = True) -> Tensor:
     """The rows of messages [*, N], if ``sent`` in this step [*, N] bool; a UAV in flight detects nothing."""
     row = 2 * messages.trail[..., 0] + messages.spotted
     return torch.where(sent & ~messages.in_flight, row, grid.no_report)
@@ -349,8 +334,7 @@ def begin_beliefs(
     grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor
 ) -> Beliefs:
     """Begin new episodes in the worlds of the mask [B], in place; all receivers know the first messages."""
-    report = report_rows(grid, messages, torch.ones_like(messages.spotted))
-    _begin(*_parts(grid, window), report, region, mask)
+    _begin(*_parts(grid, window), report_rows(grid, messages), region, mask)
     return latest(window, window.slot)
 
 
@@ -378,8 +362,7 @@ def latest(window: Window, slot: Tensor) -> Beliefs:
 # operator takes no named tuples, so grid and window come in parts: all tensors of the grid, the number
 # ``emits``, the tensors of the window that change, and its slot.
 
-_Tables = list[Tensor | None]
-_Ring = list[Tensor]
+_Tables, _Ring = list[Tensor | None], list[Tensor]
 
 
 def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, float, _Ring, Tensor]:
@@ -429,8 +412,7 @@ def _advance(
         old = window.belief.flatten(0, 2).index_select(0, before)
         new = weigh(predict(grid, old, within), likelihood(grid, reports))
         _write(window.belief, row, new, changes)
-    beliefs = latest(window, slot)
-    return slot, beliefs.server, beliefs.own
+    return slot, *latest(window, slot)
 
 
 @_advance.register_fake

@@ -9,7 +9,7 @@ from torch import Tensor
 from damian import keys
 from damian.common import checks
 from damian.common.errors import naming_errors
-from damian.common.tensors import tree_map, tree_where
+from damian.common.tensors import expand_mask, tree_map
 from damian.server.features import feature_of, stack
 from damian.server.server import Features, Server
 from damian.world.messages import Messages
@@ -51,18 +51,15 @@ def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) 
     """A feature [B, N] of what UAVs know who know other messages of each other than these, [B, N]."""
     n = messages.time.shape[-1]
     own = torch.eye(n, dtype=torch.bool, device=steps.device).expand(len(steps), n, n)
-    others = tree_map(_changed, messages)
-    mine, theirs = (
-        tree_map(lambda field: field.unsqueeze(1).expand(-1, n, *field.shape[1:]), each)
-        for each in (messages, others)
-    )
-    return server.own_features(tree_where(own, mine, theirs), steps, [name])[name]
 
+    def changed_of_others(field: Tensor) -> Tensor:
+        if field.dtype == torch.bool:
+            other = ~field
+        else:
+            other = field + 1 if field.is_floating_point() else field.flip(0, 1)  # other landing points
+        return torch.where(expand_mask(own, field.unsqueeze(1)), field.unsqueeze(1), other.unsqueeze(1))
 
-def _changed(field: Tensor) -> Tensor:
-    if field.dtype == torch.bool:
-        return ~field
-    return field + 1 if field.is_floating_point() else field.flip(0, 1)  # ids of other landing points
+    return server.own_features(tree_map(changed_of_others, messages), steps, [name])[name]
 
 
 def not_finite(server: Server, simulation: Simulation, steps: TensorDictBase) -> str | None:

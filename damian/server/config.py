@@ -44,18 +44,14 @@ class ObservationConfig(Settings):
         choices=("mean", "newest"),
     )
     belief: list[str] = setting(
-        [],
-        "Where the source is, by Bayes' rule: belief_gain (per action), belief_moments, belief_map.",
+        [], "Where the source is, by Bayes' rule: belief_gain (per action), belief_moments, belief_map."
     )
     belief_cell: float | None = setting(
         None, "Edge of a cell of the belief; 0.8 footprint radii or more if not given.", unit="m", above=0
     )
     window: int = setting(2, "Latest landing points of a UAV that its coverage counts.", low=1, high=16)
     timeline: int = setting(
-        0,
-        "Latest steps for which actor and critic observe where other UAVs were, as far as known.",
-        low=0,
-        high=100,
+        0, "Latest steps of which actor and critic observe where other UAVs were, if known.", low=0, high=100
     )
 
     def __post_init__(self) -> None:
@@ -103,9 +99,7 @@ class RewardWeights(Settings):
     source_time: float = setting(0.0, "Weight of a recent detection by any UAV (R2^s, eq. 6).")
     source_bearing: float = setting(0.0, "Weight of a small bearing of the source (R3^s, eq. 6).")
     source_drift: float = setting(0.0, "Weight of a heading towards the source (R4^s, eq. 6).")
-    spotting_agents: float = setting(
-        0.0, "Weight of spotting by the desired share of the UAVs (R5^s, eq. 6)."
-    )
+    spotting_agents: float = setting(0.0, "Weight of spotting by the desired share of UAVs (R5^s, eq. 6).")
     mean_distance: float = setting(0.0, "Weight of a mean distance as desired between UAVs (R6^s, eq. 6).")
     mean_distance_not_spotting: float = setting(0.0, "The same between UAVs that do not spot (R7^s, eq. 6).")
     mean_distance_spotting: float = setting(0.0, "The same from spotting UAVs to the source (R8^s, eq. 6).")

@@ -141,8 +141,7 @@ def _belief(v: FeatureCache) -> Tensor:
     """The belief of the context, or that after the first messages, [*, K]."""
     if v.context.belief is not None:
         return v.context.belief
-    rows = report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted))
-    return first_belief(v.grid, rows, v.region)
+    return first_belief(v.grid, report_rows(v.grid, v.messages), v.region)
 
 
 class Feature(NamedTuple):
@@ -211,18 +210,15 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
     """Features by name of messages [*, N], each [*, N], or in the shape and range that it declares."""
     cache, found = FeatureCache(messages, context), {}
     for name in names:
-        found[name] = feature_of(name).compute(cache)
-        _check_shape(name, found[name], messages.time.shape)
+        declared = feature_of(name)
+        found[name] = values = declared.compute(cache)
+        several = values.shape[-1:] if declared.width is None else (declared.width,)
+        columns = () if declared.width == 1 else several
+        expected = [*messages.time.shape, *columns]
+        if [*values.shape] != expected:
+            right = "(worlds, UAVs, values): return this shape, or declare another width"
+            raise InputError(f"feature {name}: shape: {[*values.shape]} is not {expected} {right}")
     return found
-
-
-def _check_shape(name: str, values: Tensor, of_messages: torch.Size) -> None:
-    width = feature_of(name).width
-    columns = () if width == 1 else (values.shape[-1:] if width is None else (width,))
-    expected = [*of_messages, *columns]
-    if [*values.shape] != expected:
-        right = "(worlds, UAVs, values): return this shape, or declare another width"
-        raise InputError(f"feature {name}: shape: {[*values.shape]} is not {expected} {right}")
 
 
 def observe_own(known: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
@@ -237,10 +233,8 @@ def observe_own(known: Messages, context: ServerContext, names: list[str]) -> di
 
 def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
     """Observation vector in the order of ``names``, [*, N, F] float32, whatever the features' types are."""
-    columns = [
-        features[name].unsqueeze(-1) if feature_of(name).width == 1 else features[name] for name in names
-    ]
-    return torch.cat(columns, -1).float()
+    values = [(features[name], feature_of(name).width) for name in names]
+    return torch.cat([each.unsqueeze(-1) if width == 1 else each for each, width in values], -1).float()
 
 
 def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -282,8 +276,7 @@ def _bearing(v: FeatureCache) -> Tensor:
     """Bearing of the source, clockwise from north, [*, N] in (-pi, pi]."""
     east, north = v(_to_source).unbind(-1)
     # Within a millimetre of the source the bearing would be a rounding error: it is set to 0 (north).
-    away = east.abs() + north.abs() > 1e-3
-    return torch.atan2(east, north) * away
+    return torch.atan2(east, north) * (east.abs() + north.abs() > 1e-3)
 
 
 def _pairwise(v: FeatureCache) -> Tensor:
@@ -359,8 +352,7 @@ def _coverage(v: FeatureCache) -> Tensor:
 @feature("global")
 def _mean_distance(v: FeatureCache) -> Tensor:
     """Mean distance to the other UAVs, over the largest vertex distance, [*, N]."""
-    n = v.messages.time.shape[-1]
-    return (v(_pairwise).sum(-1) / max(n - 1, 1)).clamp(max=1)
+    return (v(_pairwise).sum(-1) / max(v.messages.time.shape[-1] - 1, 1)).clamp(max=1)
 
 
 @FEATURES.register("mean_distance_not_spotting")
@@ -430,7 +422,7 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     """
     everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
     standing = v.wanted(v.messages.trail[..., 0])
-    rows = v.wanted(report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted)))
+    rows = v.wanted(report_rows(v.grid, v.messages))
     stays = chance_of_staying(v.grid, v.belief, rows).unsqueeze(-1)
     chance = detection_chance(v.grid, v.belief, v.region)
     chance = chance.scatter(-1, everyone, -chance.gather(-1, everyone))  # negative where a UAV stands

@@ -1,5 +1,6 @@
 """The terms of the reward, by the names of their features (paper, eq. 5-8), and terms of users."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -90,8 +91,8 @@ def terms_of(config: RewardConfig) -> dict[str, WeightedTerm]:
     for name in BUILT_IN:
         if weight := getattr(config, name):
             term = REWARD_TERMS.get(name, f"reward.{name}")
-            parameters = {each: getattr(config, each) for each in parameters_of(term.compute)}
-            found[name] = WeightedTerm(name, weight * factor[term.scope], term, parameters)
+            settings = {each: getattr(config, each) for each in parameters_of(term.compute)}
+            found[name] = WeightedTerm(name, weight * factor[term.scope], term, settings)
     for number, written in enumerate(config.custom):
         key = f"reward.custom[{number}]"
         path, term, parameters = REWARD_TERMS.read(written, key, "term")
@@ -141,37 +142,31 @@ def _near(value: Tensor, desired: float) -> Tensor:
 
 
 def _add(name: str, scope: str, compute: Callable[..., Tensor]) -> None:
-    REWARD_TERMS.register(name)(reward_term([name], scope)(compute))
+    """Register the term of a feature: ``compute(value, counters, **parameters)``."""
+
+    @functools.wraps(compute)
+    def term(features: Mapping[str, Tensor], counters: Counters, **parameters: Any) -> Tensor:
+        return compute(features[name], counters, **parameters)
+
+    REWARD_TERMS.register(name)(reward_term([name], scope)(term))
 
 
-_add("coverage", "individual", lambda f, counters: f["coverage"])
-_add("spotted", "individual", lambda f, counters: _per_motion(f["spotted"], counters))
-_add("battery", "individual", lambda f, counters: f["battery"])
-_add("source_distance", "system", lambda f, counters: _per_motion(1 - f["source_distance"], counters))
-_add("source_time", "system", lambda f, counters: 1 - f["source_time"])
-_add("source_bearing", "system", lambda f, counters: 1 - f["source_bearing"])
-_add("source_drift", "system", lambda f, counters, *, drift: _straight(f["source_drift"], drift))
-_add(
-    "spotting_agents",
-    "system",
-    lambda f, counters, *, desired_spotting: _near(f["spotting_agents"], desired_spotting),
-)
-_add(
-    "mean_distance",
-    "system",
-    lambda f, counters, *, desired_distance: _near(f["mean_distance"], desired_distance),
-)
+_add("coverage", "individual", lambda x, counters: x)
+_add("spotted", "individual", _per_motion)
+_add("battery", "individual", lambda x, counters: x)
+_add("source_distance", "system", lambda x, counters: _per_motion(1 - x, counters))
+_add("source_time", "system", lambda x, counters: 1 - x)
+_add("source_bearing", "system", lambda x, counters: 1 - x)
+_add("source_drift", "system", lambda x, counters, *, drift: _straight(x, drift))
+_add("spotting_agents", "system", lambda x, counters, *, desired_spotting: _near(x, desired_spotting))
+_add("mean_distance", "system", lambda x, counters, *, desired_distance: _near(x, desired_distance))
 _add(
     "mean_distance_not_spotting",
     "system",
-    lambda f, counters, *, desired_distance_not_spotting: _near(
-        f["mean_distance_not_spotting"], desired_distance_not_spotting
-    ),
+    lambda x, counters, *, desired_distance_not_spotting: _near(x, desired_distance_not_spotting),
 )
 _add(
     "mean_distance_spotting",
     "system",
-    lambda f, counters, *, desired_distance_spotting: _near(
-        f["mean_distance_spotting"], desired_distance_spotting
-    ),
+    lambda x, counters, *, desired_distance_spotting: _near(x, desired_distance_spotting),
 )

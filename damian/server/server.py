@@ -11,21 +11,14 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.tensors import gather_rows
+from damian.common.tensors import gather_rows, move_attributes
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.server.features import (
-    ServerContext,
-    check_features,
-    feature_of,
-    observe,
-    observe_own,
-    stack,
-)
+from damian.server.features import ServerContext, check_features, feature_of, observe, observe_own, stack
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
-from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
+from damian.world.coverage import KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.simulation import Simulation
 
@@ -79,11 +72,11 @@ class Server:
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._n_readings = sum(widths.values())
-        footprints: FootprintTables | None = None
+        footprints = None
         if "coverage" in self.names:
             polygons = [region.polygon for region in airspace.regions]
             footprints = build_tables(polygons, airspace.points.double().cpu().numpy(), simulation.radius)
-        grid: SourceGrid | None = None
+        grid = None
         if observation.belief:
             cell = observation.belief_cell
             grid = build_source_grid(airspace, simulation.config.source, simulation.radius, self.dt, cell)
@@ -137,11 +130,7 @@ class Server:
 
     def to(self, device: torch.device) -> "Server":
         """Move the tables to a device, in place."""
-        self._scales = self._scales.to(device)
-        moving = (Tensor, FootprintTables, SourceGrid)
-        self._context = ServerContext._make(
-            each.to(device) if isinstance(each, moving) else each for each in self._context
-        )
+        move_attributes(self, device)
         return self
 
     def messages(self, rows: Tensor) -> Messages:
@@ -175,9 +164,9 @@ class Server:
         """Observations, rewards and status; without ``source_over`` the source never ends."""
         features = self.features(messages, steps, coverage=coverage, belief=belief)
         result = self.reward_and_status(features, messages, steps, source_over)
-        known = (
-            KnownCoverage(self.counted(messages), features["coverage"]) if self.remembers_coverage else None
-        )
+        known = None
+        if self.remembers_coverage:
+            known = KnownCoverage(self.counted(messages), features["coverage"])
         return ServerOutputs(*self.observations(features), *result, known)
 
     def features(
@@ -244,6 +233,5 @@ class Server:
 
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
-        region = self.region_of(messages)
-        scales = self._scales
+        region, scales = self.region_of(messages), self._scales
         return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)

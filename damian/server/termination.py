@@ -22,18 +22,12 @@ class Status(NamedTuple):
 
     def entries(self) -> dict[str, Tensor]:
         """TorchRL's entries ``done``, ``terminated`` and ``truncated``, and ``success``, each [*, 1]."""
-        done = self.terminated | self.truncated
-        flags = {"success": self.success, "done": done}
-        flags |= {"terminated": self.terminated, "truncated": self.truncated}
+        flags = self._asdict() | {"done": self.terminated | self.truncated}
         return {name: flag.unsqueeze(-1) for name, flag in flags.items()}
 
 
 def status(
-    messages: Messages,
-    steps: Tensor,
-    source_over: Tensor,
-    dt: float,
-    config: EpisodeConfig,
+    messages: Messages, steps: Tensor, source_over: Tensor, dt: float, config: EpisodeConfig
 ) -> Status:
     """Success and the end of the episode: a time limit truncates, every other end terminates."""
     n_agents = messages.spotted.shape[-1]
@@ -45,12 +39,11 @@ def status(
     if config.end_with_source:
         ended = ended | source_over
     if config.max_steps is not None:
-        elapsed = steps
         if config.since_detection:
             # Times in messages are float32, so the step of the latest detection is the nearest whole number.
             latest = messages.detected_time.amax(-1).clamp(min=0).double()
-            elapsed = steps - (latest / dt).round().long()
-        timed_out = elapsed >= config.max_steps
+            steps = steps - (latest / dt).round().long()
+        timed_out = steps >= config.max_steps
     return Status(success, success | ended, timed_out & ~(success | ended))
 
 

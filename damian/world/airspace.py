@@ -1,7 +1,6 @@
 """Operative regions as padded tensors, with a test for inside a polygon and a search for landing points."""
 
 import math
-from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.tensors import gather_rows, tree_map
+from damian.common.tensors import gather_rows
 from damian.world.config import RegionConfig
 from damian.world.regions.polygon import RESOLUTION, Floats, landing_lattice, largest_vertex_distance
 from damian.world.regions.region import Region
@@ -43,8 +42,7 @@ class Cells(NamedTuple):
     """Side of a region's cells, [R, 1] metres, float64."""
 
 
-@dataclass(frozen=True)
-class Airspace:
+class Airspace(NamedTuple):
     """``R`` operative regions with at most ``L`` landing points and ``E`` polygon edges each.
 
     A landing point's *flat id* is ``region * L + point``; padded points lie infinitely far away.
@@ -73,11 +71,10 @@ class Airspace:
         """Largest number of landing points in a region (L)."""
         return self.points.shape[1]
 
-    def to(self, device: torch.device) -> "Airspace":
-        """Copy of the airspace on another device."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("regions", "cells")}
-        cells = tree_map(lambda t: t.to(device), self.cells)
-        return replace(self, cells=cells, **{name: tensor.to(device) for name, tensor in moved.items()})
+    def nearest(self, places: Floats, region: int) -> Tensor:
+        """The landing points nearest to places [P, 2] m, as ids within their region, [P]."""
+        regions, target = torch.full((len(places),), region), torch.as_tensor(places)
+        return nearest_points(self.cells, self.exact_points, regions, target, 1).squeeze(-1)
 
 
 def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -> Airspace:
@@ -87,7 +84,6 @@ def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -
     for region, lattice in zip(regions, lattices, strict=True):
         problem = f"UAVs are more than the {len(lattice)} landing points of {region.name}"
         checks.require(len(lattice) >= n_agents, "agents", n_agents, problem)
-    edges = [_edges(region.polygon) for region in regions]
     points = _padded(lattices, torch.inf)
     return Airspace(
         points=points.float(),
@@ -95,7 +91,7 @@ def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -
         cells=build_cells(lattices, [region.polygon for region in regions], 2 * n_agents - 1),
         n_points=torch.tensor([len(lattice) for lattice in lattices]),
         # A padded edge has zero length, so the inside test never counts it.
-        edges=_padded(edges, 0.0),
+        edges=_padded([_edges(region.polygon) for region in regions], 0.0),
         scale=torch.tensor([largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32),
         offset=torch.tensor([r.offset for r in regions], dtype=torch.float32),
         regions=tuple(regions),
@@ -171,8 +167,8 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
     padded = [np.pad(t, ((0, 0), (0, widest - t.shape[1])), constant_values=-1) for t in tables]
     first = np.cumsum([0, *map(len, rows_of_cells)])[:-1]
     ids, row_of_cell = (np.concatenate(parts).astype(np.int32) for parts in (padded, rows_of_cells))
-    fields = (ids, row_of_cell, first, np.array(shapes), np.array(corners), np.array(sides))
-    return Cells(*map(torch.as_tensor, fields))
+    tables = (ids, row_of_cell, first, np.array(shapes), np.array(corners), np.array(sides))
+    return Cells(*map(torch.as_tensor, tables))
 
 
 def _within_reach(lattice: Floats, place: Floats, n: int, side: float, farther: float) -> NDArray[np.int64]:
@@ -190,15 +186,13 @@ def _within_reach(lattice: Floats, place: Floats, n: int, side: float, farther: 
 
 def _edges(polygon: shapely.Geometry) -> np.ndarray:
     """Every edge of every ring, [E, 4] metres."""
-    rings = shapely.get_rings(shapely.get_parts(polygon))
-    corners = [shapely.get_coordinates(ring) for ring in rings]
-    return np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in corners])
+    rings = map(shapely.get_coordinates, shapely.get_rings(shapely.get_parts(polygon)))
+    return np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in rings])
 
 
 def _padded(arrays: list[np.ndarray], value: float) -> Tensor:
     """Stack arrays of different lengths, [R, longest, ...]."""
-    longest = max(len(a) for a in arrays)
-    stacked = np.full((len(arrays), longest, *arrays[0].shape[1:]), value)
+    stacked = np.full((len(arrays), max(map(len, arrays)), *arrays[0].shape[1:]), value)
     for row, array in zip(stacked, arrays, strict=True):
         row[: len(array)] = array
     return torch.as_tensor(stacked)

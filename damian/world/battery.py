@@ -15,8 +15,7 @@ _VERTICAL_FACTOR = 0.9
 
 def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:
     """Battery drain of cruising a distance: [*] metres to [*] percent."""
-    percent_per_hour = _full_power_drain(battery)
-    return distance * (percent_per_hour / (3600 * battery.reference_speed))
+    return distance * (_full_power_drain(battery) / (3600 * battery.reference_speed))
 
 
 def cruise_range(level: Tensor, battery: BatteryConfig) -> Tensor:
@@ -45,8 +44,7 @@ def used_so_far(
 
 def charge_gain(seconds: Tensor, battery: BatteryConfig) -> Tensor:
     """Battery level gained by charging: [*] seconds to [*] percent; not clipped at a full battery."""
-    full = 3600 * battery.capacity_kwh / battery.charging_power_kw
-    return seconds * (100 / full)
+    return seconds * (100 / (3600 * battery.capacity_kwh / battery.charging_power_kw))
 
 
 def observed(level: Tensor, battery: BatteryConfig) -> Tensor:

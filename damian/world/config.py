@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 from damian.common import checks
 from damian.common.fields import Settings, check_place, constant, setting
 
-RANDOM, GEOJSON, POLYNOMIAL = ("random",), ("geojson",), ("polynomial",)
-DYNAMIC, CHARGING = ("dynamic",), ("charging",)
+RANDOM, GEOJSON, FILES = ("random",), ("geojson",), ("fir", "geojson")
+POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 
 
 @dataclass
@@ -32,16 +32,12 @@ class RegionConfig(Settings):
     pool: int = setting(1, "Number of random regions, drawn once per seed.", low=1, high=10_000, kinds=RANDOM)
     vertices: list = setting([], "Polygon corners, [x, y] each.", unit="m", kinds=("vertices",))
     path: str = setting(
-        "",
-        "File, such as park.geojson, .kml, .gpkg, .shp, .plan (fir: damian:fir.csv).",
-        kinds=("fir", "geojson"),
+        "", "File, such as park.geojson, .kml, .gpkg, .shp, .plan (fir: damian:fir.csv).", kinds=FILES
     )
     id: str = setting("", "Airspace ID of the region in the FIR table.", kinds=("fir",))
-    index: Any = setting(
-        None, "Index of the feature in the file, from 0, or a list of several to unite.", kinds=GEOJSON
-    )
+    index: Any = setting(None, "Index of the feature in the file, from 0, or a list to unite.", kinds=GEOJSON)
     where: Any = setting(
-        None, "Property of the feature in the file, ``property:value``, or a list to unite.", kinds=GEOJSON
+        None, "Property of the feature, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
     lattice_step: float = setting(30.0, "Distance between landing points of a row.", unit="m", above=0)
     lattice_angle: float = setting(45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90)
@@ -69,9 +65,8 @@ class RegionConfig(Settings):
         good = indices == [None] or (indices and all(type(each) is int and each >= 0 for each in indices))
         self.refuse(not good, "index", "is not a feature's number, counted from 0, or a list of numbers")
         texts = self.where if isinstance(self.where, list) else [self.where]
-        good = texts == [None] or (
-            texts and all(isinstance(each, str) and re.search(".[:=]", each) for each in texts)
-        )
+        fits = texts and all(isinstance(each, str) and re.search(".[:=]", each) for each in texts)
+        good = texts == [None] or fits
         problem = "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
         self.refuse(not good, "where", problem)
         both = self.index is not None and self.where is not None

@@ -37,10 +37,6 @@ class FootprintTables(NamedTuple):
     masks: Tensor
     cells_per_metre: float
 
-    def to(self, device: torch.device | str) -> "FootprintTables":
-        """Copy of the tables on another device."""
-        return self._replace(masks=self.masks.to(device))
-
 
 def build_tables(
     polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],
@@ -69,10 +65,10 @@ def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor)
     ``positions`` ``[*, N, n, 2]`` [m].
     """
     lead, (n_uavs, n_last) = point_ids.shape[:-2], point_ids.shape[-2:]
-    ids, xy = point_ids.reshape(-1, n_uavs, n_last), positions.reshape(-1, n_uavs, n_last, 2)
-    worlds = _worlds_at_once(tables, ids)
-    chunks = zip(ids.split(worlds), xy.split(worlds), strict=True)
-    return torch.cat([_covered_share(tables, *chunk) for chunk in chunks]).reshape(*lead, n_uavs)
+    cells = (positions * tables.cells_per_metre).reshape(-1, n_uavs, n_last, 2)
+    # Windows that slide over the UAVs: i, i + 1, i + 2, ... (modulo N), without index tensors.
+    fleets = torch.cat([cells, cells[:, :-1]], 1).unfold(1, n_uavs, 1)
+    return _share_of_first(tables, point_ids.reshape(-1, n_uavs, n_last), fleets).reshape(*lead, n_uavs)
 
 
 class KnownCoverage(NamedTuple):
@@ -110,14 +106,6 @@ def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need on
     return torch.empty_like(share)
 
 
-def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
-    """Number of worlds of ``point_ids [b, N, n]`` to look up together; depends on shapes only."""
-    _, n_uavs, n_last = point_ids.shape
-    words_per_world = n_uavs * n_last * (n_uavs + n_last - 1 + tables.masks.shape[-1])
-    large = point_ids.device.type != "cpu" or torch.compiler.is_compiling()
-    return max(1, (_CHUNK_WORDS_LARGE if large else _CHUNK_WORDS) // words_per_world)
-
-
 def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
     """The diagonal of ``covered_share`` of what each UAV knows, ``[*, N, N, ...]`` (receiver, sender)."""
     lead, (n_uavs, n_last) = point_ids.shape[:-3], point_ids.shape[-2:]
@@ -126,27 +114,23 @@ def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Ten
     known = (uav.unsqueeze(-1) * n_uavs + (uav.unsqueeze(-1) + uav) % n_uavs).flatten()
     own = point_ids.reshape(-1, n_uavs**2, n_last).index_select(1, uav * (n_uavs + 1))
     cells = (positions * tables.cells_per_metre).reshape(-1, n_uavs**2, n_last, 2).index_select(1, known)
-    fleet = cells.view(-1, n_uavs, n_uavs, n_last, 2).movedim(2, -1)
-    worlds = _worlds_at_once(tables, own)
-    chunks = zip(own.split(worlds), fleet.split(worlds), strict=True)
-    return torch.cat([_share_of_first(tables, *chunk) for chunk in chunks]).reshape(*lead, n_uavs)
+    fleets = cells.view(-1, n_uavs, n_uavs, n_last, 2).movedim(2, -1)
+    return _share_of_first(tables, own, fleets).reshape(*lead, n_uavs)
 
 
-def _covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
-    """:func:`covered_share` of a chunk of worlds: ``[b, N, n]``, ``[b, N, n, 2]`` -> ``[b, N]``."""
-    cells, n_uavs = positions * tables.cells_per_metre, positions.shape[-3]
-    # Windows that slide over the UAVs: i, i + 1, i + 2, ... (modulo N), without index tensors.
-    fleet = torch.cat([cells, cells[..., :-1, :, :]], -3).unfold(-3, n_uavs, 1)
-    return _share_of_first(tables, point_ids, fleet)
-
-
-def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleet: Tensor) -> Tensor:
+def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleets: Tensor) -> Tensor:
     """Coverage of the first UAV of each fleet, ``[b, N]``, from positions in cells, ``[b, N, n, 2, N]``."""
-    rows = torch.cat([(point_ids + _GRID**2).unsqueeze(0), _overlap_rows(fleet).movedim(-1, 0)])
-    excluded = _or_rows(tables.masks, rows.flatten(1)).view(*point_ids.shape[:-1], -1)
-    counts = _bit_count(excluded)
-    # Summed as floats (exact: small integers), which compiles to a much faster loop than int64.
-    return 1 - counts.sum(-1, dtype=fleet.dtype) / (64 * counts.shape[-1])
+    n_uavs, n_last = point_ids.shape[1:]
+    words_per_world = n_uavs * n_last * (n_uavs + n_last - 1 + tables.masks.shape[-1])
+    large = point_ids.device.type != "cpu" or torch.compiler.is_compiling()
+    at_once = max(1, (_CHUNK_WORDS_LARGE if large else _CHUNK_WORDS) // words_per_world)
+    shares = []
+    for ids, fleet in zip(point_ids.split(at_once), fleets.split(at_once), strict=True):
+        rows = torch.cat([(ids + _GRID**2).unsqueeze(0), _overlap_rows(fleet).movedim(-1, 0)])
+        counts = _bit_count(_or_rows(tables.masks, rows.flatten(1)).view(*ids.shape[:-1], -1))
+        # Summed as floats (exact: small integers), which compiles to a much faster loop than int64.
+        shares.append(1 - counts.sum(-1, dtype=fleet.dtype) / (64 * counts.shape[-1]))
+    return torch.cat(shares)
 
 
 def _overlap_rows(fleet: Tensor) -> Tensor:

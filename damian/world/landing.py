@@ -64,18 +64,11 @@ class Candidates:
         action = action.double().clamp(0, 1)
         move = displacement(action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi).flatten(0, 1)
         own, base = flat.flatten(), (flat - flat % self.airspace.max_points).flatten()
-        exact_points, regions = self.airspace.exact_points, region.unsqueeze(-1).expand_as(flat).flatten()
+        points, exact_points = self.airspace.points.flatten(0, 1), self.airspace.exact_points
         target = gather_rows(exact_points.flatten(0, 1), own) + move
-        nearest = _nearest_inside(
-            self.airspace.edges,
-            [*self.airspace.cells],
-            exact_points,
-            regions,
-            target,
-            own - base,
-            self.n_candidates,
-        )
-        points = self.airspace.points.flatten(0, 1)
+        where = region.unsqueeze(-1).expand_as(flat).flatten(), target, own - base
+        edges, cells = self.airspace.edges, [*self.airspace.cells]
+        nearest = _nearest_inside(edges, cells, exact_points, *where, self.n_candidates)
         offset = gather_rows(points, nearest + base.unsqueeze(-1)) - gather_rows(points, own).unsqueeze(1)
         distance = torch.linalg.vector_norm(offset, dim=-1)
         return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
@@ -90,9 +83,8 @@ class Candidates:
         table = action_table(self.config, torch.float64)
         shape = (*self.airspace.points.shape[:2], len(table))
         self.distance = torch.zeros(shape)  # to the nearest candidate; infinite if the target lies outside
-        self.ranking = Ranking(
-            torch.zeros(*shape, self.n_candidates, dtype=torch.int32), torch.zeros(*shape, self.n_candidates)
-        )
+        distance = torch.zeros(*shape, self.n_candidates)
+        self.ranking = Ranking(torch.zeros_like(distance, dtype=torch.int32), distance)
         counts = self.airspace.n_points.tolist()
         parts = [(r, own) for r, n in enumerate(counts) for own in torch.arange(n).split(_POINTS_AT_ONCE)]
         for region, own in parts:
@@ -104,9 +96,7 @@ class Candidates:
         self.distance = self.distance.flatten(0, 1)
         holds = table[:, 0] == 0
         self.can_hold = bool(holds.any())
-        self.hold = torch.arange(len(table)) == int(
-            holds.int().argmax()
-        )  # one action that holds, if any does
+        self.hold = torch.arange(len(table)) == int(holds.int().argmax())  # the first one that holds, if any
 
     def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
         """Candidates [P, A, K] of moves from the points ``own`` [P], and whether these end inside [P, A]."""
@@ -114,25 +104,12 @@ class Candidates:
         target = self.airspace.exact_points[region, own].unsqueeze(1) + move
         shapely.prepare(polygon)
         within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
-        nearest = _nearest_or_own(
-            self.airspace.cells,
-            self.airspace.exact_points,
-            torch.full((within.numel(),), region),
-            target.flatten(0, 1),
-            own.repeat_interleave(len(move)),
-            within.flatten(),
-            self.n_candidates,
-        ).view(*within.shape, -1)
+        where = torch.full((within.numel(),), region), target.flatten(0, 1), own.repeat_interleave(len(move))
+        cells, exact_points = self.airspace.cells, self.airspace.exact_points
+        nearest = _nearest_or_own(cells, exact_points, *where, within.flatten(), self.n_candidates)
+        nearest = nearest.view(*within.shape, -1)
         offset = gather_rows(points, nearest) - points[own, None, None]
         return Ranking(nearest, torch.linalg.vector_norm(offset, dim=-1)), within
-
-    def to(self, device: torch.device) -> "Candidates":
-        """Move the tables to a device, in place."""
-        self.airspace = self.airspace.to(device)
-        if self.config.kind == "discrete":
-            self.ranking = Ranking(*(table.to(device) for table in self.ranking))
-            self.distance, self.hold = self.distance.to(device), self.hold.to(device)
-        return self
 
 
 @torch.library.custom_op("damian::nearest_inside", mutates_args=())

@@ -72,7 +72,11 @@ class Messages(NamedTuple):
         """
         stops = (rows.shape[-1] - _FIXED - n_readings) // 2
         parts = rows.split([*(column.width for column in _COLUMNS[:-3]), stops, stops, n_readings], -1)
-        return cls._make(_read(part, column) for part, column in zip(parts, _COLUMNS, strict=True))
+        fields = []
+        for part, (width, dtype) in zip(parts, _COLUMNS, strict=True):
+            field = part.squeeze(-1) if width == 1 else part
+            fields.append(field > 0.5 if dtype == torch.bool else field.to(dtype))
+        return cls._make(fields)
 
     @property
     def in_flight(self) -> Tensor:
@@ -88,16 +92,7 @@ class Messages(NamedTuple):
         return now.unsqueeze(-1) - self.time
 
 
-_COLUMNS: list[Column] = [
-    hint.__metadata__[0] for hint in get_type_hints(Messages, include_extras=True).values()
-]
+_HINTS = get_type_hints(Messages, include_extras=True)
+_COLUMNS: list[Column] = [hint.__metadata__[0] for hint in _HINTS.values()]
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
 """Number of columns of all fields but the last three, those of the stops and the readings."""
-
-
-def _read(part: Tensor, column: Column) -> Tensor:
-    """A field [*, N] or [*, N, width] from its packed numbers [*, N, width]."""
-    field = part.squeeze(-1) if column.width == 1 else part
-    if column.dtype == torch.float32:
-        return field
-    return field > 0.5 if column.dtype == torch.bool else field.to(column.dtype)

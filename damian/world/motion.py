@@ -1,7 +1,6 @@
 """Flights (paper, eq. 1): takeoff to the flight level, cruise and landing as rest-to-rest polynomials."""
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,17 +9,9 @@ from damian.common import checks
 from damian.world.config import MotionConfig
 
 _TINY = 1e-9
-
 # Largest first and second derivative of each time law over tau in [0, 1].
 _PEAK_SPEED = {3: 3 / 2, 5: 15 / 8, 7: 35 / 16}
 _PEAK_ACCELERATION = {3: 6.0, 5: 10 * math.sqrt(3) / 3, 7: 84 * math.sqrt(5) / 25}
-
-
-class Pose(NamedTuple):
-    """State of a flight: position [*, 3] m, and distance cruised so far [*] m."""
-
-    position: Tensor
-    cruised: Tensor
 
 
 def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> list[float]:
@@ -69,8 +60,10 @@ def poses(
     vertical: Tensor,
     cruise: Tensor,
     degree: int,
-) -> Pose:
-    """Poses of UAVs ``elapsed`` seconds after takeoff; after their flights, they stand at the targets.
+) -> tuple[Tensor, Tensor]:
+    """Positions [*, 3] m of UAVs ``elapsed`` seconds after takeoff, and the distances cruised so far [*] m.
+
+    After their flights, they stand at the targets.
 
     ``origin`` and ``target`` [*, 2] m, ``level`` above 0 [*] m, and durations [s] of takeoff or landing,
     above 0, and of the cruise, 0 for no flight; ``elapsed`` in double precision.
@@ -83,4 +76,4 @@ def poses(
     climbed, crossed = time_law(shares, degree).unbind(0)
     place = torch.lerp(origin, target, crossed.unsqueeze(-1))
     position = torch.cat([place, (level * climbed).unsqueeze(-1)], dim=-1)
-    return Pose(position, crossed * torch.linalg.vector_norm(target - origin, dim=-1))
+    return position, crossed * torch.linalg.vector_norm(target - origin, dim=-1)

@@ -61,14 +61,12 @@ def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
     """Read ``package.module:name`` or ``{sensor: package.module:name, strength: 3}``; sensors by name."""
     found: dict[str, Sensor] = {}
     for number, each in enumerate(written):
-        key = f"sensors[{number}]"
-        entry = each if isinstance(each, Mapping) else {"sensor": each}
+        key, entry = f"sensors[{number}]", each if isinstance(each, Mapping) else {"sensor": each}
         path, declared, parameters = SENSORS.read(entry, key, "sensor")
         name = name_of(parameters, declared.name, key)
         check_parameters(declared.compute, parameters, path, key)
         taken = name in found or name in Messages._fields
         problem = "is the name of another sensor, or of a field of the messages: give it another one, as in "
         checks.require(not taken, f"{key}.name", name, f"{problem}{{sensor: {path}, name: other}}")
-        compute = functools.partial(declared.compute, **parameters)
-        found[name] = declared._replace(compute=compute, name=name)
+        found[name] = Sensor(functools.partial(declared.compute, **parameters), declared.width, name)
     return found

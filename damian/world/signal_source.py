@@ -58,14 +58,6 @@ class Located(NamedTuple):
     finished: Tensor
 
 
-class _Stops(NamedTuple):
-    """Stops without times: places [W, K, 2] m, number of real stops [W], which stops are hotspots [W, K]."""
-
-    place: np.ndarray
-    n: np.ndarray
-    hotspot: np.ndarray
-
-
 def footprint_radius(config: SourceConfig) -> float:
     """Largest distance at which a UAV detects the source [m]: inverse-square law (paper, eq. 2 and 3)."""
     # R^2 = 4 pi I0 10^(level/10) / (4 pi I0 10^(microphone/10)), where all but the levels cancels.
@@ -77,17 +69,24 @@ def draw_walks(
     config: SourceConfig,
     n_walks: int,
     rng: np.random.Generator,
+    start: np.ndarray | None = None,
 ) -> Walk:
     """Draw the walks of ``W = n_walks`` sources in a polygon of local metres, float32 on the CPU.
 
-    Hotspots are uniform in the polygon, inner points uniform in the part of the disc around their hotspot
-    that lies in it, or nearer where that part is very thin (under about 1 % of the disc).
+    They begin at ``start``, [2] metres, if it is given. Hotspots are uniform in the polygon, inner points
+    uniform in the part of the disc around their hotspot that lies in it, or nearer where that part is very
+    thin (under about 1 % of the disc).
     """
     shapely.prepare(polygon)
-    if config.motion == "static":
-        return _static_walk(_hotspots(polygon, config, n_walks, 1, rng))
-    stops = _draw_stops(polygon, config, n_walks, rng)
-    return _timed_walk(stops, config, rng)
+    n_hotspots = 1 if config.motion == "static" else config.n_hotspots
+    hotspots = sample_interior(polygon, n_walks * n_hotspots, rng).reshape(n_walks, n_hotspots, 2)
+    if start is not None:
+        hotspots[:, 0] = start
+    if config.motion == "dynamic":
+        return _timed_walk(*_draw_stops(polygon, hotspots, config, rng), config, rng)
+    zeros, ones = torch.zeros(n_walks, 1), torch.ones(n_walks, 1)
+    stop = torch.as_tensor(hotspots, dtype=torch.float32)
+    return Walk(stop, zeros, zeros + math.inf, ones, ones, ones.bool())
 
 
 def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
@@ -133,31 +132,14 @@ def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tenso
     return torch.where(2 * elapsed > duration, length - near, near)
 
 
-def _hotspots(
-    polygon: _Polygon,
-    config: SourceConfig,
-    n_walks: int,
-    n_hotspots: int,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Hotspots in the order of their visit, the first at ``source.position``, [W, H, 2] metres."""
-    hotspots = sample_interior(polygon, n_walks * n_hotspots, rng).reshape(n_walks, n_hotspots, 2)
-    if config.position is not None:
-        hotspots[:, 0] = config.position
-    return hotspots
+def _draw_stops(
+    polygon: _Polygon, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Each hotspot [W, H, 2] m followed by its inner points, packed to the left and padded.
 
-
-def _static_walk(hotspots: np.ndarray) -> Walk:
-    stop = torch.as_tensor(hotspots, dtype=torch.float32)
-    zeros = torch.zeros(stop.shape[:2])
-    ones = torch.ones_like(zeros)
-    return Walk(stop, zeros, zeros + math.inf, ones, ones, ones.bool())
-
-
-def _draw_stops(polygon: _Polygon, config: SourceConfig, n_walks: int, rng: np.random.Generator) -> _Stops:
-    """Each hotspot followed by its inner points, packed to the left and padded."""
-    hotspots = _hotspots(polygon, config, n_walks, config.n_hotspots, rng)
-    inner = _inner_points(polygon, hotspots, config, rng)
+    Returns the places [W, K, 2] m, which stops are hotspots [W, K], and the number of real stops [W].
+    """
+    n_walks, inner = len(hotspots), _inner_points(polygon, hotspots, config, rng)
     grid = np.concatenate([hotspots[:, :, None], inner], axis=2)  # [W, H, 1 + max_stops, 2]
     n_inner = rng.integers(config.min_stops, config.max_stops, hotspots.shape[:2], endpoint=True)
     column = np.broadcast_to(np.arange(grid.shape[2]), grid.shape[:3]).reshape(n_walks, -1)
@@ -165,14 +147,11 @@ def _draw_stops(polygon: _Polygon, config: SourceConfig, n_walks: int, rng: np.r
     n = real.sum(1)
     order = np.argsort(~real, axis=1, kind="stable")[:, : n.max()]
     place = np.take_along_axis(grid.reshape(n_walks, -1, 2), order[..., None], axis=1)
-    return _Stops(place, n, np.take_along_axis(column, order, axis=1) == 0)
+    return place, np.take_along_axis(column, order, axis=1) == 0, n
 
 
 def _inner_points(
-    polygon: _Polygon,
-    hotspots: np.ndarray,
-    config: SourceConfig,
-    rng: np.random.Generator,
+    polygon: _Polygon, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
 ) -> np.ndarray:
     """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2] metres."""
     # Points outside after the first rounds are drawn from ever smaller discs, so that this ends.
@@ -181,7 +160,8 @@ def _inner_points(
     flat, centre = points.reshape(-1, 2), points.reshape(-1, 2).copy()
     missing = np.arange(len(flat))
     for radius in radii:
-        drawn = centre[missing] + _in_disc(len(missing), radius, rng)
+        distance, angle = radius * np.sqrt(rng.random(len(missing))), 2 * math.pi * rng.random(len(missing))
+        drawn = centre[missing] + distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
         accepted = shapely.contains_xy(polygon, drawn)
         flat[missing[accepted]] = drawn[accepted]
         missing = missing[~accepted]
@@ -190,24 +170,18 @@ def _inner_points(
     return flat.reshape(points.shape)
 
 
-def _in_disc(n: int, radius: float, rng: np.random.Generator) -> np.ndarray:
-    """Points uniform in the disc about the origin, [n, 2] metres."""
-    distance = radius * np.sqrt(rng.random(n))
-    angle = 2 * math.pi * rng.random(n)
-    return distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
-
-
-def _timed_walk(stops: _Stops, config: SourceConfig, rng: np.random.Generator) -> Walk:
+def _timed_walk(
+    place: np.ndarray, hotspot: np.ndarray, n: np.ndarray, config: SourceConfig, rng: np.random.Generator
+) -> Walk:
     """Add waiting times, legs and emission to the stops."""
-    shape, loops = stops.hotspot.shape, config.after_walk == "loop"
+    shape, loops = hotspot.shape, config.after_walk == "loop"
     per_stop = config.emission == "per_stop"
     wait = rng.uniform(config.min_wait, config.max_wait, shape)
     emits = rng.random(shape) < (config.emission_probability if per_stop else 1.0)
-    drawn = stops.place, stops.hotspot, wait, emits
     if loops:  # room for the return to the first stop
-        drawn = (np.concatenate([each, each[:, -1:]], axis=1) for each in drawn)
-    place, hotspot, wait, emits = drawn
-    last, column = (stops.n - 1)[:, None], np.arange(hotspot.shape[1])
+        drawn = place, hotspot, wait, emits
+        place, hotspot, wait, emits = (np.concatenate([each, each[:, -1:]], axis=1) for each in drawn)
+    last, column = (n - 1)[:, None], np.arange(hotspot.shape[1])
     padded = column > last
     after = np.zeros_like(last) if loops else last
     place = np.where(padded[..., None], np.take_along_axis(place, after[..., None], axis=1), place)

@@ -1,6 +1,5 @@
 """The physics of B parallel worlds: decisions, flights, the source, and the messages that the UAVs send."""
 
-import copy
 import math
 from typing import Any
 
@@ -10,17 +9,16 @@ import torch
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import gather_rows, tree_map
-from damian.world.airspace import Airspace, build_airspace, nearest_points
+from damian.common.tensors import gather_rows, move_attributes, tree_map
+from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
 from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
-from damian.world.regions.places import local_places
-from damian.world.regions.region import Region
+from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
 from damian.world.sensors import sensors_of
-from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, locate
+from damian.world.signal_source import Walk, draw_walks, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import MOTION_MODELS
 
@@ -39,7 +37,6 @@ class Simulation:
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         shortest = self._shortest_flights()
-        self._require_moves(shortest)
         self.shortest_flight = shortest if config.battery.enabled else None
         self.initial = self._initial_state(region, start, stops, seed)
         self.layout = StateLayout(self.initial)
@@ -55,14 +52,8 @@ class Simulation:
 
     def to(self, device: torch.device) -> "Simulation":
         """Move all tensors to a device, in place."""
-        self.airspace = self.airspace.to(device)
-        self.candidates.to(device)
-        self.vehicles.to(device)
-        self.points = self.points.to(device)
-        if self.shortest_flight is not None:
-            self.shortest_flight = self.shortest_flight.to(device)
-        for name in ("walk", "initial", "packed_initial"):
-            setattr(self, name, tree_map(lambda t: t.to(device), getattr(self, name)))
+        for owner in (self, self.candidates, self.vehicles):
+            move_attributes(owner, device)
         return self
 
     def reset(self, worlds: PackedState, mask: Tensor) -> PackedState:
@@ -79,7 +70,10 @@ class Simulation:
         condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
         fresh = fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
-        return self._read_anew(fresh) if self.sensors else fresh
+        if not self.sensors:
+            return fresh
+        state = self.layout.unpack(fresh)  # the first messages get the readings of this episode
+        return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
 
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
         """Simulate one step; actions of UAVs that are not ready change nothing.
@@ -90,10 +84,6 @@ class Simulation:
         state = self.decide(state, action, action_valid)
         state = self.vehicles.move(state)
         return self._sense(state._replace(steps=state.steps + 1), action_valid)
-
-    def ready(self, state: State) -> Tensor:
-        """Whether each UAV may choose an action now, [B, N] bool."""
-        return self.vehicles.ready(state)
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
@@ -175,34 +165,27 @@ class Simulation:
         return stuck | (observed(state.battery, self.config.battery) <= 0)
 
     def _shortest_flights(self) -> Tensor:
-        """Length of the shortest flight from each landing point [m], 0 if no action flies, [R*L]."""
-        if self.config.actions.kind == "discrete":
-            length = self.candidates.distance  # if this point is out of reach, the UAV holds
-            length = length.where(length > 0, torch.inf).amin(-1)
-        else:
-            length = torch.cat([_nearest_other(points) for points in self.airspace.points])
-        return length.where(length.isfinite(), 0.0)
+        """Length of the shortest flight from each landing point [m], 0 if no action flies, [R*L].
 
-    def _require_moves(self, shortest: Tensor) -> None:
-        """Refuse actions if none of them leads from any landing point to another one, [R*L] metres away."""
+        Actions are refused if none of them leads from any landing point to another one.
+        """
         actions = self.config.actions
-        moves = shortest > 0
-        if actions.kind == "continuous":  # a landing point is nearest beyond half of the way to it
-            moves = moves & (shortest < 2 * self.candidates.max_distance)
+        if actions.kind == "discrete":
+            length = self.candidates.distance  # if this point is out of reach, the UAV holds
+            length, longest = length.where(length > 0, torch.inf).amin(-1), torch.inf
+        else:  # a landing point is nearest beyond half of the way to it
+            length = torch.cat([_nearest_other(points) for points in self.airspace.points])
+            longest = 2 * self.candidates.max_distance
+        moves = self.airspace.max_points == 1 or bool((length < longest).any())
         problem = "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
-        alone = self.airspace.max_points == 1
-        checks.require(alone or bool(moves.any()), "actions.distances", actions.distances, problem)
+        checks.require(moves, "actions.distances", actions.distances, problem)
+        return length.where(length.isfinite(), 0.0)
 
     def _readings(self, state: State) -> Tensor:
         """Readings of all sensors beside each other, [B, N, K]."""
         if not self.sensors:
             return state.sent.readings
         return torch.cat([sensor.read(state, self) for sensor in self.sensors.values()], -1)
-
-    def _read_anew(self, worlds: PackedState) -> PackedState:
-        """Worlds at the start of an episode, whose first messages get the readings of this episode."""
-        state = self.layout.unpack(worlds)
-        return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """Position of the source [B, 2], whether it emits [B], and whether its walk is over [B]."""
@@ -229,7 +212,7 @@ class Simulation:
         goal = start + region.unsqueeze(-1) * self.airspace.max_points
         number = torch.arange(n)
         zeros = torch.zeros(goal.shape)
-        place = gather_rows(self.points, goal)
+        place, n_readings = gather_rows(self.points, goal), sum(each.width for each in self.sensors.values())
         state = State(
             seed=counter_rng.world_seeds(seed, n),
             episode=torch.zeros_like(number),
@@ -250,9 +233,7 @@ class Simulation:
             source_over=torch.zeros_like(number, dtype=torch.bool),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
-            sent=Messages.blank(
-                goal.unsqueeze(-1).repeat(1, 1, stops), sum(sensor.width for sensor in self.sensors.values())
-            ),
+            sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, stops), n_readings),
         )
         state = self._sense(state)
         landed = torch.full_like(state.sent.landed, -1.0)
@@ -269,69 +250,46 @@ def _draw_initial_conditions(
     source over at most K stops, [Q, K].
     """
     per_region = config.region.initial_conditions // len(airspace.regions)
-    walks, starts = [], []
+    place, walks, starts = config.source.position, [], []
     for index, region in enumerate(airspace.regions):
-        walks.append(draw_walks(region.polygon, _in_region(config.source, region), per_region, rng))
+        start = None if place is None else local_places("source.position", [place], region)[0]
+        walks.append(draw_walks(region.polygon, config.source, per_region, rng, start))
         starts.append(_draw_starts(config, airspace, index, per_region, rng))
     stops = max(walk.arrive.shape[1] for walk in walks)
-    padded = [_pad(walk, stops) for walk in walks]
-    region = torch.arange(len(airspace.regions)).repeat_interleave(per_region)
-    walk = tree_map(lambda *parts: torch.cat(parts), *padded)
-    return region, torch.cat(starts), walk
+    walk = tree_map(lambda *parts: torch.cat(parts), *(_pad(walk, stops) for walk in walks))
+    return torch.arange(len(airspace.regions)).repeat_interleave(per_region), torch.cat(starts), walk
 
 
 def _pad(walk: Walk, stops: int) -> Walk:
     """Pad walks to the given number of stops; the source never reaches the padded ones."""
-    missing = stops - walk.arrive.shape[1]
-
-    def repeat_last(field: Tensor) -> Tensor:
-        last = field[:, -1:]
-        return torch.cat([field, last.expand(-1, missing, *last.shape[2:])], 1)
-
-    never = walk.arrive.new_full((len(walk.arrive), missing), torch.inf)
-    return tree_map(repeat_last, walk)._replace(arrive=torch.cat([walk.arrive, never], 1))
-
-
-def _in_region(source: SourceConfig, region: Region) -> SourceConfig:
-    """The source with its given position, if any, in local metres of a region."""
-    if source.position is None:
-        return source
-    moved = copy.copy(source)  # not checked again
-    moved.position = local_places("source.position", [source.position], region)[0].tolist()
-    return moved
+    last, index = walk.arrive.shape[1] - 1, torch.arange(stops)
+    padded = tree_map(lambda field: field[:, index.clamp(max=last)], walk)
+    return padded._replace(arrive=padded.arrive.masked_fill(index > last, torch.inf))
 
 
 def _draw_starts(
     config: WorldConfig, airspace: Airspace, region: int, n: int, rng: np.random.Generator
 ) -> Tensor:
     """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for each."""
-    if config.region.start_positions is not None:
-        return _given_starts(config, airspace, region).expand(n, -1).clone()
+    given, together = config.region.start_positions, config.region.start_together
     n_points = int(airspace.n_points[region])
-    if config.region.start_together:
+    if given is None and together:
         return torch.as_tensor(rng.integers(n_points, size=(n, 1))).repeat(1, config.agents)
-    return torch.as_tensor(rng.random((n, n_points))).topk(config.agents, dim=-1).indices
-
-
-def _given_starts(config: WorldConfig, airspace: Airspace, region: int) -> Tensor:
-    """Landing points nearest to the given start positions, [N]."""
-    given, name = config.region.start_positions or [], airspace.regions[region].name
-    local = torch.as_tensor(local_places("region.start_positions", given, airspace.regions[region]))
-    regions = torch.full((len(local),), region)
-    points = nearest_points(airspace.cells, airspace.exact_points, regions, local, 1).squeeze(-1)
-    distinct = config.region.start_together or len(points.unique()) == len(points)
+    if given is None:
+        return torch.as_tensor(rng.random((n, n_points))).topk(config.agents, dim=-1).indices
+    points = airspace.nearest(local_places("region.start_positions", given, airspace.regions[region]), region)
+    name = airspace.regions[region].name
     problem = f"lead to the same landing point of {name}: take others, or region.start_together=true"
+    distinct = together or len(points.unique()) == len(points)
     checks.require(distinct, "region.start_positions", given, problem)
-    return points
+    return points.expand(n, -1).clone()
 
 
 def _nearest_other(points: Tensor) -> Tensor:
     """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for padded ones."""
     distance, real = torch.full((len(points),), torch.inf), points.isfinite().all(-1)
     places = np.asarray(shapely.points(points[real].double().numpy()))
-    nearest = shapely.STRtree(places).query_nearest(
-        places, exclusive=True, return_distance=True, all_matches=False
-    )
-    (index, _), found = (torch.as_tensor(each) for each in nearest)
+    options = {"exclusive": True, "return_distance": True, "all_matches": False}
+    (index, _), found = map(torch.as_tensor, shapely.STRtree(places).query_nearest(places, **options))
     distance[real.nonzero().squeeze(-1)[index]] = found.float()
     return distance

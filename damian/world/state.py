@@ -109,10 +109,8 @@ class StateLayout:
             dtype: iter(table.split([shape.numel() for t, shape in self._fields if t == dtype], 1))
             for dtype, table in zip(_TYPES, rows, strict=True)
         }
-        leaves = [
-            next(columns[dtype]).unflatten(1, shape) if shape else next(columns[dtype]).squeeze(1)
-            for dtype, shape in self._fields
-        ]
+        parts = ((next(columns[dtype]), shape) for dtype, shape in self._fields)
+        leaves = [part.unflatten(1, shape) if shape else part.squeeze(1) for part, shape in parts]
         n = len(State._fields) - 1  # the last field is the message
         return State._make([*leaves[:n], Messages._make(leaves[n:])])
 

@@ -1,7 +1,6 @@
 """Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
 
 from abc import ABC, abstractmethod
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -9,12 +8,12 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.registry import Registry
 from damian.common.tensors import expand_mask, gather_rows, tree_where
-from damian.world.airspace import Airspace, nearest_points
+from damian.world.airspace import Airspace
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
 from damian.world.config import WorldConfig
 from damian.world.messages import Messages
 from damian.world.motion import flight_levels, minimum_time, poses
-from damian.world.regions.places import local_places
+from damian.world.regions.region import local_places
 from damian.world.state import State
 
 FLIGHT_LEVEL_M = 30.48
@@ -24,8 +23,6 @@ _FLIGHT_ERROR = 1e-6
 """Largest relative error of the duration of a flight, which is computed in float32."""
 _ROUNDING = 1e-12
 """Largest relative error of a number of steps, which is computed in double precision."""
-
-Model = TypeVar("Model", bound="MotionModel")
 
 
 class MotionModel(ABC):
@@ -46,13 +43,6 @@ class MotionModel(ABC):
         self.charge = float(charge_gain(torch.tensor(dt), config.battery))
         self.chargers = _charging_points(config, airspace)
 
-    def to(self: Model, device: torch.device) -> Model:
-        """Move all tensors to a device, in place."""
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                setattr(self, name, value.to(device))
-        return self
-
     @abstractmethod
     def ready(self, state: State) -> Tensor:
         """Whether each UAV may choose an action now, [B, N] bool."""
@@ -63,10 +53,9 @@ class MotionModel(ABC):
 
     @abstractmethod
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
-        """Start flights of the UAVs that have just chosen to fly (``departs``) to ``goal``, [B, N].
+        """Start flights to ``goal`` of UAVs that have just chosen (``ready``) to fly (``departs``), [B, N].
 
-        ``ready`` [B, N]: which UAVs have just chosen; in the state's ``goal`` is where each stands or flies
-        to.
+        In the state's ``goal`` is where each stands or flies to.
         """
 
     @abstractmethod
@@ -141,8 +130,7 @@ class InstantMotion(MotionModel):
             return state
         length = self.length(state.origin, state.goal)
         drain = flight_drain(self.vertical, length, self.battery) * (length > 0)
-        battery = self.battery_after(state.battery, drain, length == 0, state.goal)
-        return state._replace(battery=battery)
+        return state._replace(battery=self.battery_after(state.battery, drain, length == 0, state.goal))
 
     def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
         return on_ground, messages
@@ -228,7 +216,6 @@ def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
         return torch.ones(n_regions * n_points, dtype=torch.bool)
     charges = torch.zeros(n_regions, n_points, dtype=torch.bool)
     for index, region in enumerate(airspace.regions):
-        local = torch.as_tensor(local_places("battery.charging_points", places, region))
-        regions = torch.full((len(local),), index)
-        charges[index, nearest_points(airspace.cells, airspace.exact_points, regions, local, 1)] = True
+        local = local_places("battery.charging_points", places, region)
+        charges[index, airspace.nearest(local, index)] = True
     return charges.flatten()

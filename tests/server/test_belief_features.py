@@ -28,9 +28,8 @@ def flown():
     simulation, server = env.simulation, env.server
     messages, steps = simulation.initial.sent, simulation.initial.steps
     torch.manual_seed(0)
-    weight = torch.rand(len(steps), server.grid.prior.shape[-1]).square() * (
-        server.grid.prior[server.region_of(messages)] > 0
-    )
+    possible = server.grid.prior[server.region_of(messages)] > 0
+    weight = torch.rand(possible.shape).square() * possible
     belief = weight / weight.sum(-1, keepdim=True)
     return simulation, server, messages, server.features(messages, steps, belief=belief), belief
 
@@ -63,16 +62,13 @@ def test_moments_are_mean_spread_and_entropy(flown):
         scale = float(simulation.airspace.scale[server.region_of(messages)[world]])
         chance, cells = belief[world].tolist(), server.grid.centres.tolist()
         east, north = (sum(p * cell[i] for p, cell in zip(chance, cells, strict=True)) for i in (0, 1))
-        variance = sum(
-            p * ((cell[0] - east) ** 2 + (cell[1] - north) ** 2)
-            for p, cell in zip(chance, cells, strict=True)
-        )
+        squares = ((x - east) ** 2 + (y - north) ** 2 for x, y in cells)
+        variance = sum(p * square for p, square in zip(chance, squares, strict=True))
         entropy = -sum(p * math.log(p) for p in chance if p) / math.log(len(chance))
         x, y = messages.position[world, uav].tolist()
         expected = [(east - x) / scale, (north - y) / scale, math.sqrt(variance) / scale, entropy]
-        torch.testing.assert_close(
-            features["belief_moments"][world, uav], torch.tensor(expected).clamp(-1, 1), rtol=1e-3, atol=1e-4
-        )
+        found = features["belief_moments"][world, uav]
+        torch.testing.assert_close(found, torch.tensor(expected).clamp(-1, 1), rtol=1e-3, atol=1e-4)
 
 
 def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
@@ -101,17 +97,14 @@ def test_a_uavs_own_features_are_those_of_its_own_belief():
         torch.testing.assert_close(td["agents", "observation"][:, uav, 1:], own)
 
 
-def certain(cache):
+@feature("belief")
+def surest(cache):
     return cache.belief.amax(-1, keepdim=True).expand_as(cache.messages.time)
-
-
-surest = feature("belief")(certain)
 
 
 def test_a_feature_of_ones_own_may_read_the_belief():
     observation = ObservationConfig(belief=[f"{__name__}:surest"])
     env = make_env(square(observation=observation, source=walking()), 2, extras=["message"])
     td = env.rollout(3)[:, -1]["next"]
-    torch.testing.assert_close(
-        td["agents", "observation"][..., -1], td["belief"].amax(-1, keepdim=True).expand(2, 3)
-    )
+    expected = td["belief"].amax(-1, keepdim=True).expand(2, 3)
+    torch.testing.assert_close(td["agents", "observation"][..., -1], expected)

@@ -13,13 +13,21 @@ from damian.common.fields import rules
 from damian.server.features import FEATURES, ObservationConfig, observe
 
 NAMES = [name for name in (*twin.LOCAL, *twin.GLOBAL) if name != "coverage"]
-seeds = st.integers(0, 2**32 - 1)
-fleets = st.integers(1, 6)
 shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
 
 
-def check_features(worlds, newest=False):
-    """Compare every feature with the twin's."""
+@settings(max_examples=settings.default.max_examples // 2)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_agents=st.integers(1, 6),
+    heard=shares,
+    spots=shares,
+    newest=st.booleans(),
+)
+def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
+    seed, n_agents, heard, spots, newest
+):
+    worlds = random_worlds(seed, n_agents, heard, spots)
     messages, server = messages_of(worlds)
     ours = observe(messages, server._replace(newest=newest), NAMES)
     for b, (now, uavs) in enumerate(worlds):
@@ -29,14 +37,6 @@ def check_features(worlds, newest=False):
                 difference = difference - difference.round()
             assert difference.abs().le(1e-4).all(), name
             assert ((ours[name] >= 0) & (ours[name] <= 1)).all(), name
-
-
-@settings(max_examples=settings.default.max_examples // 2)
-@given(seed=seeds, n_agents=fleets, heard=shares, spots=shares, newest=st.booleans())
-def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
-    seed, n_agents, heard, spots, newest
-):
-    check_features(random_worlds(seed, n_agents, heard, spots), newest)
 
 
 def test_bearing_and_drift_have_no_rounding_errors_at_the_estimated_position_of_the_source():

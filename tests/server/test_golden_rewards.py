@@ -7,8 +7,8 @@ many were left out for each reason.
 
 import math
 from collections import Counter
-from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from golden_records import (
@@ -31,39 +31,28 @@ from helpers import GOLDEN, act, usecase
 from damian.server.features import observe
 from damian.server.rewards import RewardConfig, reward, terms_of
 
+COVERS_NOTHING = "the newest position always covers nothing"
+DIVIDED_AGAIN = "divided again for every further UAV"
+NO_BEARING = "no bearing to where it stands"
+
 
 def reason_for_other_feature(name: str, transition: Transition, uav: int, value: float) -> str | None:
     """Why a feature differs from the original's; None if it does not."""
     estimate, place = transition.after["server"]["est_pos"], transition.after["positions"][uav]
     if name == "coverage":
-        return "the newest position always covers nothing"
+        return COVERS_NOTHING
     if name == "source_time" and uav > 0 and 0 < value < 1:
-        return "divided again for every further UAV"
+        return DIVIDED_AGAIN
     if name in ("source_bearing", "source_drift") and estimate is not None:
-        return "no bearing to where it stands" if math.dist(estimate, place) < 1e-6 else None
+        return NO_BEARING if math.dist(estimate, place) < 1e-6 else None
     return None
 
 
 @pytest.mark.parametrize(
     ("case", "compared", "reasons"),
     [
-        (
-            1,
-            488,
-            {
-                "the newest position always covers nothing": 90,
-                "no bearing to where it stands": 52,
-            },
-        ),
-        (
-            2,
-            2652,
-            {
-                "the newest position always covers nothing": 270,
-                "divided again for every further UAV": 36,
-                "no bearing to where it stands": 12,
-            },
-        ),
+        (1, 488, {COVERS_NOTHING: 90, NO_BEARING: 52}),
+        (2, 2652, {COVERS_NOTHING: 270, DIVIDED_AGAIN: 36, NO_BEARING: 12}),
     ],
 )
 def test_recorded_server_inputs_give_the_recorded_features(case, compared, reasons):
@@ -80,15 +69,11 @@ def test_recorded_server_inputs_give_the_recorded_features(case, compared, reaso
                 counts[reason] += 1
                 if reason is not None:
                     continue
-                pairs = zip(flat(ours[name][world][uav]), flat(value), strict=True)
+                pairs = zip(np.ravel(ours[name][world][uav]), np.ravel(value), strict=True)
                 for mine, theirs in pairs:
                     assert close(name, mine, converted(name, theirs, detected)), (name, transition, uav)
     assert counts.pop(None) == compared
     assert counts == reasons
-
-
-def flat(value: Any) -> list[float]:
-    return value if isinstance(value, list) else [value]
 
 
 def reason_for_other_term(name: str, value: float, motions: int) -> str | None:
@@ -104,22 +89,15 @@ def reason_for_other_term(name: str, value: float, motions: int) -> str | None:
     ("case", "compared", "reasons"),
     [
         (1, 598, {"eq. 6 doubles a drift up to one half": 32}),
-        (
-            2,
-            2391,
-            {"eq. 6 doubles a drift up to one half": 117, "divided by the motions": 192},
-        ),
+        (2, 2391, {"eq. 6 doubles a drift up to one half": 117, "divided by the motions": 192}),
     ],
 )
 def test_recorded_features_give_the_recorded_reward_terms(case, compared, reasons):
     records, golden = recorded(case, PERSISTENT), GOLDEN[case]["scenario"]
     _, _, counters = server_inputs(case, records)
     observed = [{FEATURES[k]: v for k, v in m.after["obs_named"].items()} for m in records]
-    features = {
-        name: torch.tensor([world[name] for world in observed])
-        for name in observed[0]
-        if name != "agent_distances"
-    }
+    names = [name for name in observed[0] if name != "agent_distances"]
+    features = {name: torch.tensor([world[name] for world in observed]) for name in names}
     desired = golden["desired_avg_distance_normalised_D"]
     task = RewardConfig(
         **dict.fromkeys(features, 1.0),

@@ -9,15 +9,12 @@ from twin import GLOBAL, LOCAL
 from damian.common.tensors import tree_map
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
-from damian.server.server import Server
 from damian.world.messages import Messages
 from damian.world.regions.sources import RegionConfig
 
-B = 3
 
-
-def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
-    """A server, and messages [B, N, N] about which everything differs, with the steps elapsed [B]."""
+@pytest.mark.parametrize("n_agents", [1, 2, 5])
+def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=30.0, initial_conditions=16)
     observation = ObservationConfig(local_features=LOCAL, global_features=GLOBAL, own=True, age=True)
     scenario = everything(agents=n_agents, region=region, observation=observation)
@@ -25,7 +22,7 @@ def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
     generator = torch.Generator().manual_seed(n_agents)
 
     def draw(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(B, n_agents, n_agents, *shape, generator=generator)
+        return low + (high - low) * torch.rand(3, n_agents, n_agents, *shape, generator=generator)
 
     point = draw(0, len(env.simulation.points), 2).long()
     known = Messages.blank(point)._replace(
@@ -37,16 +34,10 @@ def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
         detected_time=draw(-10, 20).round().clamp(min=-1),
         detected_position=draw(-100, 100, 2),
     )
-    return env.server, known, torch.tensor([20, 30, 40])
-
-
-@pytest.mark.parametrize("n_agents", [1, 2, 5])
-def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
-    server, known, steps = known_messages(n_agents)
+    server, steps = env.server, torch.tensor([20, 30, 40])
     found = server.observe_each(known, steps)
     for i in range(n_agents):
         one = tree_map(lambda field, i=i: field[:, i], known)
-        expected, _ = server.observations(
-            server.features(one, steps, server.observation.actor + server.observation.critic)
-        )
+        names = server.observation.actor + server.observation.critic
+        expected, _ = server.observations(server.features(one, steps, names))
         assert found[:, i].equal(expected[:, i])

@@ -1,17 +1,14 @@
 """The feature ``timeline``: slot k is where a UAV stood k steps ago, as far as that has arrived by now."""
 
 import itertools
-from typing import cast
 
 import pytest
 import torch
-from tensordict import TensorDictBase
 
 from damian import keys, make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv
 from damian.server.config import ObservationConfig
 from damian.server.surroundings import OTHERS
 from damian.server.termination import EpisodeConfig
@@ -39,25 +36,19 @@ def scenario(own: bool = True, **changed) -> ScenarioConfig:
     return ScenarioConfig(**(sections | changed))
 
 
-def flown(case: ScenarioConfig) -> tuple[DelayedEnv, TensorDictBase]:
-    """Steps [B, T] over several episodes, with the ages of what each UAV knows of each, [B, T, N, N]."""
+@pytest.mark.parametrize(("name", "own"), [*((name, True) for name in CASES), ("held back", False)])
+def test_a_slot_tells_where_a_uav_stood_then_if_a_message_since_has_arrived(name, own):
+    case = scenario(own and name != "links", **CASES[name])
     env = make_env(case, 4, seed=1, extras=["message"])
-    if case.links.kind == "matrix":
+    if name == "links":
         env.transform[0].age_key = AGES
     torch.manual_seed(0)
     steps = env.rollout(25, break_when_any_done=False)
-    after = cast(TensorDictBase, steps["next"])
-    if AGES not in after.keys(True):
+    server, after, seen = env.server, steps["next"], 0
+    if name != "links":  # the ages of what each UAV knows of each, [B, T, N, N]
         age = after.get(keys.AGE, torch.zeros_like(after[keys.REWARD])).squeeze(-1)
         age = age.unsqueeze(-2).repeat(1, 1, AGENTS, 1)
         after[AGES] = age.masked_fill(torch.eye(AGENTS, dtype=torch.bool) & case.observation.own, 0)
-    return env, steps
-
-
-@pytest.mark.parametrize(("name", "own"), [*((name, True) for name in CASES), ("held back", False)])
-def test_a_slot_tells_where_a_uav_stood_then_if_a_message_since_has_arrived(name, own):
-    env, steps = flown(scenario(own and name != "links", **CASES[name]))
-    server, after, seen = env.server, steps["next"], 0
     sent, first = server.messages(after[keys.MESSAGE]), server.messages(steps[keys.MESSAGE])
     half = server.scales(sent) / 2
     observed = after[keys.OBSERVATION][..., 2:].unflatten(-1, (OTHERS, 3 * SLOTS + 3))

@@ -2,23 +2,15 @@
 
 import json
 import math
-from pathlib import Path
 
 import pytest
 import torch
-from helpers import KEEPS_GOING, act, everything, fresh, random_actions
+from helpers import DATA, KEEPS_GOING, act, everything, fresh, random_actions
 from hypothesis import given
 from hypothesis import strategies as st
 
-from damian.world.battery import (
-    BatteryConfig,
-    charge_gain,
-    flight_drain,
-    observed,
-    used_so_far,
-)
+from damian.world.battery import BatteryConfig, charge_gain, flight_drain, observed, used_so_far
 
-DATA = Path(__file__).parents[1] / "data"
 ENERGY = json.loads((DATA / "motion_energy_coverage.json").read_text())["energy"]
 BATTERY = BatteryConfig()
 
@@ -49,20 +41,12 @@ def test_recorded_levels_are_observed_as_the_same_levels(dtype):
     assert observed(torch.tensor(levels, dtype=dtype), BATTERY).tolist() == list(expected)
 
 
-@given(
-    share=st.floats(0, 1.5),
-    vertical=st.floats(0.1, 20),
-    cruise=st.floats(0, 100),
-    part=st.floats(0, 1),
-)
+@given(share=st.floats(0, 1.5), vertical=st.floats(0.1, 20), cruise=st.floats(0, 100), part=st.floats(0, 1))
 def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical, cruise, part):
     elapsed = share * (2 * vertical + cruise)
     cruised = part * 150.0
-    if elapsed <= vertical:
-        flown = elapsed
-    elif elapsed <= vertical + cruise:
-        flown = vertical
-    else:
+    flown = min(elapsed, vertical)
+    if elapsed > vertical + cruise:
         flown = min(elapsed - cruise, 2 * vertical)
     expected = flown * 100 * 10 / (9 * 12 * 0.9) / 3600 + cruised / 20 * 100 * 10 / (9 * 12) / 3600
     values = (tensor(x) for x in (elapsed, vertical, cruise, cruised))
@@ -81,9 +65,8 @@ def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
         after = env.state.position[..., :2].tolist()
         for b, n in [(b, n) for b in range(4) for n in range(3)]:
             way, height = math.dist(before[b][n], after[b][n]), motion.min_level + n * motion.level_separation
-            up = max(
-                15 / 8 * height / motion.max_speed, math.sqrt(hardest * height / motion.max_acceleration)
-            )
+            hard = math.sqrt(hardest * height / motion.max_acceleration)
+            up = max(15 / 8 * height / motion.max_speed, hard)
             drain = power * (2 * up / 0.9 + way / battery.reference_speed) if way else -gain
             levels[b][n] = min(max(levels[b][n] - drain, 0.0), 100.0)
             flown += way > 0

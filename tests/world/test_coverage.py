@@ -61,21 +61,6 @@ def share_at(polygon, positions, radius=R):
     return covered_share(tables, ids, torch.tensor(positions, dtype=torch.float32)).numpy()
 
 
-@pytest.fixture(scope="module")
-def square():
-    """Tables, polygon and landing points of a 400 m square with 36 points."""
-    axis = np.linspace(-190, 190, 6)
-    points = np.array(list(itertools.product(axis, axis)))
-    polygon = shapely.box(-200, -200, 200, 200)
-    return build_tables([polygon], points[None], R), polygon, points
-
-
-def at_random(points, shape, seed=0):
-    """Random flat ids of the given shape, and the positions of these points."""
-    ids = torch.randint(len(points), shape, generator=torch.Generator().manual_seed(seed))
-    return ids, torch.tensor(points, dtype=torch.float32)[ids]
-
-
 @pytest.mark.parametrize("kind", ["convex", "concave", "hole", "parts"])
 @pytest.mark.parametrize("spread", [None, 70.0, 25.0])
 def test_coverage_is_within_one_percent_of_the_exact_area(kind, spread):
@@ -100,18 +85,19 @@ def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
         np.testing.assert_allclose(got, expected, rtol=0, atol=0.01 * golden["disc_area"])
 
 
-def test_a_sequence_of_steps_equals_each_step_by_itself(square):
-    tables, _, points = square
-    generator, places = torch.Generator().manual_seed(0), torch.tensor(points, dtype=torch.float32)
-    ids, _ = at_random(points, (40, 3, 2))
+def test_a_sequence_of_steps_equals_each_step_by_itself():
+    axis, generator = np.linspace(-190, 190, 6), torch.Generator().manual_seed(0)
+    points = np.array(list(itertools.product(axis, axis)))
+    tables = build_tables([shapely.box(-200, -200, 200, 200)], points[None], R)
+    places = torch.tensor(points, dtype=torch.float32)
+    ids = torch.randint(len(points), (40, 3, 2), generator=generator)
     known = KnownCoverage(ids, -torch.ones(40, 3))
     computed = []
     for _ in range(30):
         moved = torch.rand(40, 3, 1, generator=generator) < 0.1
         ids = torch.where(moved, ids.roll(1, -1) + 1, ids) % len(points)
-        known = KnownCoverage(
-            known.trail, known.share.where(torch.rand(40, 1, generator=generator) < 0.9, -1)
-        )
+        remembered = torch.rand(40, 1, generator=generator) < 0.9
+        known = known._replace(share=known.share.where(remembered, -1))
         share = updated_share(tables, ids, places, known)
         assert torch.equal(share, covered_share(tables, ids, places[ids]))
         computed.append((ids != known.trail).any())

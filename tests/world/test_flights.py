@@ -1,25 +1,14 @@
-"""Positions, legal actions and readiness of UAVs, and the times at which they send messages."""
+"""Where UAVs start, and where their legal actions lead."""
 
 import pytest
 import torch
-from helpers import (
-    KEEPS_GOING,
-    SQUARE,
-    act,
-    fresh,
-    random_actions,
-    sent_messages,
-    square,
-    usecase,
-)
+from helpers import KEEPS_GOING, SQUARE, act, fresh, random_actions, sent_messages, square, usecase
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.world.battery import BatteryConfig, flight_drain
 from damian.world.regions.sources import RegionConfig
 from damian.world.state import State
-
-# Positions on landing points.
 
 
 def test_uavs_start_on_different_points_or_on_one_or_on_the_given_ones():
@@ -32,11 +21,7 @@ def test_uavs_start_on_different_points_or_on_one_or_on_the_given_ones():
     assert len({tuple(p) for p in place[:, 0].tolist()}) > 10
     env = UavEnv(usecase(2))
     given = sent_messages(env.reset()).position + env.simulation.airspace.offset[0]
-    expected = [pytest.approx([62.85586449, -119.2183645], abs=1e-4)] * 3
-    assert given[0].tolist() == expected
-
-
-# Action masks.
+    assert given[0].tolist() == [pytest.approx([62.85586449, -119.2183645], abs=1e-4)] * 3
 
 
 @pytest.mark.parametrize("energy", [False, True])

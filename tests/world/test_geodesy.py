@@ -5,12 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from damian.world.regions.geodesy import (
-    EARTH_RADIUS_M,
-    area_centroid,
-    to_latlon,
-    to_local,
-)
+from damian.world.regions.geodesy import EARTH_RADIUS_M, area_centroid, to_latlon, to_local
 
 OFFSETS_M = st.floats(-35_000, 35_000)
 
@@ -41,9 +36,6 @@ def _local_by_vectors(lat, lon, origin):
 def test_local_metres_within_50_km_survive_the_round_trip_over_degrees(lat, lon, x, y):
     place = to_latlon(x, y, (lat, lon))
     np.testing.assert_allclose(to_local(*place, (lat, lon)), [x, y], atol=1e-6)
-
-
-# --- the centroid of an area --------------------------------------------------------------------
 
 
 def test_the_centroid_of_an_area_across_the_antimeridian_or_around_the_pole_is_inside():

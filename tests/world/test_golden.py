@@ -92,7 +92,7 @@ def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(cas
 
 
 @pytest.mark.parametrize("case", [1, 2])
-def test_the_recorded_geometry_is_reproduced(case):
+def test_the_recorded_geometry_and_action_table_are_reproduced(case):
     golden = GOLDEN[case]["scenario"]
     env = UavEnv(usecase(case))
     simulation, airspace = env.simulation, env.simulation.airspace
@@ -103,10 +103,6 @@ def test_the_recorded_geometry_is_reproduced(case):
     assert distance.amin(1).max() < TOLERANCE
     assert simulation.radius == pytest.approx(golden["footprint_radius_m"], abs=TOLERANCE)
     assert airspace.scale.item() == pytest.approx(golden["max_distance_normaliser_m"], abs=1e-4)
-
-
-@pytest.mark.parametrize("case", [1, 2])
-def test_the_recorded_action_table_is_reproduced(case):
     table = action_table(usecase(case).actions)
     for ours, row in zip(table.tolist(), GOLDEN[case]["action_table"], strict=True):
         assert ours[0] == row["distance_m"]
@@ -114,15 +110,14 @@ def test_the_recorded_action_table_is_reproduced(case):
 
 
 def test_recorded_flights_have_the_same_ends_and_durations():
-    run = json.loads((DATA / "motion_energy_coverage.json").read_text())
-    run = run["action_delay_env_run_usecase1_FL2"]
+    run = json.loads((DATA / "motion_energy_coverage.json").read_text())["action_delay_env_run_usecase1_FL2"]
     flights = [row for row in run if row["counters"] == [1.0, 0.0, 0.0]]
     assert len(flights) == 4
     motion = MotionConfig("polynomial", max_speed=5.0, max_acceleration=2.0, min_level=2.0)
     env = ready_env(usecase(1, motion=motion), 1)
     points = settings_points(env)
     for row in flights:
-        assert env.simulation.ready(env.state).all()
+        assert env.simulation.vehicles.ready(env.state).all()
         act(env, torch.tensor([[row["action"]]]))
         state = env.state
         assert points[state.origin].squeeze().tolist() == pytest.approx(row["start"], abs=1e-4)

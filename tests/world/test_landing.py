@@ -19,15 +19,9 @@ from damian.world import airspace as search
 from damian.world import landing
 from damian.world.airspace import build_airspace, build_cells, inside, nearest_points
 from damian.world.config import RegionConfig, WorldConfig
-from damian.world.landing import (
-    ActionConfig,
-    Ranking,
-    assign_landing_points,
-)
+from damian.world.landing import ActionConfig, Ranking, assign_landing_points
 from damian.world.regions.region import Region
 from damian.world.simulation import Simulation
-
-# Booking.
 
 
 def random_bookings(seed, n_worlds, n_agents, n_points, together):
@@ -48,15 +42,10 @@ def random_bookings(seed, n_worlds, n_agents, n_points, together):
 
 def booked_by_twin(ranking, row, standing, reach):
     """Points that UAVs book one after the other; out of reach means holding."""
-    worlds = []
-    for b in range(len(row)):
-        wishes = [
-            [p if d <= reach[b, i] else standing[b, i].item() for p, d in zip(*pair, strict=True)]
-            for i, k in enumerate(row[b].tolist())
-            for pair in [(ranking.point[k].tolist(), ranking.distance[k].tolist())]
-        ]
-        worlds.append(twin.assign_landing_points(wishes, standing[b].tolist(), [True] * len(wishes)))
-    return worlds
+    reached = ranking.distance[row] <= reach.unsqueeze(-1)
+    wishes = torch.where(reached, ranking.point[row].long(), standing.unsqueeze(-1)).tolist()
+    ready = [True] * row.shape[1]
+    return [twin.assign_landing_points(*each, ready) for each in zip(wishes, standing.tolist(), strict=True)]
 
 
 @pytest.mark.parametrize("few", [0, 25])
@@ -77,9 +66,6 @@ def test_booking_at_once_and_one_by_one_equals_a_sequential_loop(few, seed, n_ag
     assert ours.tolist() == booked_by_twin(*case)
     assert together or all(len({*world}) == n_agents for world in ours.tolist())
     assert ours[case[-1] < 0].equal(case[2][case[-1] < 0])
-
-
-# Nearest points.
 
 
 def centimetres(point, target) -> int:
@@ -123,10 +109,8 @@ def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds,
     for i, (points, radius) in enumerate((lattices[r], radii[r]) for r in region):
         distance, angle = rng.uniform(0, 0.9 * radius), rng.uniform(0, 2 * math.pi)
         if rng.random() < 0.5:  # round numbers, so that points may be equally near
-            distance, angle = (
-                min(rng.choice([0.0, 15.0, 30.0, 45.005]), distance),
-                math.pi / 4 * rng.integers(8),
-            )
+            distance = min(rng.choice([0.0, 15.0, 30.0, 45.005]), distance)
+            angle = math.pi / 4 * rng.integers(8)
         move = distance * np.array([math.sin(angle), math.cos(angle)])
         target[i] = points[rng.integers(len(points))] + move
     most = max(map(len, lattices))
@@ -136,24 +120,15 @@ def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds,
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "_SLOTS", int(rng.choice([10, 2**18])))
         ours = nearest_points(cells, *map(torch.as_tensor, (padded, region, target)), n)
-    expected = [
-        nearest_by_loop(lattices[r].tolist(), t, n) for r, t in zip(region, target.tolist(), strict=True)
-    ]
-    assert ours.tolist() == expected
+    for found, r, place in zip(ours.tolist(), region, target.tolist(), strict=True):
+        assert found == nearest_by_loop(lattices[r].tolist(), place, n)
 
-
-# Inside tests.
 
 HORSESHOE = Polygon([(0, 0), (10, 0), (10, 8), (7, 8), (7, 3), (3, 3), (3, 8), (0, 8)])
 HOLED = Polygon([(-4, -3), (9, -5), (12, 4), (3, 9), (-6, 5)], [[(0, 0), (4, 0), (4, 4), (0, 4)]])
-POLYGONS = {
-    "concave": HORSESHOE,
-    "with a hole": HOLED,
-    "in two parts": MultiPolygon([HORSESHOE, translate(HOLED, 20, 3)]),
-}
 
 
-@pytest.mark.parametrize("polygon", POLYGONS.values(), ids=POLYGONS)
+@pytest.mark.parametrize("polygon", [HORSESHOE, HOLED, MultiPolygon([HORSESHOE, translate(HOLED, 20, 3)])])
 def test_inside_equals_shapelys_contains(polygon):
     rng = np.random.default_rng(3)
     airspace = build_airspace([Region(polygon, "test")], RegionConfig(lattice_step=1.0), 1)
@@ -164,10 +139,9 @@ def test_inside_equals_shapelys_contains(polygon):
     target[:500, 1] = corners[rng.integers(len(corners), size=500), 1]
     target = target.astype(np.float32).astype(float)
     off_boundary = shapely.distance(polygon.boundary, shapely.points(target)) > 1e-3
-    assert off_boundary.sum() > 1500
     ours = inside(airspace.edges[0], torch.as_tensor(target[off_boundary], dtype=torch.float32))
     expected = shapely.contains_xy(polygon, target[off_boundary])
-    assert 0 < expected.sum() < len(expected)
+    assert 300 < expected.sum() < len(expected) - 300
     assert ours.numpy().tolist() == expected.tolist()
 
 

@@ -5,33 +5,18 @@ import math
 
 import numpy as np
 import pytest
-import shapely
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from damian.common.errors import InputError
 from damian.world.battery import BatteryConfig
 from damian.world.config import WorldConfig
 from damian.world.regions.geodesy import to_latlon
-from damian.world.regions.places import local_places
-from damian.world.regions.region import Region
 from damian.world.regions.sources import RegionConfig, regions_of
 from damian.world.signal_source import SourceConfig
 from damian.world.simulation import Simulation
 
-SQUARE = RegionConfig(
-    kind="vertices", vertices=[[0, 0], [200, 0], [200, 200], [0, 200]], initial_conditions=4
-)
+SQUARE = RegionConfig("vertices", vertices=[[0, 0], [200, 0], [200, 200], [0, 200]], initial_conditions=4)
 CORNERS = [[8.0, 45.0], [8.003, 45.0], [8.003, 45.002], [8.0, 45.002], [8.0, 45.0]]
-
-
-@pytest.fixture
-def park(tmp_path) -> RegionConfig:
-    """A region of about 236 m by 222 m with a position on Earth."""
-    file = tmp_path / "park.geojson"
-    file.write_text(json.dumps({"type": "Polygon", "coordinates": [CORNERS]}))
-    return RegionConfig(kind="geojson", path=str(file), initial_conditions=4)
 
 
 def build(region, **settings) -> Simulation:
@@ -40,20 +25,13 @@ def build(region, **settings) -> Simulation:
     return Simulation(WorldConfig(region=region, **settings), 1.0, 2, 0)
 
 
-@given(lat=st.floats(-80, 80), lon=st.floats(-180, 180), x=st.floats(-400, 400), y=st.floats(-400, 400))
-def test_a_place_in_degrees_is_the_same_place_in_metres(lat, lon, x, y):
-    region = Region(shapely.box(-500, -500, 500, 500), "test", (lat, lon))
-    place = dict(zip(("lat", "lon"), map(float, to_latlon(x, y, (lat, lon))), strict=True))
-    np.testing.assert_allclose(local_places("key", [place], region), [[x, y]], atol=1e-5)
-    np.testing.assert_allclose(local_places("key", [[x, y]], region), [[x, y]], atol=1e-5)
-
-
-def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(park):
+def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(tmp_path):
+    file = tmp_path / "park.geojson"  # about 236 m by 222 m
+    file.write_text(json.dumps({"type": "Polygon", "coordinates": [CORNERS]}))
+    park = RegionConfig(kind="geojson", path=str(file), initial_conditions=4)
     origin = regions_of(park, np.random.default_rng(0))[0].origin
     metres = [[-80.0, 0.0], [0.0, 50.0], [60.0, -70.0]]
-    degrees = [
-        {"lat": float(lat), "lon": float(lon)} for lat, lon in (to_latlon(*xy, origin) for xy in metres)
-    ]
+    degrees = [dict(zip(("lat", "lon"), map(float, to_latlon(*xy, origin)), strict=True)) for xy in metres]
     worlds = [
         build(
             park,

@@ -32,16 +32,12 @@ def _places(region: Region) -> np.ndarray:
     return np.column_stack(to_latlon(*shapely.get_coordinates(region.polygon).T, region.origin))
 
 
-# --- valid files --------------------------------------------------------------------------------
-
-
 def test_the_shipped_table_holds_the_llanbedr_polygon():
     region = read_fir(SHIPPED, "LlanbedrTest")
     assert (region.name, region.levels) == ("LlanbedrTest", (0, 60))
     assert region.origin == pytest.approx((52.813, -4.129), abs=1e-3)
-    assert _places(region)[[0, 9]] == pytest.approx(
-        np.array([[52.814992, -4.132176], [52.814502, -4.132138]]), abs=1e-9
-    )
+    ends = [[52.814992, -4.132176], [52.814502, -4.132138]]
+    np.testing.assert_allclose(_places(region)[[0, 9]], ends, atol=1e-9)
     assert len(region.polygon.exterior.coords) == 11
     # Expected area from the shoelace formula on a flat map at the region's latitude.
     flat = Polygon(_places(region)[:, ::-1]).area * DEGREE_M**2 * np.cos(np.radians(52.813))
@@ -53,20 +49,15 @@ def test_rows_of_a_table_are_ordered_by_sequence_number():
     assert region.levels == (10, 45.5)
     corners = [[52.8, -4.13], [52.8, -4.12], [52.81, -4.12], [52.81, -4.13], [52.8, -4.13]]
     np.testing.assert_allclose(_places(region), corners, atol=1e-9)
-    width = 0.01 * DEGREE_M * np.cos(np.radians(52.805))
-    assert region.polygon.area == pytest.approx(width * 0.01 * DEGREE_M, rel=1e-4)
 
 
 def test_a_hole_stays_a_hole_and_heights_are_ignored():
     region = read_area(ZONES, where="name=lake")
-    assert len(region.polygon.interiors) == 1
     outer_area = Polygon(region.polygon.exterior).area
     assert region.polygon.area == pytest.approx(outer_area * 8 / 9, rel=1e-3)
-    assert not region.polygon.contains(region.polygon.centroid)
 
 
-SQUARE = [[[8.0, 45.0], [8.01, 45.0], [8.01, 45.01], [8.0, 45.01], [8.0, 45.0]]]
-RING = SQUARE[0]
+RING = [[8.0, 45.0], [8.01, 45.0], [8.01, 45.01], [8.0, 45.01], [8.0, 45.0]]
 POINT = {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [8, 45]}}
 
 
@@ -89,8 +80,8 @@ def _written(folder, name, content) -> Path:
 
 
 UNEVEN = [[[8.0, 45.0, 10], [8.01, 45.0], [8.01, 45.01, 11, 5], [8.0, 45.01], [8.0, 45.0, 10]]]
-PARTLY_EMPTY = {"type": "MultiPolygon", "coordinates": [[], SQUARE]}
-FOLDED = {"type": "GeometryCollection", "geometries": [POINT["geometry"], _polygon(*SQUARE)]}
+PARTLY_EMPTY = {"type": "MultiPolygon", "coordinates": [[], [RING]]}
+FOLDED = {"type": "GeometryCollection", "geometries": [POINT["geometry"], _polygon(RING)]}
 
 
 @pytest.mark.parametrize(
@@ -100,14 +91,8 @@ FOLDED = {"type": "GeometryCollection", "geometries": [POINT["geometry"], _polyg
 def test_heights_empty_parts_and_collections_do_not_hide_an_area(tmp_path, geometry):
     empty = _feature(_polygon())
     file = _written(tmp_path, "square.geojson", _collection(empty, _feature(None), _feature(geometry)))
-    plain = read_area(_written(tmp_path, "plain.json", _polygon(*SQUARE)))
+    plain = read_area(_written(tmp_path, "plain.json", _polygon(RING)))
     assert read_area(file).polygon.equals(plain.polygon)
-
-
-def _in_metres() -> tuple[list, str]:
-    """Corners of the square in the grid of Europe (its axes: north, east) [m], and the name of its crs."""
-    turned = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:3035", always_xy=True)
-    return [list(turned.transform(*corner)) for corner in SQUARE[0]], "urn:ogc:def:crs:EPSG::3035"
 
 
 def _crs(name):
@@ -116,14 +101,14 @@ def _crs(name):
 
 @pytest.mark.parametrize("holder", ["collection", "feature", "geometry"])
 def test_the_coordinate_reference_system_of_geojson_is_obeyed(tmp_path, holder):
-    ring, name = _in_metres()
-    geometry = _polygon(ring)
+    grid = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:3035", always_xy=True)  # its axes: north, east
+    geometry = _polygon([list(grid.transform(*corner)) for corner in RING])
     feature = _feature(geometry)
-    document = _collection(feature)
-    document["crs"] = _crs("EPSG:3857")  # the innermost counts
-    {"collection": document, "feature": feature, "geometry": geometry}[holder]["crs"] = _crs(name)
+    document = _collection(feature) | {"crs": _crs("EPSG:3857")}  # the innermost counts
+    holders = {"collection": document, "feature": feature, "geometry": geometry}
+    holders[holder]["crs"] = _crs("urn:ogc:def:crs:EPSG::3035")
     corners = _places(read_area(_written(tmp_path, "utm.geojson", document)))
-    np.testing.assert_allclose(corners, np.array(SQUARE[0])[:, ::-1], atol=1e-9)
+    np.testing.assert_allclose(corners, np.array(RING)[:, ::-1], atol=1e-9)
 
 
 @pytest.mark.parametrize("turns", [-1, 0])
@@ -180,9 +165,9 @@ def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(
         return {"inclusion": inclusion, "polygon": [[lat, lon] for lon, lat in ring[:-1]], "version": 1}
 
     inner = [[8.0, 45.0], [8.005, 45.0], [8.005, 45.01], [8.0, 45.01], [8.0, 45.0]]
-    fences = {"circles": [], "polygons": [fence(inner, False), fence(SQUARE[0], True)]}
+    fences = {"circles": [], "polygons": [fence(inner, False), fence(RING, True)]}
     plan = {"fileType": "Plan", "geoFence": fences}
-    whole = read_area(_written(tmp_path, "square.geojson", _polygon(*SQUARE))).polygon.area
+    whole = read_area(_written(tmp_path, "square.geojson", _polygon(RING))).polygon.area
     half = read_area(_written(tmp_path, "fence.plan", plan))
     assert half.polygon.area == pytest.approx(whole / 2, rel=1e-4)
     assert half.origin == pytest.approx((45.005, 8.0075), abs=1e-6)
@@ -191,11 +176,9 @@ def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(
     _assert_one_line_error(file, "geoFence.circles: a circle is not read", lambda: read_area(file))
 
 
-@pytest.mark.parametrize("key", ["name", "ISO 3166:2", "a=b"])
-@pytest.mark.parametrize("value", ["park", "12:30", "x=y:z"])
-@pytest.mark.parametrize("sign", [":", "="])
-def test_a_property_and_its_value_may_have_any_characters(tmp_path, key, value, sign):
-    features = [_feature(_polygon(*SQUARE), **{key: "other"}), _feature(_polygon(*SQUARE), **{key: value})]
+@pytest.mark.parametrize(("key", "sign", "value"), [("name", ":", "12:30"), ("ISO 3166:2", "=", "x=y:z")])
+def test_a_property_and_its_value_may_have_any_characters(tmp_path, key, sign, value):
+    features = [_feature(_polygon(RING), **{key: "other"}), _feature(_polygon(RING), **{key: value})]
     file = _written(tmp_path, "two.geojson", _collection(*features))
     assert read_area(file, where=f"{key}{sign}{value}").name in (value, "two features[1]")
 
@@ -215,85 +198,60 @@ def test_a_wrong_choice_of_features_is_refused_by_its_key(choice, message):
 
 
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
-    file = _map(tmp_path / "map.gpkg")
     monkeypatch.setitem(sys.modules, "pyogrio", None)
-    _assert_one_line_error(
-        file, "needs pyogrio, which is missing: pip install 'damian[gis]'", lambda: read_area(file)
-    )
+    file, message = tmp_path / "map.gpkg", "needs pyogrio, which is missing: pip install 'damian[gis]'"
+    _assert_one_line_error(file, message, lambda: read_area(file))
 
 
 def test_parts_cut_at_the_antimeridian_are_united(tmp_path):
     west = [[179.9, 1], [180, 1], [180, 1.1], [179.9, 1.1], [179.9, 1]]
     east = [[-180, 1], [-179.9, 1], [-179.9, 1.1], [-180, 1.1], [-180, 1]]
-    file = tmp_path / "cut.geojson"
-    file.write_text(json.dumps({"type": "MultiPolygon", "coordinates": [[west], [east]]}))
-    region = read_area(file)
+    parts = {"type": "MultiPolygon", "coordinates": [[west], [east]]}
+    region = read_area(_written(tmp_path, "cut.geojson", parts))
     assert isinstance(region.polygon, Polygon)
     assert region.polygon.area == pytest.approx(0.2 * 0.1 * DEGREE_M**2, rel=1e-3)
 
 
-# --- invalid files ------------------------------------------------------------------------------
-
-HEADER = "Airspace ID,Min Flight Level,Max Flight Level,Sequence Number,Latitude,Longitude\n"
-ROWS = ("A,0,60,0,52.80,-4.13", "A,0,60,1,52.80,-4.12", "A,0,60,2,52.81,-4.12")
+HEADER = b"Airspace ID,Min Flight Level,Max Flight Level,Sequence Number,Latitude,Longitude\n"
 
 
-def _table(*last_rows: str, header: str = HEADER) -> str:
-    """Valid table with its last rows replaced."""
-    return header + "\n".join([*ROWS[: len(ROWS) - len(last_rows)], *last_rows]) + "\n"
-
-
-INVALID_TABLES = {
-    "not UTF-8": (b"Airspace ID\xff", "byte 11 is not UTF-8"),
-    "a wide table": (",".join("x" * 1001), "line 1: 1001 columns are more than 1000"),
-    "latitude 95": (_table("A,0,60,2,95,-4.12"), "line 4: Latitude 95 deg is not between -90"),
-}
-
-
-@pytest.mark.parametrize(("text", "message"), INVALID_TABLES.values(), ids=INVALID_TABLES)
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"Airspace ID\xff", "byte 11 is not UTF-8"),
+        (HEADER + b"A,0,60,0,95,-4.13", "line 2: Latitude 95 deg is not between -90"),
+        (HEADER + b"A,0,60,0,52,-4.13\nA,0,60,2,52,-4.12", "Sequence Number [0.0, 2.0] do not count from 0"),
+        (HEADER + b"A,0,60,0,52,-4.13\nA,0,70,1,52,-4.12", "its rows differ in their flight levels [FL]"),
+    ],
+)
 def test_an_invalid_table_raises_one_line_that_names_the_file_and_the_fault(tmp_path, text, message):
     file = tmp_path / "bad.csv"
-    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    file.write_bytes(text)
     _assert_one_line_error(file, message, lambda: read_fir(file, "A"))
 
 
 FAR_HOLE = [[18, 45], [18.01, 45], [18.01, 45.01], [18, 45]]
 TWO_FEATURES = _collection(_feature(_polygon(RING), zone="a"), _feature(_polygon(RING), zone="b"))
 
-INVALID_GEOJSON = {
-    "not JSON": ('{"type":\n oops}', {}, "is not GeoJSON: JSONDecodeError"),
-    "no choice": (
-        TWO_FEATURES,
-        {},
-        "2 features are areas: choose by region.index=NUMBER or region.where=PROPERTY:VALUE, one or a list",
-    ),
-    "where no value": (TWO_FEATURES, {"where": "zone=c"}, "fits 0 features, not one; the file has 'a', 'b'"),
-    "a line": (
-        _feature({"type": "LineString", "coordinates": RING}),
-        {},
-        "feature is a LineString; a region is an area: draw a closed outline (Polygon)",
-    ),
-    "index 2": (TWO_FEATURES, {"index": [0, 2]}, "region.index: 2 is not between 0 and 1"),
-    "metres": (
-        _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]]),
-        {},
-        "[500000.0, 4000000.0] is not a longitude",
-    ),
-    "unknown crs": (
-        _polygon(RING) | {"crs": _crs("EPSG:999999")},
-        {},
-        "reference system is not understood: ",
-    ),
-    "hole outside": (_polygon(RING, FAR_HOLE), {}, "hole lies outside shell at [18, 45] deg"),
-}
+LINE = _feature({"type": "LineString", "coordinates": RING})
+METRES = _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]])
 
 
-@pytest.mark.parametrize(("content", "choice", "message"), INVALID_GEOJSON.values(), ids=INVALID_GEOJSON)
-def test_an_invalid_geojson_raises_one_line_that_names_the_file_and_the_fault(
-    tmp_path, content, choice, message
-):
-    file = tmp_path / "bad.geojson"
-    file.write_text(content if isinstance(content, str) else json.dumps(content))
+@pytest.mark.parametrize(
+    ("content", "choice", "message"),
+    [
+        ('{"type":\n oops}', {}, "is not GeoJSON: JSONDecodeError"),
+        (TWO_FEATURES, {}, "2 features are areas: choose by region.index=NUMBER or region.where=PROPERTY"),
+        (TWO_FEATURES, {"where": "zone=c"}, "fits 0 features, not one; the file has 'a', 'b'"),
+        (TWO_FEATURES, {"index": [0, 2]}, "region.index: 2 is not between 0 and 1"),
+        (LINE, {}, "feature is a LineString; a region is an area: draw a closed outline (Polygon)"),
+        (METRES, {}, "[500000.0, 4000000.0] is not a longitude"),
+        (_polygon(RING) | {"crs": _crs("EPSG:999999")}, {}, "reference system is not understood: "),
+        (_polygon(RING, FAR_HOLE), {}, "hole lies outside shell at [18, 45] deg"),
+    ],
+)
+def test_an_invalid_map_raises_one_line_that_names_the_file_and_the_fault(tmp_path, content, choice, message):
+    file = _written(tmp_path, "bad.geojson", content)
     _assert_one_line_error(file, message, lambda: read_area(file, **choice))
 
 

@@ -5,27 +5,13 @@ from dataclasses import dataclass, field
 
 import pytest
 import torch
-from helpers import FLYING, KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
+from helpers import KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
 from damian.world.motion import MotionConfig
-
-
-def flying(**changed) -> ScenarioConfig:
-    """A scenario with flights and a loud source, in which UAVs are paid only for spotting it."""
-    sections = {
-        "region": REGIONS["fixed"],
-        "motion": FLYING,
-        "source": walking(level_db=136.0),
-        "reward": RewardConfig(spotted=1.0, spotting_agents=0.5),
-        "observation": ObservationConfig(global_features=["spotting_agents"], timeline=4),
-        "episode": EpisodeConfig(max_steps=None, success_share=0.5),
-    }
-    return ScenarioConfig(**(sections | changed))
 
 
 @dataclass
@@ -54,7 +40,9 @@ class FlyingUav:
         self.motions += 1
         if self.start != target:
             phases = self.level, math.dist(self.start, target), self.level
-            self.duration = sum(shortest_time(length, motion) for length in phases)
+            # A phase of degree 5 is limited by its largest speed or its largest acceleration.
+            fast, hard = 15 / 8 / motion.max_speed, 10 * math.sqrt(3) / 3 / motion.max_acceleration
+            self.duration = sum(max(fast * length, math.sqrt(hard * length)) for length in phases)
 
     def listen(self, now: float, dt: float, source: tuple, radius: float) -> bool:
         """Pass a step, and send a message on the ground or as the flight begins; returns if one is sent."""
@@ -81,12 +69,6 @@ class FlyingUav:
         return True
 
 
-def shortest_time(length: float, motion: MotionConfig) -> float:
-    """Shortest duration of a phase of degree 5."""
-    hardest = 10 * math.sqrt(3) / 3
-    return max(15 / 8 * length / motion.max_speed, math.sqrt(hardest * length / motion.max_acceleration))
-
-
 def twins(env: UavEnv) -> list[list[FlyingUav]]:
     """The UAVs of all worlds as they begin an episode."""
     levels, places = env.simulation.vehicles.levels.tolist(), env.state.position[..., :2].tolist()
@@ -100,22 +82,28 @@ def twins(env: UavEnv) -> list[list[FlyingUav]]:
 @pytest.mark.parametrize("sensing_time", [0.0, 2.5])
 def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
     motion = MotionConfig("polynomial", max_speed=20.0, max_acceleration=10.0, sensing_time=sensing_time)
-    env = fresh(flying(motion=motion, episode=KEEPS_GOING), num_worlds=6)
+    scenario = ScenarioConfig(
+        region=REGIONS["fixed"],
+        motion=motion,
+        source=walking(level_db=136.0),
+        reward=RewardConfig(spotted=1.0, spotting_agents=0.5),
+        observation=ObservationConfig(global_features=["spotting_agents"], timeline=4),
+        episode=KEEPS_GOING,
+    )
+    env = fresh(scenario, num_worlds=6)
     worlds, generator = twins(env), torch.Generator().manual_seed(0)
     begun = spotting = 0
     for step in range(1, 41):
-        ready = env.simulation.ready(env.state).tolist()
+        ready = env.simulation.vehicles.ready(env.state).tolist()
         output = act(env, random_actions(env, generator))
         goals = env.simulation.points[env.state.goal].tolist()
         sent, told = sent_messages(output), output["agents", "message_sent"].tolist()
         for b, world in enumerate(worlds):
+            source = env.state.source[b].tolist()
             for n, uav in enumerate(world):
                 if ready[b][n]:
                     uav.choose(tuple(goals[b][n]), motion)
-                assert (
-                    uav.listen(float(step), 1.0, env.state.source[b].tolist(), env.simulation.radius)
-                    == (told[b][n])
-                )
+                assert uav.listen(float(step), 1.0, source, env.simulation.radius) == told[b][n]
                 for name, value in uav.message.items():
                     assert getattr(sent, name)[b, n].tolist() == pytest.approx(value, abs=1e-4), name
                 told_stops = zip(sent.landed[b, n].tolist(), sent.trail[b, n].tolist(), strict=True)

@@ -29,18 +29,11 @@ def simulation(vertices, offset):
 
 @pytest.mark.parametrize(("vertices", "offset"), [(SQUARE, (1000.0, 1000.0)), (RAGGED, (-9_876_543.21, 0.1))])
 def test_moving_the_region_and_all_places_changes_no_bit_of_what_a_step_reads(vertices, offset):
-    before, after = simulation(vertices, (0.0, 0.0)), simulation(vertices, offset)
-    tables = [
-        [
-            *w.initial[:-1],
-            *w.initial.sent,
-            *w.walk,
-            *w.candidates.ranking,
-            *w.airspace.cells,
-            w.vehicles.chargers,
-        ]
-        for w in (before, after)
-    ]
-    assert all(one.equal(other) for one, other in zip(*tables, strict=True))
+    worlds = before, after = simulation(vertices, (0.0, 0.0)), simulation(vertices, offset)
+    trees = zip(
+        *((w.packed_initial, w.walk, w.candidates.ranking, w.airspace.cells) for w in worlds), strict=True
+    )
+    assert all(one.equal(other) for pair in trees for one, other in zip(*pair, strict=True))
+    assert before.vehicles.chargers.equal(after.vehicles.chargers)
     moved = after.airspace.offset - before.airspace.offset
     np.testing.assert_allclose(moved[0], offset, rtol=1e-6, atol=0.1)

@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 import torch
 import twin
-from helpers import (
-    KEEPS_GOING,
-    act,
-    both_kinds,
-    clock,
-    everything,
-    fresh,
-    random_actions,
-    sent_messages,
-)
+from helpers import KEEPS_GOING, act, both_kinds, clock, everything, fresh, random_actions, sent_messages
 from twin import GLOBAL, LOCAL
 
 from damian.envs.config import ScenarioConfig
@@ -35,7 +26,9 @@ OBSERVED = [*TWIN_FEATURES, *LOCAL]
 
 def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> ScenarioConfig:
     """Every reward term and feature except the coverage; uneven distances, so that no two points tie."""
-    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0}
+    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0, "individual": 0.8, "system": 1.5}
+    task |= {"drift": "printed" if since else "smooth", "desired_spotting": 0.7, "desired_distance": 0.4}
+    task |= {"desired_distance_not_spotting": 0.6, "desired_distance_spotting": 0.2}
     return ScenarioConfig(
         agents=n_agents,
         region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, initial_conditions=24),
@@ -80,10 +73,8 @@ def twins(env: UavEnv) -> list[twin.World]:
 
 def check_observation(world: twin.World, observation: torch.Tensor):
     """Assert that the critic's observation [N, G] of one world equals the twin's."""
-    columns = [
-        np.array(values).reshape(len(world.uavs), -1)
-        for values in (world.observe()[name] for name in OBSERVED)
-    ]
+    features = world.observe()
+    columns = [np.array(features[name]).reshape(len(world.uavs), -1) for name in OBSERVED]
     difference = np.abs(np.concatenate(columns, 1) - observation.numpy())
     # Bearings and drifts are angles over a full turn, so 0 equals 1.
     widths = np.cumsum([0, *[c.shape[1] for c in columns]])
@@ -137,9 +128,7 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         reward=RewardConfig(spotted=0.0, coverage=1.0),
         episode=KEEPS_GOING,
     )
-    env = fresh(scenario, num_worlds=3)
-    generator = torch.Generator().manual_seed(0)
-    radius = env.simulation.radius
+    env, generator = fresh(scenario, num_worlds=3), torch.Generator().manual_seed(0)
     trails = env.state.position[..., :2].unsqueeze(2).expand(-1, -1, window, -1)
     for _ in range(5):
         output = act(env, random_actions(env, generator))
@@ -147,5 +136,5 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         trails = torch.cat([newest, trails[:, :, :-1]], 2)
         for b, region in enumerate(env.state.region.tolist()):
             polygon = env.simulation.airspace.regions[region].polygon
-            expected = twin.exact_share(polygon, trails[b].double().numpy(), radius)
+            expected = twin.exact_share(polygon, trails[b].double().numpy(), env.simulation.radius)
             assert output["agents", "reward"][b, :, 0].tolist() == pytest.approx(expected, abs=0.01)

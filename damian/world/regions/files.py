@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,13 +36,9 @@ class _Feature(NamedTuple):
     """Whether UAVs must keep out of it."""
 
     @property
-    def polygons(self) -> list[list[Any]]:
-        return list(_polygons(self.geometry))
-
-    @property
     def fault(self) -> str:
         """Why it cannot be a region; empty if it can."""
-        if self.polygons:
+        if any(_polygons(self.geometry)):
             return "is excluded" if self.is_excluded else ""
         kind = self.geometry.get("type")
         return f"is a {kind}{' without corners' * (kind in _AREAS)}" if kind else "has no geometry"
@@ -54,11 +50,12 @@ def read_area(path: str | os.PathLike[str], index: Any = None, where: Any = None
     An area is a Polygon, a MultiPolygon, or what a GeometryCollection has of them. Heights are ignored.
     Parts that touch or overlap are united; those that a plan excludes are cut out.
 
+    Neither ``index`` nor ``where`` is needed if only one feature is an area.
+
     Args:
         path: the file.
         index: the feature's index, counted from 0 over all features of the file, or a list of them.
-        where: a property that only the feature has, as ``property:value`` or ``property=value``, or a list
-            of them. Neither ``index`` nor ``where`` is needed if only one feature is an area.
+        where: a property that only the feature has, as ``property:value`` or ``property=value``, or a list.
 
     Raises:
         InputError: the file cannot be read, the chosen geometry is invalid, or the choice does not single
@@ -71,7 +68,11 @@ def read_area(path: str | os.PathLike[str], index: Any = None, where: Any = None
             features = read(path)
             chosen = _choose(features, index, where)
             parts, excluded = (
-                [[_degrees(ring, each) for ring in rings] for each in some for rings in each.polygons]
+                [
+                    [_degrees(ring, each) for ring in rings]
+                    for each in some
+                    for rings in _polygons(each.geometry)
+                ]
                 for some in (chosen, [each for each in features if each.is_excluded])
             )
         except InputError:
@@ -169,7 +170,12 @@ def _fitting(features: list[_Feature], where: str) -> _Feature:
     """Find the only feature with this property value, which may be written as in Python or as in JSON."""
     # Properties and values may have : and = in them, too.
     pairs = [(where[: sign.start()], where[sign.end() :]) for sign in re.finditer("[:=]", where)]
-    found = [each for each in features if any(value in _spellings(each, key) for key, value in pairs)]
+
+    def has(feature: _Feature, key: str, value: str) -> bool:
+        own = feature.properties.get(key)
+        return value in (str(own), json.dumps(own, ensure_ascii=False, default=str))
+
+    found = [each for each in features if any(has(each, *pair) for pair in pairs)]
     if len(found) != 1:
         names = {name for each in features for name in each.properties}
         key, value = next((pair for pair in pairs if pair[0] in names), pairs[0])
@@ -177,11 +183,6 @@ def _fitting(features: list[_Feature], where: str) -> _Feature:
         hint = near(value, known) if known else near(key, names)
         raise InputError(f"region.where: {show(where)} fits {len(found)} features, not one; {hint}")
     return found[0]
-
-
-def _spellings(feature: _Feature, key: str) -> Iterable[str]:
-    value = feature.properties.get(key)
-    return (str(value), json.dumps(value, ensure_ascii=False, default=str))
 
 
 def _polygons(geometry: dict[str, Any]) -> Iterator[list[Any]]:

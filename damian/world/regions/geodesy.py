@@ -18,16 +18,10 @@ EARTH_RADIUS_M = 6_371_008.8
 
 
 def to_local(lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Convert latitude and longitude to local metres, by haversine distance d and initial bearing b.
+    """Convert latitudes in [-90, 90] and longitudes, [*] degrees, to metres [*] east and north of ``origin``.
 
-    Args:
-        lat_deg: latitudes, [*] degrees in [-90, 90].
-        lon_deg: longitudes, [*] degrees; whole turns do not matter.
-        origin: (latitude, longitude) in degrees; d and b are measured from it.
-
-    Returns:
-        ``x = d sin b`` (east) and ``y = d cos b`` (north), each [*] metres. The bearing of the
-        origin's antipode is arbitrary.
+    They are ``x = d sin b`` and ``y = d cos b``, by the haversine distance d and the initial bearing b from
+    the origin (latitude, longitude) in degrees. The bearing of its antipode is arbitrary.
     """
     lat, lat_0 = np.radians(np.asarray(lat_deg, float)), np.radians(origin[0])
     d_lon = np.radians(np.asarray(lon_deg, float) - origin[1])
@@ -41,15 +35,9 @@ def to_local(lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]
 
 
 def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Convert local metres to latitude and longitude; inverts `to_local`.
+    """Convert metres east and north [*] to latitudes and longitudes [*]; the inverse of ``to_local``.
 
-    Args:
-        x_m: metres east, [*].
-        y_m: metres north, [*].
-        origin: (latitude, longitude) in degrees.
-
-    Returns:
-        Latitudes in [-90, 90] and longitudes in [-180, 180), each [*] degrees.
+    Latitudes are in [-90, 90] and longitudes in [-180, 180) degrees.
     """
     x, y, lat_0 = np.asarray(x_m, float), np.asarray(y_m, float), np.radians(origin[0])
     arc, bearing = np.hypot(x, y) / EARTH_RADIUS_M, np.arctan2(x, y)
@@ -68,11 +56,8 @@ def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
     It is the place below the mean of all points of the area in space. For a polygon whose edges are great
     circles this mean has a closed form, the sum over the edges of their length times the normal of their
     plane (J. E. Brock, "The Inertia Tensor for a Spherical Triangle", 1975), so that regions of any size,
-    across the antimeridian or around a pole, have it exactly.
-
-    Args:
-        rings: closed rings, the area to the left of each, so that shells run counter-clockwise and holes
-            clockwise; each [V, 2] degrees (longitude, latitude).
+    across the antimeridian or around a pole, have it exactly. The area lies to the left of each closed ring,
+    [V, 2] degrees (longitude, latitude): shells run counter-clockwise and holes clockwise.
     """
     base = (float(rings[0][0, 1]), float(rings[0][0, 0]))
     moment = np.zeros(3)

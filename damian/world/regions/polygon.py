@@ -1,7 +1,6 @@
 """Polygons of operative regions and the landing points in them, in local metres (paper, section 3.2).
 
-These functions run once, when an environment is built. Polygons may be concave, have holes or consist of
-several parts.
+Polygons may be concave, have holes or consist of several parts.
 """
 
 import itertools
@@ -10,13 +9,11 @@ from typing import Any, cast
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import MultiPoint, MultiPolygon, Polygon
 
 from damian.common import checks
 from damian.common.errors import InputError
-
-Floats = NDArray[np.float64]
+from damian.world.regions.geodesy import Floats
 
 RESOLUTION = 0.01
 """Distances of landing points that differ by less are not told apart [m]."""
@@ -29,11 +26,9 @@ _MAX_ROUNDS = 100
 
 
 def polygon_from_vertices(vertices: Sequence[Any], source: str) -> Polygon:
-    """Build a polygon, convex or concave, from its corners in order around it.
+    """Build a polygon, convex or concave, from its corners in order around it, [V, 2] metres.
 
-    Args:
-        vertices: [V, 2] metres; the first may be repeated at the end.
-        source: prefix of error messages: a file, a line or a key.
+    The first may be repeated at the end. ``source`` begins error messages: a file, a line or a key.
     """
     for vertex in vertices:
         checks.place(source, vertex)
@@ -41,22 +36,17 @@ def polygon_from_vertices(vertices: Sequence[Any], source: str) -> Polygon:
 
 
 def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polygon:
-    """Build a polygon from its shell and holes; refuse any that is not valid.
+    """Build a polygon from its shell and holes, [V, 2] in ``unit`` each; refuse any that is not valid.
 
-    Args:
-        rings: the shell, then the holes; each [V, 2] in ``unit``.
-        source: prefix of error messages.
-        unit: unit of the coordinates, for error messages.
+    ``source`` and ``unit`` are for error messages.
     """
     shell, *holes = [_require_area(ring, source) for ring in rings]
     polygon = Polygon(shell, holes)
     if not polygon.is_valid:
         reason, _, place = shapely.is_valid_reason(polygon).rstrip("]").partition("[")
         reason = "edges cross" if "self-intersection" in reason.lower() else reason.lower()
-        raise InputError(
-            f"{source}: {reason} at [{', '.join(place.split())}] {unit}; list the corners in "
-            "order around the polygon, and holes inside its shell"
-        )
+        remedy = "list the corners in order around the polygon, and holes inside its shell"
+        raise InputError(f"{source}: {reason} at [{', '.join(place.split())}] {unit}; {remedy}")
     return polygon
 
 
@@ -89,18 +79,10 @@ def landing_lattice(
 ) -> Floats:
     """Lay a serpentine lattice over the polygon; its points inside the polygon are the landing points.
 
-    Points are ``step_m`` apart in a row and rows ``step_m sin(degrees)`` apart, so no two points
-    coincide. A landing point's id is its row in the result. Points are ordered counter-clockwise about the
-    centroid from due west, with due west itself last; of two in one direction, the nearer comes first.
-
-    Args:
-        polygon: in local metres; points on its boundary count as outside.
-        step_m: distance between neighbours in a row [m].
-        degrees: slant of the lattice [deg], in (0, 90].
-        n_points: number of points kept, those nearest to the centroid; all if not given.
-
-    Returns:
-        [L, 2] metres.
+    Points are ``step_m`` [m] apart in a row and rows ``step_m sin(degrees)`` apart, with a slant in (0, 90]
+    deg, so no two points coincide. The ``n_points`` nearest to the centroid are kept, or all. A landing
+    point's id is its row in the result, [L, 2] metres. They are ordered counter-clockwise about the centroid
+    from due west, with due west itself last; of two in one direction, the nearer comes first.
     """
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
     shapely.prepare(polygon)
@@ -108,22 +90,17 @@ def landing_lattice(
     problem = f"lays no landing point inside the polygon of {polygon.area:g} m^2; take a shorter one"
     checks.require(len(inside) > 0, "region.lattice_step", f"{step_m:g} m", problem)
     if n_points is not None:
-        problem = f"is more than the {len(inside)} inside the polygon: lower it, or region.lattice_step"
-        checks.require(
-            n_points <= len(inside), "region.n_landing_points", n_points, f"{problem} ({step_m:g} m)"
-        )
+        remedy = f"lower it, or region.lattice_step ({step_m:g} m)"
+        problem = f"is more than the {len(inside)} inside the polygon: {remedy}"
+        checks.require(n_points <= len(inside), "region.n_landing_points", n_points, problem)
     return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
 
 
 def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Generator) -> Floats:
-    """Draw points uniformly in the polygon, strictly inside.
+    """Draw points uniformly in the polygon, strictly inside, [n, 2] metres.
 
     First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it (Osada
-    et al., "Shape Distributions", 2002, eq. 1). Only points that rounding has put on the boundary are drawn
-    again.
-
-    Returns:
-        [n, 2] metres.
+    et al., "Shape Distributions", 2002, eq. 1). Points that rounding has put on the boundary are drawn again.
     """
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
@@ -170,10 +147,10 @@ def _lattice(bounds: tuple[float, float, float, float], step: float, slant: floa
     width, height, rise = max_x - min_x, max_y - min_y, step * np.sin(slant)
     # Compared as products, since a quotient by a tiny step could overflow.
     if (width + 4 * step) * (height + rise) > MAX_CANDIDATES * step * rise:
-        raise InputError(
-            f"region.lattice_step: {step:g} m is too fine for a polygon of {width:g} m x {height:g} m: "
-            f"more than {MAX_CANDIDATES} points; take a longer one"
+        problem = (
+            f"is too fine for a polygon of {width:g} m x {height:g} m: more than {MAX_CANDIDATES} points"
         )
+        raise InputError(f"region.lattice_step: {step:g} m {problem}; take a longer one")
     rows, start, ends = [], min_x, itertools.cycle([(max_x, 1), (min_x, -1)])
     for y, (end, sign) in zip(min_y + rise * np.arange(int(height / rise) + 1), ends, strict=False):
         # A bound missed by a rounding error counts as reached.

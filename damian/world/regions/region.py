@@ -1,8 +1,8 @@
 """Operative regions in local metres about their centroid, and places that settings give in them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import shapely
@@ -62,6 +62,37 @@ def to_grid(metres: Floats) -> Floats:
     return np.round(metres * 65536) / 65536
 
 
+def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
+    """Places of the settings in local metres of a region, [P, 2]; all of them must lie inside.
+
+    Each is ``[x, y]``, metres east and north in the coordinates in which the region is given (those of
+    ``region.vertices``; of a file: about the area's centroid), or, where a file gives the region,
+    ``{lat: 53.1, lon: -4.5}`` in degrees. ``key`` is that of the setting, for errors.
+    """
+    local = np.array([_local_place(key, place, region) for place in places])
+    inside = shapely.contains_xy(region.polygon, local)
+    if not inside.all():
+        first = int(np.argmin(inside))
+        given, (x, y) = places[first], local[first]
+        shown = f"{given} (at [{x:g}, {y:g}] m)" if isinstance(given, Mapping) else f"{[*given]} m"
+        west, south, east, north = np.round(np.tile(region.offset, 2) + region.polygon.bounds, 2)
+        bounds = f"x {west:.10g} to {east:.10g} m, y {south:.10g} to {north:.10g} m"
+        raise InputError(f"{key}: {shown} is not inside {region.name} ({bounds})")
+    return local
+
+
+def _local_place(key: str, place: Any, region: Region) -> Floats:
+    """A place in local metres, [2]."""
+    if not isinstance(place, Mapping):
+        return to_grid(np.array(place, float) - region.offset)
+    problem = (
+        f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in metres, or "
+        "take a region from a FIR table or GeoJSON file"
+    )
+    checks.require(region.origin is not None, key, place, problem)
+    return np.stack(to_local(place["lat"], place["lon"], cast(tuple[float, float], region.origin)))
+
+
 def local_region(
     parts: Sequence[Sequence[Floats]],
     name: str,
@@ -71,27 +102,25 @@ def local_region(
 ) -> Region:
     """Build a region in metres about the centroid of its area on the sphere from polygon parts in degrees.
 
-    Edges are straight in local metres: nearly great circles, not parallels of latitude.
+    Edges are straight in local metres: nearly great circles, not parallels of latitude. ``source`` begins
+    error messages.
 
     Args:
         parts: for each part its rings, the shell first; each [V, 2] degrees (longitude, latitude).
         name: of the region.
         levels: lowest and highest flight level [FL], if known.
-        source: prefix of error messages.
         excluded: parts that are cut out.
     """
-    reference, unit = parts[0][0][0, 0], "deg (longitude, latitude)"
-    polygons, holes = (
-        [
-            polygon_from_rings([_unwrap_longitude(ring, reference) for ring in rings], source, unit)
-            for rings in some
-        ]
-        for some in (parts, excluded)
-    )
+
+    def united(some: Sequence[Sequence[Floats]]) -> Polygon | MultiPolygon:
+        unwrapped = [[_unwrap_longitude(ring, parts[0][0][0, 0]) for ring in rings] for rings in some]
+        polygons = [polygon_from_rings(rings, source, "deg (longitude, latitude)") for rings in unwrapped]
+        return cast(Polygon | MultiPolygon, shapely.union_all(polygons))
+
     # Parts that were cut at the antimeridian share an edge, which a valid MultiPolygon must not.
-    shape = cast(Polygon | MultiPolygon, shapely.union_all(polygons))
+    shape = united(parts)
     if excluded:
-        shape = cast(Polygon | MultiPolygon, shape - shapely.union_all(holes))
+        shape = cast(Polygon | MultiPolygon, shape - united(excluded))
         if shape.is_empty:
             raise InputError(f"{source}: all of it is excluded; take a larger region")
     if shape.bounds[2] - shape.bounds[0] > 180:
