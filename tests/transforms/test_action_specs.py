@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from contract import Servos
 from delay_twin import ACTION
+from environments import Servos
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, MultiOneHot, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from contract import petting_zoo, vmas
 from delay_twin import Counting, drawn
+from environments import petting_zoo, vmas
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded

@@ -6,31 +6,27 @@ import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
-from contract import (
-    CASES,
-    GROUPS,
+from environments import (
+    ACTION,
     KINDS,
     LATE,
-    PAIRS,
-    TRANSFORMS,
-    Case,
+    OBSERVATION,
+    REWARD,
+    Drift,
     Kind,
-    begun,
+    Servos,
     cartpole,
-    drawing,
-    every_kind,
-    memory,
-    observation_delay,
-    onward,
     uavs,
     unserved,
 )
-from helpers import all_same, same, saved_and_loaded
+from helpers import all_same, same, saved_and_loaded, square, walking
 from streams import check_independent
+from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
@@ -39,17 +35,139 @@ import damian.transforms
 from damian.delays.laws import Burst, Law, Uniform
 from damian.delays.samplers import ContextSampler, Sampler
 from damian.envs.nodes import Belief, ServerNode
+from damian.envs.uav_env import UavEnv
+from damian.server.features import ObservationConfig
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
     Channel,
     CumulativeReward,
     ObservationDelay,
+    ObservationTimeline,
     RewardDelay,
     SampleAndHold,
     StatefulTransform,
     set_seed,
 )
+
+
+class Case(NamedTuple):
+    """An environment, and a transform that works on it."""
+
+    env: Callable[[], EnvBase]
+    make: Callable[[], Transform]
+
+    def build(self) -> TransformedEnv:
+        """The environment with the transform."""
+        return TransformedEnv(self.env(), self.make())
+
+
+def _belief() -> Transform:
+    observation = ObservationConfig(belief=["belief_moments"])
+    scenario = square(observation=observation, source=walking())
+    server = UavEnv(scenario, num_worlds=2, extras=["message"], messages_only=True).server
+    return Belief(server, longest=0, delayed=False, own=True)
+
+
+CASES = {
+    "Belief": Case(uavs, _belief),
+    "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
+    "ActionDelay, two entries": Case(
+        Servos, lambda: ActionDelay(LATE, ["place", "gear"], ["wish", "gear"], loss=0.2)
+    ),
+    "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
+    "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
+    "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),
+    "ActionHistory, agents": Case(
+        uavs, lambda: ActionHistory(2, ACTION, append_to=OBSERVATION, recorded_key="ready")
+    ),
+    "SampleAndHold, worlds": Case(Drift, lambda: SampleAndHold(2, in_keys_inv=["action"])),
+    "SampleAndHold, agents": Case(
+        uavs, lambda: SampleAndHold("2s", [OBSERVATION], [ACTION], ready_key=("agents", "ready"))
+    ),
+    "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
+    "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),
+    "ObservationTimeline, one world": Case(cartpole, lambda: ObservationTimeline(3)),
+    "ObservationTimeline, worlds": Case(Drift, lambda: ObservationTimeline(2)),
+    "ObservationTimeline, agents": Case(
+        uavs,
+        lambda: ObservationTimeline(3, ("agents", "message"), sent_key="message_sent", group=True, own=True),
+    ),
+    "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
+    "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"}, fresh_key="fresh")),
+    "ObservationDelay, agents": Case(
+        uavs,
+        lambda: ObservationDelay(LATE, [OBSERVATION], loss=0.2, delay_key="delay", sent_key="message_sent"),
+    ),
+    "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
+    "RewardDelay, worlds": Case(Drift, lambda: RewardDelay({"law": "geometric"})),
+    "RewardDelay, agents": Case(uavs, lambda: RewardDelay(LATE, REWARD)),
+    "Channel, links": Case(
+        uavs,
+        lambda: Channel(
+            [[0, LATE, 1], [3, 0, 0], [0, LATE, 0]], OBSERVATION, loss=0.2, limit=2, sent_key="message_sent"
+        ),
+    ),
+    "Channel, messages": Case(uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)),
+    "ServerNode": Case(unserved, lambda: ServerNode(unserved().server, ("agents", "message"))),
+}
+"""Every transform on every kind of environment that it works on; the name before the comma is its class."""
+
+
+def onward(env: EnvBase, td: TensorDictBase, n_steps: int = 6, seed: int = 0) -> list[TensorDictBase]:
+    """Step with random actions and partial resets; the outputs of every step and every reset."""
+    torch.manual_seed(seed)
+    outputs = []
+    for _ in range(n_steps):
+        after, td = env.step_and_maybe_reset(env.rand_action(td))
+        outputs += [after["next"].clone(), td.clone()]
+    return outputs
+
+
+def begun(env: EnvBase, n_steps: int = 5, seed: int = 0) -> TensorDictBase:
+    """Reset and step an environment; the TensorDict from which ``onward`` can continue."""
+    set_seed(env, seed)
+    torch.manual_seed(seed)
+    td = env.reset()
+    return onward(env, td, n_steps, seed)[-1] if n_steps else td
+
+
+def memory(transform: Transform) -> list[Tensor]:
+    """All tensors that a transform remembers."""
+    return [value for value in transform.state_dict().values() if value is not None]
+
+
+# Every transform on every kind of environment.
+
+GROUPS = {name: kind for name, kind in KINDS.items() if isinstance(kind.observation, tuple)}
+"""Kinds whose observations are those of a group of agents, for ``Channel``."""
+
+
+def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
+    return ObservationDelay(law, kind.observation, fresh_key="fresh", delay_key="delay", **options)
+
+
+TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
+    "ObservationDelay": observation_delay,
+    "ActionDelay": lambda kind, law, **options: ActionDelay(law, kind.action, **options),
+    "RewardDelay": lambda kind, law, **options: RewardDelay(
+        law, kind.reward, delay_key="reward_delay", earned_key="earned_reward", **options
+    ),
+    "CumulativeReward": lambda kind, law, **options: CumulativeReward(3, 0.5, kind.reward, **options),
+    "ActionHistory": lambda kind, law, **options: ActionHistory(3, kind.action, **options),
+    "SampleAndHold": lambda kind, law, **options: SampleAndHold(2, kind.observation, **options),
+}
+every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+PAIRS = {f"{name} on {kind}": (KINDS[kind], make) for kind in KINDS for name, make in TRANSFORMS.items()} | {
+    f"Channel on {name}": (kind, lambda kind, law: Channel(law, kind.observation, loss=0.1))
+    for name, kind in GROUPS.items()
+}
+"""Every kind of environment with every transform, and with a channel where that works."""
+DRAWING = {name: pair for name, pair in PAIRS.items() if "Delay" in name or "Channel" in name}
+drawing = pytest.mark.parametrize(("kind", "make"), DRAWING.values(), ids=DRAWING)
+
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 OTHERS = {name: Case(kind.make, partial(make, kind, LATE)) for name, (kind, make) in PAIRS.items()}

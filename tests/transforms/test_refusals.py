@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from contract import ACTION, LATE, OBSERVATION, Drift, uavs
 from delay_twin import Counting
+from environments import ACTION, LATE, OBSERVATION, Drift, uavs
 from tensordict import TensorDict
 from torchrl.envs import Compose, ConditionalSkip, GymEnv, StepCounter, Transform, TransformedEnv
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 import torch
-from contract import vmas
 from delay_twin import ACTION, OBSERVATION, REWARD, WORLDS, Counting
+from environments import vmas
 from helpers import same
 from tensordict import TensorDictBase
 from torchrl.envs import (

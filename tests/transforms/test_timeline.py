@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from contract import LATE
+from environments import LATE
 from helpers import square
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
