@@ -18,7 +18,7 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.delays.law_fit import fit_laws
-from damian.field.advice import next_landings, uavs_of
+from damian.field.advice import next_landings
 from damian.field.fitting import (
     check_clocks,
     fit,
@@ -56,7 +56,8 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
         print("note: the policy knew a UAV's own messages at once; here they are known when they arrive")
     with named(path := Path(str(config.table))):
         rows = read_file(path)
-        node = Node(for_uavs(config.eval_scenario, len(uavs_of(rows))), config.seed)
+        n_uavs = len({report.id for _, report in rows})
+        node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed)
         policy = stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
         answers = next_landings(rows, node, policy, time.time(), config.flown == "sampled")
     save_config(config, folder)

@@ -6,7 +6,8 @@ damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
 
 __package__ = "damian.recipes"  # also of a script: python recipes/fly.py
 
-from functools import cache, partial
+import math
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -55,21 +56,16 @@ def fly(config: FlyConfig) -> list[Episode]:
 
 def episode_of_journal(config: FlyConfig) -> Episode:
     """The flight that the journal tells."""
-    from damian.field.journal import read_head  # noqa: PLC0415 (needs pydantic, which only reports do)
-    from damian.field.node import Node, for_uavs  # noqa: PLC0415
+    from damian.field.node import Node, for_uavs  # noqa: PLC0415 (needs pydantic, which only reports do)
     from damian.field.playback import episode_of  # noqa: PLC0415
-
-    path = Path(str(config.journal))
-    head = read_head(path)
 
     @cache
     def node_of(n_uavs: int) -> Node:
         return Node(for_uavs(config.eval_scenario, n_uavs), config.seed, reward_terms=True)
 
-    span = None if config.span is None else (config.span[0], config.span[1])
-    about = {"policy": head.about.policy, "checkpoint": head.about.checkpoint}
-    about |= {"overrides": list(config.overrides), "fleet": head.fleet}
-    return episode_of(path, head.uavs, node_of, about, span, partial(tqdm, unit=" lines", delay=1))
+    first, last = config.span or (0.0, math.inf)
+    about = {"overrides": list(config.overrides)}
+    return episode_of(Path(str(config.journal)), node_of, about, (first, last))
 
 
 def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:

@@ -64,14 +64,13 @@ class Greedy:
     def __init__(self, worlds: UavEnv) -> None:
         scenario, simulation = worlds.scenario, worlds.simulation
         source = scenario.source
-        self.unpack, self.region_of = worlds.server.messages, worlds.server.region_of
-        self.counted = worlds.server.counted
-        self.grid = worlds.server.grid
+        server = worlds.server
+        self.unpack, self.region_of, self.counted = server.messages, server.region_of, server.counted
+        self.grid = server.grid
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
         self.emits = source.emits
-        self.seeks = scenario.seeks_source
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
         near = distances(self.points, self.points) <= self.radius
@@ -83,11 +82,9 @@ class Greedy:
         held = self.unpack(message)
         region = self.region_of(held)
         ground = self.points[region]
-        weight = self.fresh(held, ground)
-        if self.seeks:
-            time = held.time if age is None else held.time + age.squeeze(-1) * self.dt
-            likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
-            weight = torch.where(recent, likely, weight * likely)
+        time = held.time if age is None else held.time + age.squeeze(-1) * self.dt
+        likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
+        weight = torch.where(recent, likely, self.fresh(held, ground) * likely)
         return self.choose_landing(held, weight @ self.footprints(region), region, mask)[0]
 
     def footprints(self, region: Tensor) -> Tensor:
@@ -215,9 +212,7 @@ class Searcher(Greedy):
     def taken(self, known: Messages) -> Tensor:
         """Landing points on which the latest known messages place another UAV, [B, N, L] bool."""
         point = known.trail[..., :1] % self.points.shape[1]
-        stands = torch.zeros(*point.shape[:2], self.points.shape[1], device=point.device).scatter(
-            -1, point, 1.0
-        )
+        stands = point.new_zeros(*point.shape[:2], self.points.shape[1]).scatter(-1, point, 1)
         return stands.sum(1, keepdim=True) > stands
 
 
@@ -254,9 +249,8 @@ class Coverer(Greedy):
     ) -> tuple[Tensor, Tensor]:
         """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others."""
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        latest = (
-            self.counted(alone)[:, 0, :-1] % self.points.shape[1]
-        )  # the next landing replaces the oldest one
+        # The next landing replaces the oldest one.
+        latest = self.counted(alone)[:, 0, :-1] % self.points.shape[1]
         covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
         return self.choose_landing(alone, (1 - covered) @ near, self.region_of(known), mask)
 

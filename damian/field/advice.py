@@ -38,11 +38,6 @@ class NextLanding(BaseModel):
     """Age of its newest report [s]."""
 
 
-def uavs_of(rows: Rows) -> list[str]:
-    """The UAVs that report, in the order of their first rows."""
-    return list(dict.fromkeys(report.id for _, report in rows))
-
-
 def next_landings(
     rows: Rows, node: Node, policy: TensorDictModuleBase, now: float, drawn: bool = False
 ) -> list[NextLanding]:
@@ -54,8 +49,9 @@ def next_landings(
     for where, report in rows:
         with named(where):
             report.stamp(now, file=True)
-    tracker = Tracker(uavs_of(rows), lambda _: node)
-    hidden = _first_hidden(policy, len(tracker.uavs))
+    tracker = Tracker([*dict.fromkeys(report.id for _, report in rows)], lambda _: node)
+    sizes = [each.cell.hidden_size for each in policy.modules() if isinstance(each, AgentGRU)]
+    hidden = torch.zeros(1, len(tracker.uavs), sizes[0]) if sizes else None
     kind = ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
         for where, report in sorted(rows, key=lambda row: row[1].received):
@@ -68,12 +64,6 @@ def next_landings(
         asking = [uav for uav in tracker.uavs if not tracker.held[uav].report.flies]
         action = policy(_read(tracker, asking, hidden))[keys.ACTION]
     return _answers(tracker, asking, action)
-
-
-def _first_hidden(policy: TensorDictModuleBase, n_uavs: int) -> Tensor | None:
-    """The first hidden states of a recurrent policy, [1, N, H]; None of another one."""
-    sizes = [each.cell.hidden_size for each in policy.modules() if isinstance(each, AgentGRU)]
-    return torch.zeros(1, n_uavs, sizes[0]) if sizes else None
 
 
 def _read(tracker: Tracker, asking: Sequence[str], hidden: Tensor | None) -> TensorDictBase:

@@ -3,28 +3,30 @@
 A service writes it, such as that of ``examples/fleet``; the first line says which fleet it is.
 """
 
-from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AliasChoices, BaseModel, Field, model_validator
 
-from damian.common.errors import InputError
-from damian.common.text_files import named
-from damian.field.rows import Report, Time, UavId, parsed_json, validated
+from damian.common.text_files import named, read_text
+from damian.field.rows import Place, Report, Time, UavId, parsed_json, validated
 
 SUFFIX = ".jsonl"
 """End of the name of a journal; that of a fleet that has ended is ``.ended``."""
 
 
 class About(BaseModel):
-    """Which policy advises by which settings."""
+    """Which policy advises."""
 
     policy: str | None = None
     checkpoint: str | None = None
-    overrides: list[str] = []
-    """Words of the command line."""
+
+
+class Rules(BaseModel):
+    """What of the rules of a fleet counts here."""
+
+    acknowledge: bool = True
+    """Whether UAVs follow an answer only once they have accepted it."""
 
 
 class Head(BaseModel):
@@ -32,24 +34,49 @@ class Head(BaseModel):
 
     journal: Literal["damian-advice"] = "damian-advice"
     version: Literal[3] = 3
-    fleet: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-    uavs: Annotated[list[UavId], Field(min_length=1, max_length=100)]
+    fleet: str
+    uavs: Annotated[list[UavId], Field(min_length=1)]
     about: About
+    rules: Rules = Rules()
 
-    @model_validator(mode="after")
-    def _distinct(self) -> "Head":
-        if len({*self.uavs}) < len(self.uavs):
-            raise ValueError(f"uavs: {', '.join(self.uavs)}: a UAV appears twice")
-        return self
+
+class Told(BaseModel):
+    """An answer to a UAV; it has a place if the UAV is to fly there, or to stay there as the policy chose."""
+
+    id: UavId = Field(validation_alias="ID")
+    answer: str = ""
+    lat: float | None = None
+    lon: float | None = None
+    x: float | None = None
+    y: float | None = None
+
+    @property
+    def place(self) -> Place | None:
+        """The place, [deg] or [m]."""
+        first, second = (self.x, self.y) if self.lat is None else (self.lat, self.lon)
+        return None if first is None or second is None else (first, second)
+
+
+class Acknowledged(BaseModel):
+    """What a UAV does with an answer."""
+
+    answer: str
+    status: str
 
 
 class Line(BaseModel):
-    """Any other line, as far as it tells what was reported; what UAVs were told is left out."""
+    """Any other line, as far as it tells what was reported, and where UAVs were sent."""
 
     time: Time = Field(validation_alias=AliasChoices("received", "asked"))
     """When it was written [s]."""
     reports: list[Report] = []
     """Reports that came in then."""
+    advice: list[Told] = []
+    """What UAVs were told then."""
+    acknowledged: list[Acknowledged] = []
+    """What UAVs do with what they were told."""
+    outdated: list[int] = []
+    """Which of these accept what was not safe any more."""
     join: list[UavId] = []
     """UAVs that join with their first reports."""
     leave: list[UavId] = []
@@ -62,29 +89,11 @@ class Line(BaseModel):
         return self
 
 
-def read_head(path: Path) -> Head:
-    """The first line of a journal."""
+def read_journal(path: Path) -> tuple[Head, list[tuple[int, Line]]]:
+    """The first line of a journal, and the others with their numbers; an unfinished last one is left out."""
     with named(path):
-        return validated(Head, parsed_json(_texts(path, 1)[0]), "line 1")
-
-
-def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
-    """The lines after the first one, with their numbers; an unfinished one at the end is left out."""
-    with named(path):
-        texts = _texts(path)
-    for number, text in enumerate(texts[1:], 2):
-        with named(f"{path}: line {number}"):
-            line = validated(Line, parsed_json(text))
-        yield number, line
-
-
-def _texts(path: Path, most: int | None = None) -> list[bytes]:
-    """The whole lines of a file, or the first ``most`` ones."""
-    try:
-        with path.open("rb") as file:
-            *lines, _ = b"".join(islice(file, most)).split(b"\n")
-    except OSError as error:
-        raise InputError(f"it cannot be read: {error.strerror}") from None
-    if not lines:
-        raise InputError("it is empty")
-    return lines
+        first, *others = read_text(path).rpartition("\n")[0].split("\n")
+        head = validated(Head, parsed_json(first), "line 1")
+        return head, [
+            (n, validated(Line, parsed_json(text), f"line {n}")) for n, text in enumerate(others, 2)
+        ]

@@ -23,9 +23,6 @@ from damian.world.battery import observed
 from damian.world.messages import Messages
 from damian.world.regions.geodesy import to_latlon, to_local
 
-DIGITS = {DEGREES: 8, METRES: 3}
-"""Decimals of a place in answers: a millimetre."""
-
 
 class Ground:
     """Landing points of a region, as answers and reports, up to ``reach`` [m] beside them, name places."""
@@ -34,14 +31,15 @@ class Ground:
         self.region, self.reach = airspace.regions[0], reach
         self.columns = METRES if self.region.origin is None else DEGREES
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
+        if self.region.origin is None:
+            places = (self.points + self.region.offset).round(3)
+        else:
+            east, north = self.points.T
+            places = np.column_stack(to_latlon(east, north, self.region.origin)).round(8)
+        self._places = places.tolist()
         self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
-        # Each place is looked up several times.
-        self.landing_point = lru_cache(10_000)(self._landing_point)
+        self.landing_point = lru_cache(10_000)(self._landing_point)  # each place is looked up several times
         """Number of the landing point nearest to a place; ``InputError`` if it is farther than ``reach``."""
-        self.place = lru_cache(10_000)(self._place)
-        """Where a landing point is, in ``columns``."""
-        self.way = lru_cache(10_000)(self._way)
-        """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
 
     def local(self, place: Place) -> tuple[float, float]:
         """A place, east and north of the origin of the region [m]."""
@@ -60,17 +58,14 @@ class Ground:
             raise InputError(f"{where} is {away:.0f} m away from the landing points of {self.region.name}")
         return point
 
-    def _place(self, point: int) -> Place:
-        x, y = self.points[point]
-        if self.region.origin is None:
-            place = x + self.region.offset[0], y + self.region.offset[1]
-        else:
-            place = to_latlon(x, y, self.region.origin)
-        digits = DIGITS[self.columns]
-        return round(float(place[0]), digits), round(float(place[1]), digits)
+    def place(self, point: int) -> Place:
+        """Where a landing point is, in ``columns``, to a millimetre."""
+        first, second = self._places[point]
+        return first, second
 
-    def _way(self, origin: int, goal: int) -> tuple[float, float]:
-        east, north = (float(each) for each in self.points[goal] - self.points[origin])
+    def way(self, origin: int, goal: int) -> tuple[float, float]:
+        """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
+        east, north = (self.points[goal] - self.points[origin]).tolist()
         heading = math.degrees(math.atan2(east, north)) % 360
         return round(math.hypot(east, north), 2), round(heading, 2)
 
@@ -125,14 +120,13 @@ class UavLog:
         if report.columns != self.ground.columns:
             own = ", ".join(self.ground.columns)
             raise InputError(f"places in {self.ground.region.name} are {own}: give those of {report.id} so")
-        for place in (report.place(), report.place("source_"), report.place("target_")):
+        own_places = (report.place(prefix) for prefix in ("", "source_", "target_"))
+        for place in (*own_places, *(report.previous or ())):
             if place is not None:
                 self.ground.landing_point(place)
-        for place in report.previous or ():
-            self.ground.landing_point(place)
-        n = self.n_readings
-        if report.readings is not None and len(report.readings) != n:
-            raise InputError(f"readings: {len(report.readings)} numbers are not {n}, as in the training")
+        given, n = report.readings, self.n_readings
+        if given is not None and len(given) != n:
+            raise InputError(f"readings: {len(given)} numbers are not {n}, as in the training")
 
     def has(self, time: float) -> bool:
         """Has a report that was generated at this time come in before."""
@@ -140,9 +134,7 @@ class UavLog:
         return at < len(self.reports) and self.reports[at].report.time == time
 
     def _place_of(self, time: float) -> int:
-        """Number of reports that were generated before this time; mostly all."""
-        if not self.reports or self.reports[-1].report.time < time:
-            return len(self.reports)
+        """Number of reports that were generated before this time."""
         return bisect.bisect_left(self.reports, time, key=lambda filled: filled.report.time)
 
     def add(
@@ -180,15 +172,14 @@ class UavLog:
         if filled.spotted:
             filled.detected, filled.detected_at = filled.step, filled.point
         elif report.source_time is None:
-            if before is not None:
+            if before:
                 filled.detected, filled.detected_at = before.detected, before.detected_at
         elif place is not None:
             filled.detected_at = near(place)
         else:
             held = before and before.detected_at
             filled.detected_at = filled.point if held is None else held
-        filled.motions = 0 if before is None or before.spotted else before.motions
-        filled.motions += before is not None
+        filled.motions = 0 if before is None else 1 if before.spotted else before.motions + 1
         if report.motions is not None:
             filled.motions = report.motions
         filled.stops = self._stops(filled, before)

@@ -5,234 +5,231 @@ hindsight, and between two reports on the straight way to the later one. Nobody 
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
+import pandas as pd
+import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from tqdm import tqdm
 
 from damian import keys
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.field.fitting import fit
-from damian.field.journal import read_lines
+from damian.field.journal import Line, read_journal
 from damian.field.node import Node
 from damian.field.rows import Place, Report, written
-from damian.field.tracker import Tracker
+from damian.field.tracker import Tracker, latest
 from damian.show.episode import Episode, Floats, cells_of, fixed_of
 
 MOST_STEPS = 20_000
 """Most steps of an episode that is made from a journal."""
-
-
-class Known(NamedTuple):
-    """What the server node knew of its N UAVs at the end of a step."""
-
-    step: int
-    uavs: list[str]
-    believed: Tensor
-    """Positions in the messages that it held [m], [N, 2]."""
-    age: Tensor
-    """Ages of these messages [s], [N]."""
-    reward: Tensor
-    """Rewards of the step, [N]."""
-    terms: dict[str, Tensor]
-    """Their weighted terms by name, [N] each."""
-    belief: Tensor | None
-    """Probability that the source is in a cell, [K]."""
-    success: bool
-    """Whether it knew that the task was accomplished."""
+FOLLOWED = ("accepted", "taken off", "landed")
+"""What a UAV says of an answer that it follows."""
+_KNOWN = ("step", "uav", "east", "north", "age", "reward")
+"""What the server node knew of a UAV at the end of a step: where it was by the message that the node held
+[m], the age of this message [s], and the reward of the step; its terms follow."""
 
 
 def episode_of(
     path: Path,
-    uavs: Sequence[str],
     node_of: Callable[[int], Node],
     about: Mapping[str, Any],
-    span: tuple[float, float] | None = None,
-    progress: Callable = iter,
+    span: tuple[float, float] = (0.0, math.inf),
 ) -> Episode:
-    """The flight of a journal that begins with these UAVs, as an episode; ``source`` and ``emits`` are None.
+    """The flight of a journal as an episode; ``source`` and ``emits`` are None.
 
     ``node_of`` gives a node for a number of UAVs, which writes the terms of the reward; ``span`` is the first
-    and last time to keep, since every UAV had reported [s], and ``progress`` is like ``tqdm.tqdm``.
+    and last time to keep, since every UAV had reported [s].
     """
-    tracker = Tracker(uavs, node_of)
-    known, delays, reports = _read(path, tracker, span, progress)
-    steps, uavs, node = np.array([each.step for each in known]), [*reports], tracker.node
-    truth = [_hindsight(tracker, own, steps) for own in reports.values()]
+    replay = _Replay(path, node_of, span)
+    tracker, node = replay.tracker, replay.tracker.node
+    reports = {uav: own for uav, own in replay.reports.items() if own}
+    names = [*node.server.reward.terms]
+    table = pd.DataFrame(replay.known, columns=[*_KNOWN, *range(len(names))])
+    known = table.pivot(index="step", columns="uav")
+    steps = known.index.to_numpy()
+
+    def column(name: str | int, stays: bool = False) -> Floats:
+        """What was known of all UAVs, [S, U]; while one is not a member 0, or as before, or as then."""
+        of_uavs = cast(pd.DataFrame, known[name]).reindex(columns=[*reports])
+        return (of_uavs.ffill().bfill() if stays else of_uavs).fillna(0).to_numpy(np.float32, copy=True)
+
+    truth = [_hindsight(tracker, uav, own, steps) for uav, own in reports.items()]
     columns = {name: np.stack([each[name] for each in truth], 1) for name in truth[0]}
-    columns["sent"], columns["delay"] = _messages(tracker, delays, reports, steps)
-    columns["believed"] = _of_members(known, [each.believed for each in known], uavs, stays=True)
-    columns["age"] = _of_members(known, [each.age for each in known], uavs)
-    columns["reward"] = _of_members(known, [each.reward for each in known], uavs)
-    terms = {name: _of_members(known, [each.terms[name] for each in known], uavs) for name in known[0].terms}
+    columns["believed"] = np.stack([column("east", stays=True), column("north", stays=True)], -1)
+    columns |= {"age": column("age"), "reward": column("reward")}
+    columns["sent"], columns["delay"] = _messages(replay, reports, steps)
+    terms = {name: column(number) for number, name in enumerate(names)}
     for rows in (columns["sent"], columns["reward"], *terms.values()):
         rows[0] = 0
-    began = cast(float, tracker.start) + known[0].step * node.dt
-    flight = {"uavs": uavs, "began": written(began)}
-    parts: dict[str, Any] = {**fixed_of(node.worlds, {**about, **flight}, 0), **columns}
-    has_belief = known[0].belief is not None
+    head, began = replay.head, written(cast(float, tracker.start) + int(steps[0]) * node.dt)
+    about = {"policy": head.about.policy, "checkpoint": head.about.checkpoint, **about, "fleet": head.fleet}
+    parts: dict[str, Any] = {
+        **fixed_of(node.worlds, {**about, "uavs": [*reports], "began": began}, 0),
+        **columns,
+    }
     return Episode(
         **parts,
         instant=False,
-        success=known[-1].success,
+        success=replay.success,
         time=np.arange(len(steps)) * node.dt,
         source=None,
         emits=None,
         reward_terms=terms,
-        cells=cells_of(node.worlds) if has_belief else None,
-        belief=np.stack([np.asarray(each.belief) for each in known]) if has_belief else None,
+        cells=cells_of(node.worlds) if replay.beliefs else None,
+        belief=np.stack(replay.beliefs) if replay.beliefs else None,
     )
 
 
-def _read(
-    path: Path, tracker: Tracker, span: tuple[float, float] | None, progress: Callable
-) -> tuple[list[Known], dict[tuple[int, str], int], dict[str, list[Report]]]:
-    """What was known in the steps of a span, delays of messages that arrived in it, and all reports by UAV.
+class _Replay:
+    """Takes the steps of a journal again, and notes what was known in those of a span [s]."""
 
-    Delays [steps] are by the step in which the message was generated, and the UAV.
-    """
-    known: list[Known] = []
-    delays: dict[tuple[int, str], int] = {}
-    reports: dict[str, list[Report]] = {uav: [] for uav in tracker.uavs}
-    begin, end = span or (0.0, math.inf)
+    def __init__(self, path: Path, node_of: Callable[[int], Node], span: tuple[float, float]) -> None:
+        self.head, lines = read_journal(path)
+        self.tracker, self.span = Tracker(self.head.uavs, node_of), span
+        self.known: list[tuple[Any, ...]] = []
+        """Rows of what was known of each UAV, as of ``_KNOWN``."""
+        self.beliefs: list[Floats] = []
+        """Probability that the source is in a cell, [K], of each step; empty without a belief."""
+        self.success = False
+        """Whether the node knew in the last step that the task was accomplished."""
+        self.delays: dict[tuple[int, str], int] = {}
+        """Delays of the messages that arrived [steps], by the step of their generation, and the UAV."""
+        self.reports: dict[str, list[Report]] = {uav: [] for uav in self.head.uavs}
+        """All reports by UAV."""
+        self._answers: dict[str, tuple[str, float, Place]] = {}
+        """Where a UAV was told to be, and when, by the ID of the answer."""
+        for number, line in tqdm(lines, unit=" lines", delay=1):
+            with named(f"{path}: line {number}"):
+                self._take(line)
+        tracker, (first, last) = self.tracker, self._first_and_last()
+        if tracker.start is None:
+            raise InputError(f"{path}: the fleet never began: not every UAV has reported")
+        if first <= tracker.step <= last:
+            self._note()
+        if not self.known:
+            whole = f"the journal covers 0 to {(tracker.step - tracker.first_step) * tracker.node.dt:g} s"
+            raise InputError(f"span: no step lies between {span[0]:g} and {span[1]:g} s: {whole}")
 
-    def note() -> None:
+    def _first_and_last(self) -> tuple[float, float]:
+        """The steps between which the span lies."""
+        first, last = (self.tracker.first_step + each / self.tracker.node.dt for each in self.span)
+        return first, last
+
+    def _take(self, line: Line) -> None:
+        """Take the steps before a line, and what it says."""
+        tracker, (first, last) = self.tracker, self._first_and_last()
+        if tracker.step <= last:
+            for step in tracker.advance(line.time, math.ceil(first)):
+                if step <= last:
+                    self._note()
+            tracker.change_members(line.join, line.leave)
+            for order in self._followed(line):
+                tracker.follow(*order)
+            for report in sorted(line.reports, key=lambda each: each.received):
+                tracker.report(report)
+        for report in line.reports:
+            self.reports.setdefault(report.id, []).append(report)
+
+    def _followed(self, line: Line) -> Iterator[tuple[str, float, Place]]:
+        """The UAVs that follow an answer from this line on, each with when and where it was sent."""
+        for told in line.advice:
+            if (place := told.place) is not None and told.id in self.tracker.held:
+                self._answers[told.answer] = told.id, line.time, place
+                if not self.head.rules.acknowledge:
+                    yield self._answers[told.answer]
+        for number, said in enumerate(line.acknowledged):
+            if said.status in FOLLOWED and number not in line.outdated and said.answer in self._answers:
+                yield self._answers.pop(said.answer)
+
+    def _note(self) -> None:
+        """Note what the server node knows at the end of the tracker's step."""
+        tracker, node, outputs = self.tracker, self.tracker.node, self.tracker.observe()
         for uav, each in tracker.arrived:
             lag = tracker.step - each.step
-            delays[each.step, uav] = min(lag, delays.get((each.step, uav), lag))
-        known.append(_known(tracker))
-        if len(known) > MOST_STEPS:
-            dt = tracker.node.dt
-            raise InputError(
-                f"span: it has more than {MOST_STEPS} steps of {dt:g} s: give FIRST and LAST [s]"
-            )
-
-    for number, line in progress([*read_lines(path)]):
-        with named(f"{path}: line {number}"):
-            first, last = (tracker.first_step + each / tracker.node.dt for each in (begin, end))
-            if tracker.step <= last:
-                for step in tracker.advance(line.time, math.ceil(first)):
-                    if step <= last:
-                        note()
-                if line.join or line.leave:
-                    tracker.change_members(line.join, line.leave)
-                for report in sorted(line.reports, key=lambda each: each.received):
-                    tracker.report(report)
-            for report in line.reports:
-                reports.setdefault(report.id, []).append(report)
-    if tracker.start is None:
-        raise InputError(f"{path}: the fleet never began: not every UAV has reported")
-    first, last = (tracker.first_step + each / tracker.node.dt for each in (begin, end))
-    if first <= tracker.step <= last:
-        note()
-    if not known:
-        whole = f"the journal covers 0 to {(tracker.step - tracker.first_step) * tracker.node.dt:g} s"
-        raise InputError(f"span: no step lies between {begin:g} and {end:g} s: {whole}")
-    return known, delays, {uav: own for uav, own in reports.items() if own}
-
-
-def _known(tracker: Tracker) -> Known:
-    """What the server node knows at the end of the tracker's step."""
-    outputs, node = tracker.observe(), tracker.node
-    age = outputs[keys.AGE][0, :, 0] * node.dt
-    reward, belief = outputs.get(keys.REWARD, None), outputs.get(keys.BELIEF, None)
-    terms = {name: outputs.get((*keys.REWARD_TERMS, name), None) for name in node.server.reward.terms}
-    return Known(
-        tracker.step,
-        tracker.uavs,
-        believed=tracker.points[[tracker.held[uav].point for uav in tracker.uavs]],
-        age=age,
-        reward=age * 0 if reward is None else cast(Tensor, reward)[0, :, 0],
-        terms={name: age * 0 if term is None else cast(Tensor, term)[0] for name, term in terms.items()},
-        belief=None if belief is None else cast(Tensor, belief)[0],
-        success=bool(outputs[keys.SUCCESS]),
-    )
+            self.delays[each.step, uav] = min(lag, self.delays.get((each.step, uav), lag))
+        age = outputs[keys.AGE][0, :, 0] * node.dt
+        places = tracker.points[[tracker.held[uav].point for uav in tracker.uavs]]
+        values = [*places.T, age, outputs.get(keys.REWARD, torch.zeros(1, len(age), 1))[0, :, 0]]
+        values += [
+            outputs.get((*keys.REWARD_TERMS, name), torch.zeros(1, len(age)))[0]
+            for name in node.server.reward.terms
+        ]
+        rows = torch.stack(values, -1).tolist()
+        self.known += [(tracker.step, uav, *row) for uav, row in zip(tracker.uavs, rows, strict=True)]
+        if (belief := outputs.get(keys.BELIEF, None)) is not None:
+            self.beliefs.append(np.asarray(belief[0]))
+        self.success = bool(outputs[keys.SUCCESS])
+        if tracker.step - self.known[0][0] >= MOST_STEPS:
+            problem = f"it has more than {MOST_STEPS} steps of {node.dt:g} s: give FIRST and LAST [s]"
+            raise InputError(f"span: {problem}")
 
 
 def _hindsight(
-    tracker: Tracker, reports: Sequence[Report], steps: NDArray[np.int64]
+    tracker: Tracker, uav: str, reports: Sequence[Report], steps: NDArray[np.int64]
 ) -> dict[str, NDArray[Any]]:
     """Columns of a UAV that follow from its reports by the time when they were generated, [S, ...]."""
-    ordered = sorted(reports, key=lambda report: report.time)
-    at = np.clip([tracker.step_of(report.time) for report in ordered], tracker.first_step, None)
-    of_step = {int(step): report for step, report in zip(at, ordered, strict=True)}
-    knots, latest = np.array(list(of_step)), list(of_step.values())
-    local, heights = tracker.node.ground.local, [max(each.fla or 0.0, 0.0) for each in latest]
-    places = np.array([local(cast(Place, each.place())) for each in latest])
-    position = np.stack([np.interp(steps, knots, axis) for axis in (*places.T, heights)], -1)
-    goals = [*places]
-    for i in reversed(range(len(latest))):
-        if (target := latest[i].place("target_")) is not None:
-            goals[i] = np.array(local(target))
-        elif latest[i].flies and i + 1 < len(latest):
-            goals[i] = goals[i + 1]
-    following = np.clip(np.searchsorted(knots, steps), None, len(knots) - 1)
-    newest = np.clip(np.searchsorted(knots, steps, side="right") - 1, 0, None)
-    spots = np.array([each.source_spotted and not each.flies for each in latest])
-    headings = [None if each.track is None else math.radians(each.track) for each in latest]
+    ground, orders, rows = tracker.node.ground, tracker.orders[uav], []
+    for report in sorted(reports, key=lambda each: each.time):
+        target = report.place("target_")
+        goal = (math.nan, math.nan) if target is None else ground.local(target)
+        if target is None and report.flies and (order := latest(orders, report.time)):
+            goal = ground.points[order.goal]
+        rows.append(
+            (
+                max(tracker.step_of(report.time), tracker.first_step),
+                *ground.local(cast(Place, report.place())),
+                max(report.fla or 0.0, 0.0),
+                *goal,
+                report.battery,
+                None if report.track is None else math.radians(report.track),
+                report.source_spotted and not report.flies,
+                report.flies,
+            )
+        )
+    place, goal = ["east", "north", "up"], ["to_east", "to_north"]
+    names = ["step", *place, *goal, "battery", "track", "spotted", "flies"]
+    table = pd.DataFrame(rows, columns=names).drop_duplicates("step", keep="last").set_index("step")
+    position = np.stack([np.interp(steps, table.index, table[axis]) for axis in place], -1)
+    stands = table[place[:2]].set_axis(goal, axis=1)
+    # A UAV in flight without a known goal goes to where it stands next.
+    goals = table[goal].fillna(stands[~table.flies]).bfill().fillna(stands)
+    following = np.clip(table.index.searchsorted(steps), None, len(table) - 1)
+    newest = np.clip(table.index.searchsorted(steps, side="right") - 1, 0, None)
+    track = _course(position) if table.track.isna().any() else table.track.to_numpy()[newest]
     return {
         "position": position,
-        "target": np.array(goals)[following],
-        "battery": _filled([each.battery for each in latest], 100.0)[newest],
-        "spotted": spots[newest],
-        "track": _course(position) if None in headings else _filled(headings, 0.0)[newest] % (2 * np.pi),
+        "target": goals.to_numpy()[following],
+        "battery": table.battery.astype(float).ffill().fillna(100.0).to_numpy()[newest],
+        "spotted": table.spotted.to_numpy()[newest],
+        "track": track % (2 * np.pi),
     }
-
-
-def _filled(values: Sequence[float | None], first: float) -> Floats:
-    """Values in which the one before stands for each that is None."""
-    filled = accumulate(values, lambda before, value: before if value is None else value, initial=first)
-    return np.array([*filled][1:])
 
 
 def _course(position: Floats) -> Floats:
     """Headings by which a UAV has come to its positions [S, 3], clockwise from north [rad], [S]."""
-    east, north, _ = np.diff(position, axis=0, prepend=position[:1]).T
-    moved = [float(np.arctan2(*way)) if any(way) else None for way in zip(east, north, strict=True)]
-    return _filled(moved, 0.0) % (2 * np.pi)
+    way = np.diff(position[:, :2], axis=0, prepend=position[:1, :2])
+    return pd.Series(np.arctan2(*way.T)).where(np.asarray(way.any(1))).ffill().fillna(0.0).to_numpy()
 
 
 def _messages(
-    tracker: Tracker,
-    delays: Mapping[tuple[int, str], int],
-    reports: Mapping[str, Sequence[Report]],
-    steps: NDArray[np.int64],
+    replay: _Replay, reports: Mapping[str, Sequence[Report]], steps: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N] each."""
     sent, number = np.zeros((len(steps), len(reports)), bool), {uav: i for i, uav in enumerate(reports)}
-    delay = np.zeros(sent.shape, int)
-    for (step, name), lag in delays.items():
-        uav = number[name]
+    delay, step_of = np.zeros(sent.shape, int), replay.tracker.step_of
+    for (step, uav), lag in replay.delays.items():
         if step >= steps[0]:
-            sent[step - steps[0], uav], delay[step - steps[0], uav] = True, lag
-    for message in fit([report for own in reports.values() for report in own]).messages:
-        row, uav = tracker.step_of(message.time) - steps[0], number[message.uav]
-        if 0 <= row < len(steps) and not sent[row, uav]:  # lost, or it came in after the last of the steps
-            lag = -1 if message.received is None else tracker.step_of(message.received) - steps[0] - row
-            sent[row, uav], delay[row, uav] = True, lag
+            at = step - steps[0], number[uav]
+            sent[at], delay[at] = True, lag
+    found = fit(report for own in reports.values() for report in own)
+    for uav, time, received in zip(found.uav, found.time, found.received, strict=True):
+        at = step_of(time) - steps[0], number[uav]
+        if 0 <= at[0] < len(steps) and not sent[at]:  # lost, or it came in after the last of the steps
+            lag = -1 if math.isnan(received) else step_of(received) - steps[0] - at[0]
+            sent[at], delay[at] = True, lag
     return sent, delay
-
-
-def _of_members(
-    known: Sequence[Known], rows: Sequence[Tensor], uavs: Sequence[str], stays: bool = False
-) -> NDArray[Any]:
-    """Rows of the members [N, ...] as columns of all UAVs [S, U, ...]; 0 while a UAV is not a member.
-
-    With ``stays`` it is then where it was last, and before it joins, where it will be first.
-    """
-    found = np.zeros((len(rows), len(uavs), *rows[0].shape[1:]), np.asarray(rows[0]).dtype)
-    there = np.zeros(found.shape[:2], bool)
-    for step, (each, row) in enumerate(zip(known, rows, strict=True)):
-        at = [uavs.index(uav) for uav in each.uavs]
-        found[step, at], there[step, at] = np.asarray(row), True
-    for uav in range(len(uavs)) if stays else ():
-        when = np.flatnonzero(there[:, uav])
-        if len(when):
-            latest = np.searchsorted(when, np.arange(len(rows)), side="right") - 1
-            found[:, uav] = found[when[latest.clip(min=0)], uav]
-    return found

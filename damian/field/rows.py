@@ -4,15 +4,13 @@ Columns of a report may be written in any case, and with ``_`` for a space. ``NA
 mean that the value is not known.
 """
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
+import pandas as pd
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import from_json
 
@@ -63,11 +61,6 @@ UavId: TypeAlias = Annotated[str, Field(pattern=r"^\w[\w .:/-]{0,63}$")]
 """ID of a UAV; it begins with a letter, digit or ``_``, so that no spreadsheet takes it for a formula."""
 
 
-def _no_default(schema: dict[str, Any]) -> None:
-    """Leave a default out of a JSON schema, which has no NaN."""
-    del schema["default"]
-
-
 class Row(BaseModel):
     """A row of a table: the names of its fields, with a space for ``_``, are the columns.
 
@@ -87,18 +80,19 @@ class Row(BaseModel):
         """A row by its columns, without unknown values."""
         if not isinstance(row, Mapping):
             return row
-        return {column_of(str(name)): value for name, value in row.items() if not _is_unknown(value)}
+        known = {name: cell for name, cell in row.items() if str(cell).strip().lower() not in UNKNOWN}
+        return {column_of(str(name)): cell for name, cell in known.items()}
 
 
 class Report(Row):
     """What a UAV reports; None where it does not say. Journals keep the columns of tables."""
 
     id: UavId
-    received: Time = Field(math.nan, alias="receive time", exclude=True, json_schema_extra=_no_default)
+    received: Time = Field(alias="receive time", exclude=True, default_factory=lambda: math.nan)
     """When it came in [s]; a column of files only."""
     aoi: Annotated[Number, Field(ge=0, le=LATEST)] = Field(0.0, exclude=True)
     """Age of the observation when it came in [s], if there is no time."""
-    time: Time = Field(math.nan, json_schema_extra=_no_default)
+    time: Time = Field(default_factory=lambda: math.nan)
     """When the observation was generated [s]."""
     lat: Latitude | None = None
     lon: Longitude | None = None
@@ -182,14 +176,9 @@ class TimedReport(Report):
         return self
 
 
-@lru_cache(1000)
 def column_of(name: str) -> str:
     """A name of a column as ``Row`` has it: small letters, and spaces between words."""
     return name.strip().lower().replace("_", " ").replace("-", " ")
-
-
-def _is_unknown(value: Any) -> bool:
-    return value is None or (isinstance(value, str) and value.strip().lower() in UNKNOWN)
 
 
 Found = list[tuple[str, Any]]
@@ -250,11 +239,9 @@ def as_rows(answers: Sequence[BaseModel]) -> list[dict[str, Any]]:
 
 def as_csv(answers: Sequence[BaseModel]) -> str:
     """A CSV table of answers with the same columns; what is not known is ``NA``."""
-    text, rows = io.StringIO(), as_rows(answers)
-    writer = csv.DictWriter(text, list(rows[0]) if rows else ["ID"], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: "NA" if cell is None else cell for name, cell in row.items()} for row in rows)
-    return text.getvalue()
+    rows = as_rows(answers)
+    table = pd.DataFrame(rows, columns=list(rows[0]) if rows else ["ID"], dtype=object)
+    return table.to_csv(index=False, na_rep="NA", lineterminator="\n")
 
 
 def written(time: float) -> float | str:

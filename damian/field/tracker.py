@@ -5,6 +5,7 @@ to the step in which it was generated, and counts from the step in which it came
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from damian.common.errors import InputError
 from damian.common.text_files import listed, show
 from damian.field.known import FilledReport, UavLog, messages_of
 from damian.field.node import LateMessage, Memories, Node, Reported
-from damian.field.rows import Report
+from damian.field.rows import Place, Report
 from damian.world.messages import Messages
 from damian.world.state import State
 
@@ -31,13 +32,19 @@ _ROUNDING = 1e-3
 """Share of a step by which times may be rounded."""
 
 
-class Pending(NamedTuple):
-    """A report that has come in, and counts later."""
+class Order(NamedTuple):
+    """A flight on which a UAV was sent, or its stay."""
 
-    due: int
-    """Step from which it counts."""
-    uav: str
-    filled: FilledReport
+    time: float
+    """When it was told [s]."""
+    origin: int
+    goal: int
+    """Landing points from which and to which it flies."""
+
+
+def latest(orders: Sequence[Order], time: float) -> Order | None:
+    """The last of the orders that were told before an instant [s]."""
+    return next((each for each in reversed(orders) if each.time < time), None)
 
 
 class Tracker:
@@ -52,9 +59,12 @@ class Tracker:
         """The message of each UAV that the server holds."""
         self.arrived: list[tuple[str, FilledReport]] = []
         """Messages that count from this step on, by UAV."""
+        self.orders: defaultdict[str, list[Order]] = defaultdict(list)
+        """Orders that UAVs have followed, oldest first, by UAV."""
         self._logs: dict[str, UavLog] = {}
         self._joining: list[str] = []
-        self._pending: list[Pending] = []
+        self._pending: list[tuple[int, str, FilledReport]] = []
+        """Reports that have come in and count later: the step from which they do, the UAV, the report."""
         self._last_arrival = 0
         self._become([*uavs])
 
@@ -62,8 +72,11 @@ class Tracker:
         """Go on with these UAVs; what the node remembers begins anew."""
         self.uavs, self.node = uavs, self._node_of(len(uavs))
         self.points = self.node.simulation.airspace.points[0]
-        self._logs = {uav: self._logs.get(uav) or self._new_log() for uav in uavs}
-        self._pending = [each for each in self._pending if each.uav in uavs]
+        n_stops = self.node.server.observation.stops
+        n_readings = sum(each.width for each in self.node.simulation.sensors.values())
+        told = n_stops, n_readings, self.node.dt
+        self._logs = {uav: self._logs.get(uav) or UavLog(self.node.ground, *told) for uav in uavs}
+        self._pending = [each for each in self._pending if each[1] in uavs]
         self._before: Memories | None = None
         """What the node remembers after the step before; ``_after`` this step."""
         self._after: Memories = []
@@ -71,10 +84,6 @@ class Tracker:
         self.arrived, self._begun = [], self.step
         if self.start is None:
             self._begin()
-
-    def _new_log(self) -> UavLog:
-        n_readings = sum(each.width for each in self.node.simulation.sensors.values())
-        return UavLog(self.node.ground, self.node.server.observation.stops, n_readings, self.node.dt)
 
     # Reports.
 
@@ -103,32 +112,39 @@ class Tracker:
 
         Nothing changes with one that is known already, or was generated before the start.
         """
-        if report.id in self._joining:
+        joins = report.id in self._joining
+        if joins:
             self._joining.remove(report.id)
             self._become([*self.uavs, report.id])
-            self._check(report)
-            step = min(self.step_of(report.time), self.step)
-            self.held[report.id] = self._logs[report.id].add(report, step, self._detected(report))
-            return
         self._check(report)
         log = self._logs[report.id]
-        if log.has(report.time):
+        if joins:
+            self.held[report.id] = self._add(report)
+        elif log.has(report.time):
             return
-        if self.start is None:
+        elif self.start is None:
             log.add(report, 0, None)
             self._begin()
-            return
-        if report.time < self.start:
-            return
-        now = self.step_of(self.clock)
-        step = min(self.step_of(report.time), now)
-        filled = log.add(report, step, self._detected(report))
-        due = max(now, self.step)
-        if self.node.scenario.delay.hold == "max":
-            due = max(due, step + self.node.law_longest)
-        self._pending.append(Pending(due, report.id, filled))
-        self._outputs = None
-        self._collect()
+        elif report.time >= self.start:
+            filled, due = self._add(report), self.step
+            if self.node.scenario.delay.hold == "max":
+                due = max(due, filled.step + self.node.law_longest)
+            self._pending.append((due, report.id, filled))
+            self._outputs = None
+            self._collect()
+
+    def _add(self, report: Report) -> FilledReport:
+        """Add a report to the log of its UAV."""
+        detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
+        order, step = latest(self.orders[report.id], report.time), min(self.step_of(report.time), self.step)
+        sent = order and (order.origin, order.goal)
+        return self._logs[report.id].add(report, step, detected, sent)
+
+    def follow(self, uav: str, time: float, goal: Place) -> None:
+        """Take a UAV to follow an order of an instant [s] to fly to a place, or to stay there."""
+        held, before = self.held[uav], latest(self.orders[uav], math.inf)
+        origin = before.goal if before and held.report.time <= before.time else held.target
+        self.orders[uav].append(Order(time, origin, self.node.ground.landing_point(goal)))
 
     def _check(self, report: Report) -> None:
         if report.id not in self._logs:
@@ -141,10 +157,6 @@ class Tracker:
             raise InputError(f"time: the first reports are more than {SECONDS:g} s older: leave them out")
         self._logs[report.id].check(report)
 
-    def _detected(self, report: Report) -> int | None:
-        """The step of the detection that a report names."""
-        return None if report.source_time is None else max(self.step_of(report.source_time), 0)
-
     def _begin(self) -> None:
         """Begin with the newest report of each UAV, once each has one."""
         if self.missing:
@@ -154,18 +166,17 @@ class Tracker:
         self.step = self.first_step = self._begun = self._last_arrival = max(self.step_of(self.clock), 0)
         for log, report in newest:
             log.reports.clear()
-            step = min(self.step_of(report.time), self.step)
-            self.held[report.id] = log.add(report, step, self._detected(report))
+            self.held[report.id] = self._add(report)
 
     def _collect(self) -> None:
         """Let the reports that count by now arrive."""
-        due = [each for each in self._pending if each.due <= self.step]
+        due = [each for each in self._pending if each[0] <= self.step]
         if not due:
             return
-        self._pending = [each for each in self._pending if each.due > self.step]
+        self._pending = [each for each in self._pending if each[0] > self.step]
         self._outputs, self._last_arrival = None, self.step
         by_arrival = self.node.scenario.delay.order == "arrival"
-        for _, uav, filled in sorted(due, key=lambda each: each.filled.report.time):
+        for _, uav, filled in sorted(due, key=lambda each: each[2].report.time):
             held = self.held[uav]
             # Of those that arrive in the same step, the one that was generated last counts as the last.
             earlier = by_arrival and not any(each is held for _, each in self.arrived)
@@ -191,7 +202,7 @@ class Tracker:
             settles = SILENT_STEPS if self.node.diffuses else self.node.settles
             if self._before is not None and self._last_arrival + settles <= self.step < skipped:
                 if self.step < first:
-                    following = int(min([skipped, first, *(each.due for each in self._pending)]))
+                    following = int(min([skipped, first, *(due for due, _, _ in self._pending)]))
                 self._before = self.node.skip(self._before, following - self.step)
             else:
                 self.observe()
@@ -217,15 +228,12 @@ class Tracker:
         late = {key: filled for key, filled in arrived.items() if self._begun < key[1] < self.step}
         rows = self._messages([*late.values()]).pack() if late else ()
         held = [self.held[uav] for uav in self.uavs]
+        pairs = zip(self.uavs, held, strict=True)
+        on_time = [each.step == self.step and (uav, self.step) in arrived for uav, each in pairs]
         return Reported(
             state=self.state([]),
-            age=self.step - torch.tensor([filled.step for filled in held]),
-            on_time=torch.tensor(
-                [
-                    each.step == self.step and (uav, self.step) in arrived
-                    for uav, each in zip(self.uavs, held, strict=True)
-                ]
-            ),
+            age=self.step - torch.tensor([each.step for each in held]),
+            on_time=torch.tensor(on_time),
             late=[
                 LateMessage(row, self.uavs.index(uav), self.step - step)
                 for row, (uav, step) in zip(rows, late, strict=True)

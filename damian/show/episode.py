@@ -218,13 +218,9 @@ def record(rollout: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> li
 
 def at_instant(outputs: TensorDictBase) -> TensorDictBase:
     """What an episode needs of an environment's outputs after a step, or at the reset, without a reward."""
-    instant = outputs.select(*OUTPUTS, strict=False)
     sent = cast(Tensor, outputs[keys.MESSAGE_SENT])
-    reward = outputs.get(keys.REWARD, None)
-    instant[keys.REWARD] = (
-        torch.zeros_like(sent, dtype=torch.float32)[..., None] if reward is None else reward
-    )
-    return instant
+    reward = outputs.get(keys.REWARD, torch.zeros_like(sent, dtype=torch.float32)[..., None])
+    return outputs.select(*OUTPUTS, strict=False).set(keys.REWARD, reward)
 
 
 def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> Episode:
@@ -288,12 +284,9 @@ def _listed(values: Any, digits: int = DIGITS) -> Any:
     return np.where(values == 0, 0.0, np.round(values * scale) / scale).tolist()
 
 
-_KINDS = {"delay": int, "spotted": bool, "sent": bool, "emits": bool}
-"""Types of the columns that are not of floats."""
-
-
 def _column(name: str, values: Any) -> Any:
     """An array from nested lists, or arrays by name."""
     if name == "reward_terms":
         return {term: np.asarray(each, float) for term, each in values.items()}
-    return None if values is None else np.asarray(values, _KINDS.get(name, float))
+    kind = int if name == "delay" else bool if name in ("spotted", "sent", "emits") else float
+    return None if values is None else np.asarray(values, kind)

@@ -40,7 +40,8 @@ def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
                 film.draw(step)
                 writer.grab_frame()
         return
-    first, *others = [film.image(step) for step in steps]
+    pictures = (Image.fromarray(film.frame(step)) for step in steps)
+    first, *others = [each.quantize(dither=Image.Dither.NONE) for each in pictures]  # a third of the size
     times = [1000 // STEPS_PER_SECOND] * episode.n_steps + [1000 * LAST_STEPS // STEPS_PER_SECOND]
     first.save(path, save_all=True, append_images=others, duration=times, loop=0)
 
@@ -94,10 +95,6 @@ class Film:
         canvas: Any = self.figure.canvas
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-    def image(self, step: int) -> Image.Image:
-        """The picture of an instant in 256 colours, which is a third of its size."""
-        return Image.fromarray(self.frame(step)).quantize(dither=Image.Dither.NONE)
 
     def _draw_charts(self) -> None:
         """Draw over time the return so far, and the ages of messages, or the batteries if they are used."""

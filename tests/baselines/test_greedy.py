@@ -1,6 +1,5 @@
 """The scripted policy: its choices from the server's messages, and its return beside the random policy's."""
 
-import itertools
 import math
 from dataclasses import replace
 
@@ -130,20 +129,6 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
             [math.exp(log - best) for log in expected], abs=1e-4
         )
         assert recent[world].item() == (min(ages) * policy.speed <= RECENT * radius)
-
-
-def test_uavs_fly_where_their_footprints_hold_most_fresh_ground_by_the_shortest_flight():
-    env = make_env(everything(reward=SEARCH, episode=EpisodeConfig(max_steps=9)), 16, extras=["message"])
-    policy = Greedy(env.uav_env)
-    policy.seeks = False
-    td = env.rollout(4, random_policy(env))["next"][:, -1]
-    held, legal = sent_messages(td), td["agents", "action_mask"]
-    region = held.trail[:, 0, 0] // policy.points.shape[1]
-    assert len(region.unique()) == 3
-    fresh, chosen = policy.fresh(held, policy.points[region]), policy(td["agents", "message"], mask=legal)
-    for world, uav in itertools.product(range(8), range(3)):
-        start, action = held.position[world, uav], chosen[world, uav]
-        check_choice(env, int(region[world]), start, fresh[world, uav], legal[world, uav], action)
 
 
 @pytest.mark.parametrize("obs", [0, 3])

@@ -1,9 +1,8 @@
 """The scripted policy that reads the belief: where it sends the UAVs for a given belief."""
 
+import pytest
 import torch
 from helpers import SQUARE, square
-from tensordict import TensorDictBase
-from torch import Tensor
 
 from damian import keys
 from damian.baselines.greedy import Searcher, greedy_policy
@@ -16,8 +15,8 @@ from damian.world.landing import ActionConfig
 from damian.world.regions.sources import RegionConfig
 
 
-def believing(reach: float = 300.0, own: bool = False, **changed) -> DelayedEnv:
-    """Three UAVs in the south-west of a square, which fly up to ``reach`` metres in 16 directions."""
+def believing(own: bool = False, **changed) -> DelayedEnv:
+    """Three UAVs in the south-west of a square, which fly up to 300 m in 16 directions."""
     region = RegionConfig(
         kind="vertices",
         vertices=SQUARE,
@@ -29,34 +28,23 @@ def believing(reach: float = 300.0, own: bool = False, **changed) -> DelayedEnv:
         "region": region,
         "observation": ObservationConfig(belief=["belief_moments"], own=own),
         "actions": ActionConfig(
-            distances=[reach * n / 8 for n in range(9)], headings=[22.5 * n for n in range(16)]
+            distances=[37.5 * n for n in range(9)], headings=[22.5 * n for n in range(16)]
         ),
     }
     return make_env(square(**(sections | changed)), 1, extras=["message"])
 
 
-def certain(env: DelayedEnv, place: list[float]) -> tuple[TensorDictBase, Tensor]:
-    """First outputs in which all are certain of the cell nearest to a place, and its centre [2]."""
+@pytest.mark.parametrize("own", [False, True])
+def test_all_uavs_fly_to_where_they_detect_the_source(own):
+    env = believing(own=own)
     td, centres = env.reset(), env.server.grid.centres
-    cell = (centres - torch.tensor(place)).norm(dim=-1).argmin()
-    belief = torch.nn.functional.one_hot(cell, len(centres)).float().unsqueeze(0)
-    td[keys.BELIEF] = belief
-    if keys.OWN_BELIEF in td.keys(True, True):
-        td[keys.OWN_BELIEF] = belief.unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()
-    return td, centres[cell]
-
-
-def places_after(env: DelayedEnv, td: TensorDictBase) -> Tensor:
-    """Where the UAVs stand after the step that the policy chooses, [N, 2]."""
-    return env.uav_env.server.messages(env.step(greedy_policy(env)(td))["next"][keys.MESSAGE]).position[0]
-
-
-def test_all_uavs_fly_to_where_they_detect_the_source():
-    for own in (False, True):
-        env = believing(own=own)
-        td, centre = certain(env, [50.0, 50.0])
-        distance = (places_after(env, td) - centre).norm(dim=-1)
-        assert (distance < env.uav_env.simulation.radius).all()
+    cell = (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()  # of which all are certain
+    td[keys.BELIEF] = torch.nn.functional.one_hot(cell, len(centres)).float().unsqueeze(0)
+    if own:
+        td[keys.OWN_BELIEF] = td[keys.BELIEF].unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()
+    after = env.step(greedy_policy(env)(td))["next"][keys.MESSAGE]
+    distance = (env.uav_env.server.messages(after).position[0] - centres[cell]).norm(dim=-1)
+    assert (distance < env.uav_env.simulation.radius).all()
 
 
 def test_without_a_belief_or_a_reward_for_the_source_the_script_keeps_its_own_map():

@@ -44,7 +44,9 @@ def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, numbered, per
     rows = trace_rows(fitted)
     found = [None if row == "lost" else float(row.removesuffix("s")) for row in rows]
     assert found == [None if d is None else pytest.approx(d, abs=1e-6) for d in DELAYS * 2]
-    assert fitted.losses == ("by their numbers" if numbered else f"by their period of {period:.3g} s")
+    assert fitted.attrs["losses"] == (
+        "by their numbers" if numbered else f"by their period of {period:.3g} s"
+    )
     assert summary(fitted).startswith(f"22 messages of 2 UAVs over {10 * period:.0f} s; lost: 6 (27.3%)")
 
 
@@ -74,7 +76,7 @@ def test_a_uav_that_is_silent_in_flight_loses_nothing(log):
     times = [t for start in range(0, 100, 20) for t in (*range(start, start + 12), start + 11.5)]
     lines = [f"A,{t},{t + 0.1},53.1,-4.5,{60 if t % 20 == 11.5 else 0}" for t in times]
     fitted = fit(read_log(log("\n".join(["ID,time,receive time,lat,lon,FLA", *lines]))))
-    assert fitted.losses == "by their period of 1 s"
+    assert fitted.attrs["losses"] == "by their period of 1 s"
     assert "lost" not in trace_rows(fitted)
 
 

@@ -36,12 +36,12 @@ MOTIONS = {
 SCENARIOS = {name: replace(SCENARIO, motion=motion) for name, motion in MOTIONS.items()}
 
 
-def played(path, scenario: ScenarioConfig, span=None, uavs: int = 3) -> Episode:
+def played(path, scenario: ScenarioConfig, *span) -> Episode:
     @cache
     def node_of(n: int) -> Node:
         return Node(for_uavs(scenario, n), 3, reward_terms=True)
 
-    return episode_of(path, names_of(uavs), node_of, {}, span)
+    return episode_of(path, node_of, {}, *span)
 
 
 @pytest.fixture(scope="module", params=[pytest.param("instant", marks=pytest.mark.slow), "flights"])
@@ -138,7 +138,7 @@ def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
 def test_a_journal_without_a_flight_is_refused(tmp_path):
     path = write_journal(tmp_path / "x.jsonl", uavs=names_of(1))
     with pytest.raises(InputError, match=r"x\.jsonl: the fleet never began: not every UAV has reported"):
-        played(path, SCENARIO, uavs=1)
+        played(path, SCENARIO)
 
 
 def test_uavs_that_join_and_leave_are_in_the_flight(tmp_path):
@@ -158,3 +158,26 @@ def test_uavs_that_join_and_leave_are_in_the_flight(tmp_path):
     assert episode.names == names_of(4)
     assert episode.age[-1].tolist() == [0.0, 5.0, 12.0, 5.0]
     assert np.array_equal(episode.believed[-1, 3], ground.points[300].astype(np.float32))
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_a_uav_in_flight_is_bound_for_where_it_was_told_and_has_accepted(tmp_path, accepted):
+    ground = Node(SCENARIO, 3).ground
+
+    def row(uav: str, now: float, point: int, **more) -> dict:
+        lat, lon = ground.place(point)
+        return {"ID": uav, "time": now, "lat": lat, "lon": lon, **more}
+
+    lat, lon = ground.place(400)
+    lines = [
+        {"received": 1000.0, "reports": [row(uav, 1000.0, 200) for uav in names_of(3)]},
+        {"asked": 1001.0, "told": {}, "advice": [{"ID": "uav-0", "answer": "a", "lat": lat, "lon": lon}]},
+        {"received": 1002.0, "acknowledged": [{"answer": "a", "status": "accepted"}] * accepted},
+        {"received": 1004.0, "reports": [row("uav-0", 1004.0, 250, FLA=20)]},
+        {"received": 1009.0, "reports": [row("uav-0", 1009.0, 300)]},
+    ]
+    path = write_journal(tmp_path / "x.jsonl", *lines, uavs=names_of(3))
+    episode = played(path, replace(SCENARIO, observation=ObservationConfig()))
+    goal = ground.points[400 if accepted else 300]
+    np.testing.assert_allclose(episode.target[4, 0], goal, atol=0.01)
+    np.testing.assert_allclose(episode.target[-1, 0], ground.points[300], atol=0.01)

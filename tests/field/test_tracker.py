@@ -136,8 +136,8 @@ def test_who_is_in_flight_is_not_advised():
     assert {each.age for each in answers} == {1.0}
 
 
-def tracker_of(node: Node | None = None, **changed) -> Tracker:
-    node = node or Node(scenario_of(**changed), 3)
+def tracker_of(**changed) -> Tracker:
+    node = Node(scenario_of(**changed), 3)
     return Tracker(["a", "b", "c"], lambda _: node)
 
 

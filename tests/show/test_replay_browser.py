@@ -19,16 +19,16 @@ FLAGS += ["--enable-unsafe-swiftshader", "--hide-scrollbars"]
 LAST, LATE = 20, 4
 
 
-def late_flight(late: int = LATE, **changes):
+def late_flight():
     """Two UAVs that fly through the region and up, whose messages are late, and some of which are lost."""
     rng, t = np.random.default_rng(3), LAST + 1
     position = np.cumsum(rng.normal(0, 25, (t, 2, 3)), 0).clip(-180, 180).round(1)
     position[..., 2] = np.abs(position[..., 2])
     steps = np.arange(t)
-    held = np.maximum(steps - late, 0)
+    held = np.maximum(steps - LATE, 0)
     sent = np.ones((t, 2), bool)
     sent[0] = False
-    delay = np.full((t, 2), late)
+    delay = np.full((t, 2), LATE)
     delay[::5, 1] = -1
     reward = rng.uniform(0, 1, (t, 2))
     reward[0] = 0
@@ -44,10 +44,10 @@ def late_flight(late: int = LATE, **changes):
         "reward_terms": {"near": 0.75 * reward, "far": 0.25 * reward},
         "cells": np.stack([east.ravel(), north.ravel()], -1),
         "belief": rng.dirichlet(np.full(64, 0.2), t),
-        "about": {"overrides": [f"delay.obs={late}"], "seed": 3},
+        "about": {"overrides": [f"delay.obs={LATE}"], "seed": 3},
         "instant": False,
     }
-    return flight(LAST, **{**columns, "sent": sent, "delay": delay, **changes})
+    return flight(LAST, **columns, sent=sent, delay=delay)
 
 
 @pytest.fixture(scope="module")
@@ -100,19 +100,19 @@ class Page:
     def time(self):
         return float(self.run("return document.querySelector('#transport input').value"))
 
-    def shown(self, name, card=0):
-        return self.all(".card")[card].find_element("css selector", f"[data-shown={name}]").text
+    def shown(self, name):
+        return self.one(f".card [data-shown={name}]").text
 
-    def table(self, card=0):
+    def table(self):
         """The numbers of the UAVs at this instant, by column."""
-        rows = self.all(".card")[card].find_elements("css selector", ".numbers tbody tr")
+        rows = self.all(".card .numbers tbody tr")
         names = ("east", "north", "up", "age", "battery")
         find = [[row.find_element("css selector", f"[data-shown={n}]") for n in names] for row in rows]
         cells = np.array([[float(cell.text.replace("\u2212", "-")) for cell in row] for row in find])
         return dict(zip(names, cells.T, strict=True))
 
-    def map(self, card=0):
-        return self.run("return document.querySelectorAll('canvas.map')[arguments[0]].toDataURL()", card)
+    def map(self):
+        return self.run("return document.querySelector('canvas.map').toDataURL()")
 
 
 @pytest.fixture
@@ -120,12 +120,10 @@ def opened(browser, tmp_path):
     """Open a page of episodes, and see that the browser has nothing to complain of."""
 
     @contextmanager
-    def open_page(*episodes, width=1280, height=900, dark=False):
-        save_page(episodes, tmp_path / "page.html")
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+    def open_page(episode):
+        save_page([episode], tmp_path / "page.html")
+        size = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
         browser.get((tmp_path / "page.html").as_uri())
         page = Page(browser)
         page.wait(lambda: page.run("return document.documentElement.dataset.ready"))
@@ -137,17 +135,17 @@ def opened(browser, tmp_path):
     return open_page
 
 
-def check_numbers(page, episode, step, card=0):
+def check_numbers(page, episode, step):
     """The page shows the numbers of an instant of an episode."""
-    table = page.table(card)
+    table = page.table()
     for axis, name in enumerate(("east", "north", "up")):
         np.testing.assert_allclose(table[name], episode.position[step, :, axis], atol=0.001)
     np.testing.assert_allclose(table["age"], episode.age[step], atol=0.001)
     np.testing.assert_allclose(table["battery"], episode.battery[step], atol=0.001)
-    won = float(page.shown("return", card).split()[1])
+    won = float(page.shown("return").split()[1])
     assert won == pytest.approx(episode.reward[: step + 1].mean(-1).sum(), abs=0.0051)
-    assert page.shown("time", card) == f"{episode.time[step]:g} s"
-    assert page.shown("spots", card).startswith(f"{episode.spotted[step].sum()} of 2")
+    assert page.shown("time") == f"{episode.time[step]:g} s"
+    assert page.shown("spots").startswith(f"{episode.spotted[step].sum()} of 2")
 
 
 def test_it_shows_the_numbers_of_every_instant_and_loads_nothing(opened):

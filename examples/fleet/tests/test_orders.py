@@ -416,7 +416,7 @@ def test_whatever_happens_nothing_is_unsafe_and_a_restart_remembers_it_all(tmp_p
         field.session.close()
         assert ("it is not read" in caplog.text) == (turn == 1), "the snapshot is used, if it is good"
         (tmp_path / f"north{SNAPSHOT}").write_bytes(b"damaged")
-    episode = episode_of(tmp_path / "north.jsonl", [*"ABC"], lambda n: field.parts(n)[0], {})
+    episode = episode_of(tmp_path / "north.jsonl", lambda n: field.parts(n)[0], {})
     assert episode.names[:3] == [*"ABC"]
     assert episode.n_agents == 3 + ("D" in episode.names)
     assert len({*map(len, (episode.believed, episode.age, episode.reward, episode.true, episode.sent))}) == 1

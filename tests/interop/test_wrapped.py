@@ -1,4 +1,4 @@
-"""One UAV for users of Gymnasium: their own checker, and what the worlds really did."""
+"""Users of Gymnasium and PettingZoo: their own checkers, and what TorchRL's environment does."""
 
 from itertools import product
 
@@ -7,34 +7,44 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+from torchrl.envs import TransformedEnv
+from torchrl.envs.libs.pettingzoo import PettingZooWrapper
+from torchrl.envs.utils import check_env_specs
 
-import damian.interop
-from damian import compose_scenario, keys
+from damian import ObservationDelay, compose_scenario, keys
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
-from damian.interop import UavGymEnv, UavVectorEnv
+from damian.interop import TASKS, UavGymEnv, UavParallelEnv, UavVectorEnv
 
 DELAYS = ["delay=none", "delay=paper", "delay.act=2", "delay.rew=1", "delay.history=3"]
-KINDS = [
-    pytest.param(task, actions, motion, delay, id=f"{task}-{actions}-{motion}-{delay}")
-    for (task, actions, motion), delay in zip(
-        product(damian.interop.TASKS, ("discrete", "continuous"), ("instant", "polynomial")),
-        4 * DELAYS,
-        strict=True,
-    )
-]
-"""Every task, kind of action and motion; over them the delays take turns."""
+KINDS = product(TASKS, ("discrete", "continuous"), ("instant", "polynomial"))
+KINDS = [(*kind, delay) for kind, delay in zip(KINDS, 4 * DELAYS, strict=True)][::3]
+"""Every task, kind of action, motion and delay, together in turns."""
+
+
+def made(*overrides, **options):
+    return UavParallelEnv(compose_scenario(*overrides), **options)
 
 
 @pytest.mark.sample(3)
-@pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS[::3])  # every value of each
+@pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS)
 def test_gymnasiums_checker_finds_nothing(task, actions, motion, delay):
     overrides = [f"actions={actions}", f"motion={motion}", delay]
     env = gymnasium.make(f"damian/{task.capitalize()}-v0", overrides=overrides)
     check_env(env.unwrapped, skip_render_check=True)
 
 
-def test_the_environment_does_what_the_torchrl_environment_does():
+@pytest.mark.sample(4)
+@pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS)
+def test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys):
+    overrides = [f"scenario={task}", f"actions={actions}", f"motion={motion}", delay, "episode.max_steps=4"]
+    parallel_api_test(made(*overrides), num_cycles=6)
+    parallel_seed_test(lambda: made(*overrides))
+    assert "Passed Parallel API test" in capsys.readouterr().out
+
+
+def test_gymnasiums_environment_does_what_torchrls_does():
     scenario = compose_scenario("scenario=tracking", "agents=1", "delay=paper", "episode.max_steps=12")
     env = UavGymEnv(scenario, seed=3)
     reference = make_env(scenario, 1, seed=3)
@@ -54,6 +64,31 @@ def test_the_environment_does_what_the_torchrl_environment_does():
         ended = terminated or truncated
     assert truncated
     assert not terminated
+
+
+def test_pettingzoos_environment_does_what_torchrls_does():
+    scenario = compose_scenario("delay=paper", "episode.max_steps=8")
+    env, reference = UavParallelEnv(scenario, seed=3), make_env(scenario, 1, seed=3)
+    reference.seed_worlds(torch.tensor([5]))
+    now = reference.reset()
+    observations, infos = env.reset(seed=5)
+    for _ in range(8):
+        for number, agent in enumerate(env.possible_agents):
+            assert np.array_equal(observations[agent], now[keys.OBSERVATION][0, number].numpy())
+            assert np.array_equal(infos[agent]["action_mask"], now[keys.ACTION_MASK][0, number].numpy())
+        assert np.array_equal(env.state(), now[keys.GLOBAL_OBSERVATION][0].flatten().numpy())
+        chosen = {name: env.action_space(name).sample(infos[name]["action_mask"]) for name in env.agents}
+        now[keys.ACTION] = torch.tensor([[*chosen.values()]])
+        now = reference.step(now)["next"]
+        observations, rewards, terminated, truncated, infos = env.step(chosen)
+        assert [*rewards.values()] == now[keys.REWARD].flatten().tolist()
+        assert {*terminated.values()} == {now["terminated"].item()}
+        assert {*truncated.values()} == {now["truncated"].item()}
+        if now["done"].item():
+            break
+    assert now["done"].item()
+    assert env.agents == []
+    assert env.step({}) == ({}, {}, {}, {}, {})
 
 
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
@@ -78,6 +113,13 @@ def test_every_world_of_the_vector_environment_equals_a_single_one(actions):
                 observation, info = env.reset()
             assert np.array_equal(observations[world], observation)
             assert infos["ready"][world] == info["ready"]
+
+
+def test_torchrl_reads_the_environment_and_our_transforms_delay_it_further():
+    env = PettingZooWrapper(made("episode.max_steps=5"), use_mask=True)
+    check_env_specs(env, break_when_any_done="both")
+    delayed = TransformedEnv(env, ObservationDelay(2, in_keys=[("uav", "observation")]))
+    assert delayed.rollout(4)["next", "uav", "age"].max() == 2
 
 
 def test_a_picture_shows_what_a_film_of_the_episode_shows():
@@ -105,3 +147,7 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
     vector.reset()
     with pytest.raises(InputError, match="actions"):
         vector.step([0])
+    env = made()
+    env.reset()
+    with pytest.raises(InputError, match="action of uav_1: -1 is not in Discrete"):
+        env.step({"uav_0": 0, "uav_1": -1, "uav_2": 0})
