@@ -160,22 +160,29 @@ def plain(given: DictConfig, words: Sequence[str], program: str = "train") -> di
     return values
 
 
-def option_folders() -> list[Path]:
-    """The folders in which Hydra finds options: our own, and that of ``--config-dir``."""
+def options_in(group: str, option: str = "*") -> Iterator[tuple[dict[str, Any], list[str]]]:
+    """What the files of a group's options set, as nested settings, and what their defaults lists name.
+
+    They lie in ``conf`` and in the folder of ``--config-dir``.
+    """
     sources = HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ()
-    return [CONF, *(Path(source.path) for source in sources if source.schema == "file")]
+    for folder in (CONF, *(Path(source.path) for source in sources if source.schema == "file")):
+        for file in sorted((folder / group).rglob(f"{option}.yaml")):
+            text = file.read_text(encoding="utf-8")
+            written = yaml.safe_load(text) or {}
+            chosen = [name for each in written.pop("defaults", ()) if isinstance(each, dict) for name in each]
+            yield written if "@package _global_" in text else {group: written}, chosen
 
 
 def _check_whole(values: Mapping[str, Any], words: Sequence[str], choices: Mapping[str, Any]) -> None:
     """Refuse a law that Hydra has merged from two files, such as that of a scenario over ``delay=burst``."""
     for key in (key for key in LAWS if not any(f"{key_of(word)}.".startswith(f"{key}.") for word in words)):
-        law, written = value_at(values, key), []
-        for group, option in choices.items() if isinstance(law, Mapping) else ():
-            for file in (folder / group / f"{option}.yaml" for folder in option_folders()):
-                text = file.read_text(encoding="utf-8") if file.is_file() else ""
-                found = yaml.safe_load(text) or {}
-                found = value_at(found if "@package _global_" in text else {group: found}, key)
-                written += [found] * (isinstance(found, Mapping) and "law" in found)
+        law = value_at(values, key)
+        options = choices.items() if isinstance(law, Mapping) else ()
+        files = [
+            value_at(found, key) for each in options for found, _ in options_in(*each) if "/" not in each[0]
+        ]
+        written = [found for found in files if isinstance(found, Mapping) and "law" in found]
         problem = f"mixes laws of several files; write the one that you mean as a whole: {key}={{law: ...}}"
         checks.require(not written or law in written, key, law, problem)
 

@@ -151,6 +151,13 @@ def value_at(values: Mapping[str, Any], key: str) -> Any:
     return found
 
 
+def has(values: Mapping[str, Any], key: str) -> bool:
+    """Whether nested data have a value, also None, at a dotted key."""
+    section, _, name = key.rpartition(".")
+    found = value_at(values, section) if section else values
+    return isinstance(found, Mapping) and name in found
+
+
 def set_at(values: dict[str, Any], key: str, value: Any) -> None:
     """Set a value of nested data by its dotted key, in sections that are made where there are none."""
     *sections, name = key.split(".")

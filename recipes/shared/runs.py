@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 
 from damian.common.atomic_files import remove_unfinished, write_atomically
 from damian.common.errors import InputError, RunError
-from damian.common.fields import default_of, filled, leaves, nested, set_at, value_at
+from damian.common.fields import default_of, filled, has, leaves, nested, set_at, value_at
 from damian.common.registry import IMPORTED, stored_settings
 from damian.common.text_files import read_text, show
 from damian.envs.config import ScenarioConfig
@@ -31,7 +31,7 @@ from damian.runs.run_lock import locked
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
 
-from ..cli import ERRORS, Work, command, one_line_errors, option_folders, plain, reason, short
+from ..cli import ERRORS, Work, command, one_line_errors, options_in, plain, reason, short
 from ..config import TrainConfig
 from ..known import SCHEMAS, key_of, known_settings
 from .settings import check_components
@@ -92,7 +92,7 @@ def _carry_out(
         else:
             config.overrides, only_reads = words, False
             check_components(config)
-        if sweeps and (config := left_to_do(config, folder)) is None:
+        if sweeps and not resumes and (config := left_to_do(config, folder)) is None:
             return
         if not (again or sweeps or resumes) and (folder / CONFIG).exists():
             remedy = f"choose another folder, or continue the run with resume={folder}"
@@ -258,12 +258,12 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
     """
     folder = run_folder(Path(values["checkpoint"]))
     stored = stored_config(folder, "checkpoint")
-    merged: dict[str, Any] = copy.deepcopy(nested(stored))
+    merged = copy.deepcopy(nested(stored))
     defaults = {each.name: default_of(each) for each in fields(TrainConfig)}
     own = {f.name for f in fields(SCHEMAS[program]) if default_of(f) != defaults.get(f.name, MISSING)}
     kept = {key: value_at(merged, key) for key in ("delay.history", "delay.messages")}
-    given = {key_of(word).partition("@")[0] for word in words} | {"checkpoint", "trust"} | (own & {*values})
-    mentioned = set[str]().union(*(reach(key, program) for key in given))
+    given = {key_of(word).partition("@")[0] for word in words} | (own & {*values})
+    mentioned = {"checkpoint", "resume", "trust"}.union(*(reach(key, program) for key in given))
     for key in sorted(mentioned):  # a section before its keys
         set_at(merged, key, value_at(values, key))
     for key in kept.keys() - mentioned:
@@ -283,24 +283,11 @@ def reach(key: str, program: str) -> set[str]:
 
     A scenario says nothing of the networks: they are those of the policy.
     """
-    found: set[str] = set()
-    for file in (file for folder in option_folders() for file in (folder / key).rglob("*.yaml")):
-        text = read_text(file)
-        written = yaml.safe_load(text) or {}
-        chosen = [name for each in written.pop("defaults", ()) if isinstance(each, dict) for name in each]
+    known, found = known_settings(program), {key} & known_settings(program).keys()
+    for written, chosen in options_in(key):
+        found |= {each for each, setting in known.items() if not setting.is_section and has(written, each)}
         found |= {name.removeprefix("override /") for name in chosen if name.startswith("override /")}
-        found |= {*_settings_in(written, program)} if "@package _global_" in text else {key}
-    return found - {"model"} - {"tuning"} if key == "scenario" else found or {key}
-
-
-def _settings_in(written: Mapping[str, Any], program: str, path: str = "") -> Iterator[str]:
-    """The settings that nested mappings set."""
-    for name, value in written.items():
-        setting = known_settings(program).get(f"{path}{name}")
-        if setting and setting.is_section and isinstance(value, Mapping):
-            yield from _settings_in(value, program, f"{path}{name}.")
-        elif setting:
-            yield f"{path}{name}"
+    return found - {"model"} if key == "scenario" else found or {key}
 
 
 def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:

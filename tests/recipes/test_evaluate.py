@@ -1,6 +1,7 @@
 """The evaluation recipe, run by its command line: a trained policy with other UAVs, regions and delays."""
 
 import csv
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -42,10 +43,14 @@ def fly(trained, tmp_path, monkeypatch) -> Callable[..., Path]:
     monkeypatch.chdir(tmp_path)
 
     def run_recipe(
-        *overrides: str, of: Path | str | None = trained, folder: str = "flown", program=evaluate
+        *overrides: str,
+        of: Path | str | None = trained,
+        folder: str = "flown",
+        program=evaluate,
+        words=TRAINED,
     ) -> Path:
         policy = [f"checkpoint={of}"] if of else []
-        words = [*(TRAINED if program is train else []), *overrides, *policy, f"hydra.run.dir={folder}"]
+        words = [*(words if program is train else []), *overrides, *policy, f"hydra.run.dir={folder}"]
         monkeypatch.setattr(sys, "argv", ["evaluate.py", *words])
         program.main()
         return tmp_path / folder
@@ -81,6 +86,22 @@ def test_new_overrides_replace_those_of_the_run_and_the_others_apply(fly):
     longer, shorter = (results(path)["random"]["age"] for path in (folder, fly(folder="trained")))
     assert longer == pytest.approx((1 + 2 + 3 + 7 * 4) / 10, rel=1e-6)
     assert shorter == 1
+
+
+def test_a_run_that_was_resumed_is_flown_and_begun_with_as_any_other(fly, trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "longer")
+    fly("resume=longer", "frames=96", of=None, folder="unused", program=train, words=())
+    assert (fly(of="longer") / "result.csv").exists()
+    begun = OmegaConf.load(
+        fly("frames=32", of="longer", folder="begun", program=train, words=()) / "config.yaml"
+    )
+    assert (begun.resume, begun.frames, begun.seed) == (None, 32, 3)
+
+
+def test_an_option_replaces_what_its_group_sets_and_all_else_stays(fly):
+    config = OmegaConf.load(fly("delay=paper", "source=dynamic", "aware=none") / "config.yaml")
+    assert (config.delay.obs.law, config.delay.loss, config.source.motion) == ("uniform", 0.0, "dynamic")
+    assert (config.episode.max_steps, config.region.lattice_step, config.seed) == (10, 60, 3)
 
 
 @pytest.mark.slow
