@@ -94,7 +94,7 @@ class ActionTransform(StatefulTransform):
         return self.action_key
 
     def action_rows(self, value: Tensor) -> Tensor:
-        """A value of ``actions`` for each of the M rows, [M, ...]."""
+        """A value of ``all_actions`` for each of the M rows, [M, ...]."""
         return self.as_rows_of_spec(value, self.env.full_action_spec, self.action_key)
 
     @cached_property
@@ -102,11 +102,6 @@ class ActionTransform(StatefulTransform):
         """Shape, range and default of each of the actions, by the environment's specs."""
         pairs = zip(self.in_keys_inv, self.defaults, strict=True)
         return [read_action_specs(self.env, key, default) for key, default in pairs]
-
-    @property
-    def actions(self) -> ActionSpecs:
-        """Shape, range and default of the first of the actions."""
-        return self.all_actions[0]
 
     def empty_cache(self) -> None:
         super().empty_cache()
