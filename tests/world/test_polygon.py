@@ -1,4 +1,4 @@
-"""Polygons and landing points, compared with those of the original simulator and with slow loops."""
+"""Polygons and landing points, compared with those of the original simulator."""
 
 import json
 import math
@@ -35,37 +35,6 @@ def test_the_lattice_has_the_landing_points_of_the_original_for_other_polygons(e
     polygon = polygon_from_vertices(example["polygon"], "example")
     points = landing_lattice(polygon, example["step"], example["deg"], n)
     np.testing.assert_allclose(points, example["landing_points_in_id_order"], atol=1e-6)
-
-
-def _slow_lattice(polygon, step, degrees):
-    """Lattice of the original simulator, one point at a time."""
-    min_x, min_y, max_x, max_y = polygon.bounds
-    slant, points, x, y, signed = math.radians(degrees), [], min_x, min_y, step
-    while y <= max_y + 1e-9:
-        while True:
-            if polygon.contains(Point(x, y)):
-                points.append((x, y))
-            if (x >= max_x - 1e-7) if signed > 0 else (x <= min_x + 1e-7):
-                break
-            x += signed
-        x += 2 * signed * math.cos(slant)
-        y, signed = y + step * math.sin(slant), -signed
-    centre = polygon.centroid
-
-    def direction(point):
-        x, y = point[0] - centre.x, point[1] - centre.y
-        return round(math.atan2(y, x), 9), math.hypot(x, y)
-
-    return sorted(points, key=direction)
-
-
-@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-@pytest.mark.parametrize(("step", "degrees"), [(29.7, 30), (11.1, 80)])
-def test_the_lattice_agrees_with_a_slow_loop_on_concave_holed_and_multipart_polygons(shape, step, degrees):
-    polygon = shapely.affinity.translate(shapely.affinity.rotate(shape, 7.7), 31.7, -11.3)
-    points = landing_lattice(polygon, step, degrees)
-    assert len(points) > 10
-    np.testing.assert_allclose(points, _slow_lattice(polygon, step, degrees), atol=1e-6)
 
 
 @pytest.mark.parametrize(
