@@ -32,7 +32,6 @@ PACKAGES = (
     "learners",
     "server",
     "world",
-    "settings",
     "baselines",
     "runs",
     "compare",
