@@ -20,7 +20,7 @@ def delays(**settings) -> ScenarioDelays:
 
 
 INVALID_LAWS = [
-    (-1, ": -1 is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a distribution"),
+    (-1, ": -1 is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7"),
     ("3x", ": 3x is not a delay"),
     ("3h", f": 3h is more than {LONGEST} steps"),
     ({"law": "gauss"}, ".law: gauss is not one of constant, uniform, geometric, burst, trace"),
