@@ -8,7 +8,7 @@ from helpers import GOLDEN, nearest
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.features import ServerContext
+from damian.server.features import ObservationConfig, ServerContext
 from damian.server.rewards import Counters
 from damian.world.battery import BatteryConfig
 from damian.world.messages import Messages
@@ -149,7 +149,7 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         now=number.float(),
         scale=torch.full((len(records),), golden["max_distance_normaliser_m"]),
         time_scale=golden["time_max_normaliser"],
-        age_scale=10.0,
+        observation=ObservationConfig(),
         battery=BatteryConfig(),
         footprints=None,
         points=torch.zeros(1, 2),

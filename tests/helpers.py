@@ -266,7 +266,7 @@ def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, Server
         now=torch.tensor([now for now, _ in worlds]),
         scale=torch.full((len(worlds),), SCALE),
         time_scale=TIME_SCALE,
-        age_scale=10.0,
+        observation=ObservationConfig(),
         battery=BatteryConfig(resolution=5.0),
         footprints=None,
         points=torch.zeros(1, 2),

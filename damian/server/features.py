@@ -47,16 +47,10 @@ class ServerContext(NamedTuple):
     """For the feature ``coverage``; None if it is not needed."""
     points: Tensor
     """Landing points by flat id, [R*L, 2] metres."""
-    age_scale: float
-    """Ages are divided by this [s]."""
-    window: int = 1
-    """Number of latest landing points that coverage counts."""
-    slots: int = 0
-    """Number of steps of the feature ``timeline``."""
+    observation: ObservationConfig
+    """Gives scales, and the numbers of landing points and steps that features look at."""
     dt: float = 1.0
     """Length of a step [s]."""
-    newest: bool = False
-    """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
     readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
     """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
     radius: float = 0.0
@@ -112,7 +106,7 @@ class FeatureCache:
     @property
     def trail(self) -> Tensor:
         """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
-        return self.messages.trail[..., : self.context.window]
+        return self.messages.trail[..., : self.context.observation.window]
 
     @property
     def region(self) -> Tensor:
@@ -260,7 +254,7 @@ def _any_has_detected(v: FeatureCache) -> Tensor:
 def _to_source(v: FeatureCache) -> Tensor:
     """Vector from each UAV to the estimated position of the source [m], [*, N, 2]."""
     counts, detected_time = v(_has_detected), v.messages.detected_time
-    if v.context.newest:
+    if v.context.observation.estimate == "newest":
         counts = counts & (detected_time == detected_time.amax(-1, keepdim=True))
     weight = counts.to(v.messages.position.dtype)
     total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-2, keepdim=True)
@@ -401,7 +395,7 @@ def _spotted(v: FeatureCache) -> Tensor:
 @feature("actor")
 def _age(v: FeatureCache) -> Tensor:
     """Age of the UAV's message on the server, over ten seconds, [*, N]."""
-    return (v.messages.age(v.context.now) / v.context.age_scale).clamp(max=1)
+    return (v.messages.age(v.context.now) / v.context.observation.age_scale).clamp(max=1)
 
 
 # Where the source is believed to be (``damian.server.belief``); beyond the paper's Table 2.

@@ -88,11 +88,8 @@ class Server:
             battery=battery,
             footprints=footprints,
             points=airspace.points.flatten(0, 1),
-            age_scale=observation.age_scale,
-            window=observation.window,
-            slots=observation.timeline,
+            observation=observation,
             dt=simulation.dt,
-            newest=observation.estimate == "newest",
             readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
             radius=simulation.radius,
             n_points=airspace.max_points,
@@ -100,7 +97,6 @@ class Server:
             places_inside=places_inside(airspace, simulation.radius) if surrounded else None,
             grid=grid,
         )
-        """What the server knows besides the messages, but for what changes from step to step."""
         # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.
         self.remembers_coverage = footprints is not None and not simulation.vehicles.instant
 
@@ -228,7 +224,7 @@ class Server:
         return sum(terms.values(), start=final), terms, ended
 
     def _known(self, messages: Messages, steps: Tensor) -> ServerContext:
-        """What the server knows besides the messages."""
+        """What the server knows besides the messages now."""
         return self._context._replace(now=steps * self.dt, scale=self.scales(messages))
 
     def scales(self, messages: Messages) -> Tensor:

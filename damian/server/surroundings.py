@@ -89,7 +89,7 @@ def _others(v: FeatureCache) -> Tensor:
 @feature("global", width=OTHERS)
 def _ages(v: FeatureCache) -> Tensor:
     """Ages of what is known of the UAVs that ``others`` describes, over ten seconds, [*, N, 4]."""
-    age = v.messages.age(v.context.now) / v.context.age_scale
+    age = v.messages.age(v.context.now) / v.context.observation.age_scale
     return _four(_of_nearest(v, age.unsqueeze(-1)).clamp(max=1))
 
 
@@ -103,7 +103,7 @@ def _timeline(v: FeatureCache) -> Tensor:
     that step. Behind the slots stands the same of the destination of a UAV in flight. Ways begin where the
     observer is bound for.
     """
-    messages, context, slots = v.messages, v.context, v.context.slots
+    messages, context, slots = v.messages, v.context, v.context.observation.timeline
     since = ((context.now[..., None, None] - messages.landed) / context.dt).round().long()  # [*, N, S]
     slot = torch.where((messages.landed < 0) | (since > slots), slots, since)  # the last one is left out
     stops = F.pad(gather_rows(context.points, messages.trail), (0, 1), value=1.0)  # [*, N, S, 3]

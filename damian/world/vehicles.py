@@ -66,8 +66,7 @@ class MotionModel(ABC):
     def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
         """Which UAVs send a message in this step [B, N] bool, and the latest message of each UAV [B, N].
 
-        ``state.sent`` are the latest ones before, ``messages`` what each would send; none in flight spots the
-        source.
+        ``state.sent`` are the latest ones before, ``messages`` what each would send.
         """
 
     @abstractmethod
@@ -163,16 +162,9 @@ class PolynomialFlight(MotionModel):
 
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)
-        elapsed = state.elapsed.double() * self.dt
-        position, cruised = poses(
-            gather_rows(self.points, state.origin),
-            gather_rows(self.points, state.goal),
-            self.levels,
-            elapsed,
-            state.vertical,
-            state.cruise,
-            self.motion.degree,
-        )
+        elapsed, times = state.elapsed.double() * self.dt, (state.vertical, state.cruise)
+        ends = gather_rows(self.points, state.origin), gather_rows(self.points, state.goal)
+        position, cruised = poses(*ends, self.levels, elapsed, *times, self.motion.degree)
         state = state._replace(position=position)
         if not self.battery.enabled:
             return state

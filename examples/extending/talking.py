@@ -40,7 +40,7 @@ def heard(v: FeatureCache) -> Tensor:
     places = torch.cat([messages.target.unsqueeze(-2), landed], -2)
     ways = places.unsqueeze(-4) - own[..., :, None, None, :]
     ways = (ways / (v.context.scale / 2)[..., None, None, None, None]).flatten(-2)  # [*, N, N, 2 + 2 window]
-    age = messages.age(v.context.now) / v.context.age_scale
+    age = messages.age(v.context.now) / v.context.observation.age_scale
     rest = torch.stack([messages.spotted.float(), age], -1).unsqueeze(-3).expand(*ways.shape[:-1], 2)
     return of_others(v, torch.cat([ways, rest], -1)).clamp(-1, 1).flatten(-2)
 

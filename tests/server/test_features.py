@@ -29,7 +29,8 @@ def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
 ):
     worlds = random_worlds(seed, n_agents, heard, spots)
     messages, server = messages_of(worlds)
-    ours = observe(messages, server._replace(newest=newest), NAMES)
+    observation = ObservationConfig(estimate="newest" if newest else "mean")
+    ours = observe(messages, server._replace(observation=observation), NAMES)
     for b, (now, uavs) in enumerate(worlds):
         for name, values in twin.features(uavs, now, SCALE, TIME_SCALE, newest=newest).items():
             difference = ours[name][b].double() - torch.tensor(values, dtype=torch.float64)

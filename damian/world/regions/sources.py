@@ -17,7 +17,6 @@ from damian.world.regions.region import Region, centred
 RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]
 """From the settings and a random generator to the regions; each episode flies over one of them."""
 
-
 REGION_SOURCES = Registry[RegionSource](
     "region source", inspect.isfunction, "is not a function (config, rng) -> list[Region]"
 )
