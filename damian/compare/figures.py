@@ -218,7 +218,7 @@ def curve(runs: Sequence[pd.DataFrame], name: str) -> tuple[Floats, Floats]:
     if first > last:
         return np.full(_POINTS, np.nan), np.full((_POINTS, 1), np.nan)
     place = np.linspace(first, last, _POINTS)
-    return place, np.stack([np.interp(place, *run.T) for run in points], -1)
+    return place, np.stack([np.interp(place, run[:, 0], run[:, 1]) for run in points], -1)
 
 
 def _error_bars(axis: Axes, places: Sequence[float], lines: pd.DataFrame, name: str, **style: Any) -> None:
