@@ -362,7 +362,8 @@ def latest(window: Window, slot: Tensor) -> Beliefs:
 # operator takes no named tuples, so grid and window come in parts: all tensors of the grid, the number
 # ``emits``, the tensors of the window that change, and its slot.
 
-_Tables, _Ring = list[Tensor | None], list[Tensor]
+_Tables = list[Tensor | None]
+_Ring = list[Tensor]
 
 
 def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, float, _Ring, Tensor]:
@@ -412,7 +413,8 @@ def _advance(
         old = window.belief.flatten(0, 2).index_select(0, before)
         new = weigh(predict(grid, old, within), likelihood(grid, reports))
         _write(window.belief, row, new, changes)
-    return slot, *latest(window, slot)
+    on_server, known = latest(window, slot)
+    return slot, on_server, known
 
 
 @_advance.register_fake
