@@ -6,7 +6,6 @@ damian evaluate -m checkpoint=runs/first delay.obs=0,2,4,8
 
 __package__ = "damian.recipes"  # also of a script: python recipes/evaluate.py
 
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from torchrl.modules import ProbabilisticActor
 
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
-from damian.common.errors import InputError, naming_errors
+from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.learners.recurrent import add_recurrent_state
@@ -28,6 +27,7 @@ from damian.runs.training_state import load_networks
 
 from . import cli
 from .config import TrainConfig
+from .shared.learning import own_code
 from .shared.runs import only_named_code, save_config, start, with_policy_of
 from .shared.settings import check_components
 
@@ -143,11 +143,6 @@ def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
     with torch.random.fork_rng(devices=[]), own_code(config.learner.name):
         torch.manual_seed(config.seed)
         return config.learner.make_actor(env, config.model)
-
-
-def own_code(learner: str) -> AbstractContextManager[None]:
-    """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
-    return naming_errors(learner) if ":" in learner else nullcontext()
 
 
 @cli.one_line_errors("evaluate")

@@ -8,7 +8,6 @@ __package__ = "damian.recipes"  # also of a script: python recipes/train.py
 
 import shlex
 import time
-from collections.abc import Collection
 from contextlib import closing
 from pathlib import Path
 from typing import cast
@@ -17,7 +16,6 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torchrl.data import ReplayBuffer
 from tqdm import tqdm
 
 from damian import keys
@@ -25,15 +23,12 @@ from damian.common import checks
 from damian.common.errors import RunError
 from damian.common.fields import leaves
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.learners.base import Learner, divergence
 from damian.learners.schedule import SystemClock
-from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt, end_interrupted
 from damian.runs.loggers import make_loggers
-from damian.runs.metrics import Evaluation, HindsightReturns, evaluate
+from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
 from damian.runs.training_state import RandomState, TrainingState, load_networks
@@ -41,14 +36,20 @@ from damian.server.components import not_finite
 
 from . import cli
 from .config import TrainConfig
-from .evaluate import make_eval_env, own_code, report
-from .shared.collectors import learning_env, make_collector, read_by, ticks
+from .evaluate import make_eval_env, report
+from .shared.learning import (
+    hindsight_returns,
+    learning_env,
+    make_collector,
+    make_learner,
+    own_code,
+    read_by,
+    replay_buffer,
+    ticks,
+)
 from .shared.runs import names_own_code, run_folder, save_config, start, stored_values
 from .shared.settings import (
-    backupdates,
     check_learning,
-    learning_setup,
-    measures_hindsight,
 )
 
 
@@ -109,62 +110,6 @@ def best_flight(evaluations: dict[str, Evaluation], folder: Path) -> str:
     scores = {name: evaluations[policy] for name, policy in policies.items()}
     best = max(scores, key=lambda name: (scores[name].success_rate, scores[name].return_))
     return f"damian fly checkpoint={shlex.quote(str(folder))} policy={best}"
-
-
-def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
-    """The learner, with the replay buffer that it needs."""
-    name = config.learner.name
-    with own_code(name):
-        learner = config.learner.make(env, learning_setup(config), buffer)
-        has_actor = "actor" in learner.components()
-    should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
-    checks.require(has_actor, f"{name}: components", [*learner.components()], should)
-    return learner
-
-
-def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
-    """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
-    setup = learning_setup(config)
-    with own_code(config.learner.name):
-        size = config.learner.buffer_size(setup)
-    if size is None:
-        return None
-    if not backupdates(config):
-        return ReplayBuffer(storage=TimeStorage(size, device=config.device))
-    least = setup.least_buffer
-    should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
-    checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
-    storage = corrected_storage(config, env, config.corrected, size, setup.worlds)
-    return ReplayBuffer(storage=storage)
-
-
-def corrected_storage(
-    config: TrainConfig, env: DelayedEnv, corrected: Collection[str], size: int, worlds: int
-) -> BackupdateStorage:
-    """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct steps."""
-    late_messages = config.delays.obs.late
-    corrected = corrected if late_messages else ["reward"]
-    corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
-    # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
-    # The storage then has to keep the newest one.
-    hindsight = "hindsight" in config.learner.reads or (late_messages and config.delay.order == "arrival")
-    return BackupdateStorage(
-        size + sum(correction.lookback for correction in corrections) * worlds,
-        server_recompute(env.server, corrected) if late_messages else None,
-        config.delays.longest,
-        corrections=corrections,
-        hindsight_key=keys.HINDSIGHT if hindsight else None,
-        device=config.device,
-    )
-
-
-def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:
-    """The returns of the learning curve; None if they are those perceived, or if steps are skipped."""
-    if not measures_hindsight(config):
-        return None
-    worlds = min(config.worlds, HindsightReturns.WORLDS)
-    size = (learning_setup(config).longest_period + 2 * config.delays.longest) * worlds
-    return HindsightReturns(corrected_storage(config, env, ["reward"], size, worlds), worlds)
 
 
 def begin(config: TrainConfig, state: TrainingState) -> None:

@@ -39,12 +39,7 @@ from .train import train
 
 try:
     import optuna
-    from optuna.distributions import (
-        BaseDistribution,
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
+    from optuna import distributions
     from optuna.trial import Trial, TrialState
 except ImportError as error:
     raise InputError("damian tune: optuna is not installed; pip install optuna") from error
@@ -59,7 +54,7 @@ OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields
 """Settings that a training does not have."""
 
 
-def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistribution]:
+def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, distributions.BaseDistribution]:
     """The values of each setting that a search varies, by its dotted key."""
     space = {}
     for name, written in search.items():
@@ -80,12 +75,14 @@ def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistr
     return space
 
 
-def _distribution(choices: Any = None, **values: Any) -> BaseDistribution:
+def _distribution(choices: Any = None, **values: Any) -> distributions.BaseDistribution:
     """The values of a setting, for Optuna; choices are as they are written on a command line."""
     if choices is not None and not values:
-        return CategoricalDistribution([json.dumps(each, separators=(",", ":")) for each in choices])
+        return distributions.CategoricalDistribution(
+            [json.dumps(each, separators=(",", ":")) for each in choices]
+        )
     whole = all(isinstance(value, int) for value in values.values())
-    return (IntDistribution if whole else FloatDistribution)(**values)
+    return (distributions.IntDistribution if whole else distributions.FloatDistribution)(**values)
 
 
 class Search:

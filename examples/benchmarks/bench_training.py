@@ -27,8 +27,7 @@ from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.schedule import SystemClock
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.config import TrainConfig
-from damian.recipes.shared.collectors import learning_env, make_collector, ticks
-from damian.recipes.train import make_learner, replay_buffer
+from damian.recipes.shared.learning import learning_env, make_collector, make_learner, replay_buffer, ticks
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}

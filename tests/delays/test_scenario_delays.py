@@ -9,7 +9,7 @@ from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.pipeline import make_env
 from damian.learners.config import MappoConfig
 from damian.recipes.config import TrainConfig
-from damian.recipes.shared.collectors import learning_env
+from damian.recipes.shared.learning import learning_env
 from damian.recipes.shared.settings import check_learning, learning_setup
 
 

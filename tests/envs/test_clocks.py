@@ -14,8 +14,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig
 from damian.learners.schedule import SystemClock
 from damian.recipes.config import TrainConfig
-from damian.recipes.shared.collectors import spotting, ticks
-from damian.recipes.train import learning_env
+from damian.recipes.shared.learning import learning_env, spotting, ticks
 from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
 

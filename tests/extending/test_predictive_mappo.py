@@ -15,7 +15,7 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
 from damian.learners.networks import ModelConfig
 from damian.recipes.config import TrainConfig
-from damian.recipes.train import learning_env, make_learner, replay_buffer
+from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
 from damian.runs.config import LoggerConfig
 from damian.server.termination import EpisodeConfig

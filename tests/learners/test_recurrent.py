@@ -17,7 +17,7 @@ from damian.envs.recompute import server_recompute
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
 from damian.learners.networks import ModelConfig, make_actor
-from damian.recipes.shared.collectors import make_collector
+from damian.recipes.shared.learning import make_collector
 from damian.replay.backupdate import BackupdateStorage
 from damian.server.termination import EpisodeConfig
 

@@ -13,7 +13,7 @@ from damian.delays.laws import sampler_of
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
-from damian.recipes.shared.collectors import warn_of_memory
+from damian.recipes.shared.learning import warn_of_memory
 
 
 @pytest.mark.parametrize(

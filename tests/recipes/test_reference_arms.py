@@ -31,7 +31,7 @@ from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.config import TrainConfig
-from damian.recipes.train import learning_env, make_learner, replay_buffer
+from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.server.features import ObservationConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from statistics import fmean
 
 import pytest
 from test_evaluate import TRAINED
@@ -14,16 +13,6 @@ import damian
 from damian import keys
 from damian.common.errors import InputError
 from damian.recipes.command import main
-
-SWEEP = [*(word for word in TRAINED if word.partition("=")[0] not in ("seed", "delay.obs")), "worlds=2"]
-
-
-@pytest.fixture(scope="module")
-def sweep(tmp_path_factory) -> Path:
-    """The folder of a sweep over two delays and three seeds."""
-    folder = tmp_path_factory.mktemp("sweep")
-    main(["train", "-m", *SWEEP, "delay.obs=1,2", "seed=0,1,2", f"hydra.sweep.dir={folder}"])
-    return folder
 
 
 @pytest.fixture(scope="module", params=["mlp", "gru"])
@@ -60,26 +49,6 @@ def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
         damian.load(trained.parent / "nowhere")
 
 
-def test_a_sweep_ends_with_a_table_of_means_over_seeds(sweep, capsys):
-    rows = damian.results(sweep)
-    rows = rows[rows["policy"] == "trained"].to_dict("records")
-    assert [(row["delay.obs"], row["seed"]) for row in rows] == [(d, s) for d in (1, 2) for s in (0, 1, 2)]
-    for row in rows:
-        assert stored(sweep / row["folder"], "trained")["return"] == row["return"]
-    table = (sweep / "table.md").read_text()
-    for delay in (1, 2):
-        mean = fmean(row["return"] for row in rows if row["delay.obs"] == delay)
-        (line,) = [line for line in table.splitlines() if line.startswith(f"| {delay} | trained |")]
-        _, _, n_runs, shown, *_ = line.split(" | ")
-        assert n_runs == "3"
-        assert float(shown.split()[0]) == pytest.approx(mean, abs=6e-4)
-    assert (sweep / "figure.png").stat().st_size > 1000
-    before = {path.name: path.read_bytes() for path in sweep.glob("*.csv")}
-    main(["results", str(sweep)])
-    assert capsys.readouterr().out.startswith("| delay.obs |")
-    assert {path.name: path.read_bytes() for path in sweep.glob("*.csv")} == before
-
-
 def test_results_are_utf_8_whatever_the_locale_and_shown_also_where_it_lacks_a_letter(tmp_path):
     text = "policy,episodes,return\nŁąka,4,1.5\n"
     (tmp_path / "result.csv").write_text(text, encoding="utf-8")
@@ -96,9 +65,8 @@ def test_results_are_utf_8_whatever_the_locale_and_shown_also_where_it_lacks_a_l
     assert "| \\u0141\\u0105ka |" in done.stdout
 
 
-def test_results_of_a_run_and_of_a_comparison_are_rows_too(sweep):
-    run = next(path.parent for path in sweep.rglob("result.csv"))
-    assert [*damian.results(run)["policy"]][:2] == ["untrained", "untrained, deterministic"]
+def test_results_of_a_run_and_of_a_comparison_are_rows(trained):
+    assert [*damian.results(trained)["policy"]][:2] == ["untrained", "untrained, deterministic"]
     folder = Path(__file__).parents[2] / "docs" / "results" / "delaybench"
     assert {*damian.results(folder)["arm"]} >= {"undelayed", "backupdate"}
     with pytest.raises(InputError, match="no run has finished there"):

@@ -10,7 +10,7 @@ from damian.keys import next_key
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.recipes.config import TrainConfig
-from damian.recipes.train import learning_env, replay_buffer
+from damian.recipes.shared.learning import learning_env, replay_buffer
 from damian.runs.config import LoggerConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.motion import MotionConfig

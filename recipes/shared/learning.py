@@ -1,27 +1,36 @@
-"""The environment of a training, and its batches: each lies between two ticks of the system clock."""
+"""The parts of a training: environment, learner, replay buffer, and batches between ticks of its clock."""
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import cast
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
+from torchrl.data import ReplayBuffer
 from torchrl.envs import TransformedEnv
 
 from damian import keys
+from damian.common import checks
+from damian.common.errors import naming_errors
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
+from damian.envs.recompute import CORRECTED, server_recompute
+from damian.learners.base import Learner
 from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
+from damian.replay.backupdate import BackupdateStorage, corrections_of
+from damian.replay.time_storage import TimeStorage
+from damian.runs.metrics import HindsightReturns
 from damian.server.server import Server
 
 from ..config import TrainConfig
-from .settings import backupdates, measures_hindsight
+from .settings import backupdates, learning_setup, measures_hindsight
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
@@ -55,6 +64,67 @@ def warn_of_memory(config: TrainConfig) -> None:
             f"the steps of {config.worlds} worlds of {config.agents} UAVs take at least {needed / 1e9:.0f} GB"
         )
         print(f"worlds: {what}, and this machine has {there / 1e9:.0f} GB: choose fewer", file=sys.stderr)
+
+
+def own_code(learner: str) -> AbstractContextManager[None]:
+    """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
+    return naming_errors(learner) if ":" in learner else nullcontext()
+
+
+def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
+    """The learner, with the replay buffer that it needs."""
+    name = config.learner.name
+    with own_code(name):
+        learner = config.learner.make(env, learning_setup(config), buffer)
+        has_actor = "actor" in learner.components()
+    should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
+    checks.require(has_actor, f"{name}: components", [*learner.components()], should)
+    return learner
+
+
+def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
+    """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
+    setup = learning_setup(config)
+    with own_code(config.learner.name):
+        size = config.learner.buffer_size(setup)
+    if size is None:
+        return None
+    if not backupdates(config):
+        return ReplayBuffer(storage=TimeStorage(size, device=config.device))
+    least = setup.least_buffer
+    should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
+    checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
+    storage = corrected_storage(config, env, config.corrected, size, setup.worlds)
+    return ReplayBuffer(storage=storage)
+
+
+def corrected_storage(
+    config: TrainConfig, env: DelayedEnv, corrected: Collection[str], size: int, worlds: int
+) -> BackupdateStorage:
+    """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct steps."""
+    late_messages = config.delays.obs.late
+    corrected = corrected if late_messages else ["reward"]
+    corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
+    # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
+    # The storage then has to keep the newest one.
+    hindsight = "hindsight" in config.learner.reads or (late_messages and config.delay.order == "arrival")
+    return BackupdateStorage(
+        size + sum(correction.lookback for correction in corrections) * worlds,
+        server_recompute(env.server, corrected) if late_messages else None,
+        config.delays.longest,
+        corrections=corrections,
+        hindsight_key=keys.HINDSIGHT if hindsight else None,
+        device=config.device,
+    )
+
+
+def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:
+    """The returns of the learning curve; None if they are those perceived, or if steps are skipped."""
+    if not measures_hindsight(config):
+        return None
+    worlds = min(config.worlds, HindsightReturns.WORLDS)
+    size = (learning_setup(config).longest_period + 2 * config.delays.longest) * worlds
+    return HindsightReturns(corrected_storage(config, env, ["reward"], size, worlds), worlds)
 
 
 def make_collector(
