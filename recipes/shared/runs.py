@@ -266,9 +266,9 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
     mentioned = {"checkpoint", "resume", "trust"}.union(*(reach(key, program) for key in given))
     for key in sorted(mentioned):  # a section before its keys
         set_at(merged, key, value_at(values, key))
-    for key in kept:
+    for key, value in kept.items():
         if not given & {key, "aware"}:  # another option of delay leaves what the policy observes
-            set_at(merged, key, kept[key])
+            set_at(merged, key, value)
     config = filled(SCHEMAS[program], merged)
     check_policy_fits(config, stored)
     if changed := changes(config, stored):
