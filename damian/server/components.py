@@ -11,6 +11,7 @@ from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.tensors import expand_mask, tree_map
 from damian.server.features import feature_of, stack
+from damian.server.rewards import Counters
 from damian.server.server import Features, Server
 from damian.world.messages import Messages
 from damian.world.simulation import Simulation
@@ -43,7 +44,7 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
                 checks.require(same, key, "local", should)
     for term in server.terms.values():
         with naming_errors(f"reward term {term.name}"):
-            server.reward_and_status(found, messages, steps, None)
+            term.value(found, Counters(steps, messages.motions))
     return found
 
 

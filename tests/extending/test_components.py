@@ -104,6 +104,10 @@ def leaks(cache):
 def shared(features, counters):
     return features["spotted"].T
 
+@reward_term(reads=["spotted"])
+def fails(features, counters):
+    return features["spotted"] / None
+
 @sensor(width=2)
 def flipped(state, world):
     return state.position[..., :2].transpose(0, 1)
@@ -124,6 +128,10 @@ def seen(name: str) -> dict[str, ObservationConfig]:
         (
             {"reward": RewardConfig(custom=[{"term": "lies:shared"}])},
             r"reward term shared: shape: \[3, 20\] is not \[20, 3\]",
+        ),
+        (
+            {"reward": RewardConfig(spotted=1.0, custom=[{"term": "lies:fails"}])},
+            r"reward term fails: TypeError",
         ),
         (
             {"sensors": [{"sensor": "lies:flipped"}]},
