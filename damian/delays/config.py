@@ -39,7 +39,7 @@ class DelayConfig(Settings):
     )
     history: int = setting(0, "Number of its latest actions that a UAV observes.", low=0, high=1000)
     messages: int = setting(
-        0, "Latest steps of which a learner gets all messages, as a timeline.", low=0, high=1000
+        0, "Number of latest steps whose messages a learner gets, as a timeline.", low=0, high=1000
     )
     reward_window: int = setting(
         1, "Steps over which rewards are summed (eq. 4).", unit="steps", low=1, high=LONGEST

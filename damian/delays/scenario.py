@@ -21,7 +21,7 @@ class ScenarioDelays:
         self.obs: Sampler = HeldSampler(obs) if delay.hold == "max" else obs
         """Of the messages to the server, with their losses, and as the server holds them back."""
         self.act, self.rew = (sampler_of(getattr(delay, n), dt, key=f"delay.{n}") for n in ("act", "rew"))
-        """Of the actions, and of the rewards, of which none is lost."""
+        """Of the actions, and of the rewards; no reward is lost."""
         self.links = link_sampler(links.delay, links.loss, dt, "links.delay")
         """Of what the UAVs receive from the server (updown), or from each other (matrix)."""
         checks.require(not self.rew.loses, "delay.rew", delay.rew, LOSES)

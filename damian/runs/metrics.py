@@ -96,7 +96,7 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
 def _of_episodes(
     success: Tensor, reward: Tensor, counted: Tensor, can_succeed: bool
 ) -> tuple[float, float, float]:
-    """Success rate, steps and return of the episodes of which the steps in a mask [B, T] count."""
+    """Success rate, steps and return of episodes, from the steps that count, a mask [B, T]."""
     succeeded, steps = (success & counted).any(-1), counted.sum(-1)
     if can_succeed:
         steps = torch.where(succeeded, steps, counted.shape[1])

@@ -1,4 +1,4 @@
-"""Checks that features and reward terms, built-in ones and one's own, keep what they declare."""
+"""Checks that features and reward terms, built-in or your own, have the shapes and bounds they declare."""
 
 from typing import cast
 
@@ -20,7 +20,7 @@ _WORLDS, _ROUNDING = 16, 1e-5
 
 
 def checked_features(server: Server, messages: Messages, steps: Tensor) -> Features:
-    """All features of the first messages of episodes [B, N], of which each is as it declares.
+    """All features of the first messages of episodes [B, N], checked against what they declare.
 
     Values are finite and within bounds, and a local feature follows from the UAV's own message alone. A
     reward term of these features gives one value for each UAV. What only later messages show is not found.

@@ -51,7 +51,7 @@ class ObservationConfig(Settings):
     )
     window: int = setting(2, "Latest landing points of a UAV that its coverage counts.", low=1, high=16)
     timeline: int = setting(
-        0, "Latest steps of which actor and critic observe where other UAVs were, if known.", low=0, high=100
+        0, "Number of latest steps: actor and critic observe where other UAVs were in each.", low=0, high=100
     )
 
     def __post_init__(self) -> None:

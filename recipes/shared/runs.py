@@ -259,8 +259,8 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
     folder = run_folder(Path(values["checkpoint"]))
     stored = stored_config(folder, "checkpoint")
     merged = copy.deepcopy(nested(stored))
-    defaults = {each.name: default_of(each) for each in fields(TrainConfig)}
-    own = {f.name for f in fields(SCHEMAS[program]) if default_of(f) != defaults.get(f.name, MISSING)}
+    common = [(each.name, default_of(each)) for each in fields(TrainConfig)]
+    own = {f.name for f in fields(SCHEMAS[program]) if (f.name, default_of(f)) not in common}
     kept = {key: value_at(merged, key) for key in ("delay.history", "delay.messages")}
     given = {key_of(word).partition("@")[0] for word in words} | (own & {*values})
     mentioned = {"checkpoint", "resume", "trust"}.union(*(reach(key, program) for key in given))
@@ -274,9 +274,6 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
     if changed := changes(config, stored):
         print(f"changed since the training: {changed}")
     return config
-
-
-MISSING = object()
 
 
 def reach(key: str, program: str) -> set[str]:
