@@ -18,7 +18,6 @@ PROGRAMS = {
     "train": "train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one",
     "evaluate": "evaluate a trained policy, also in another scenario or under other delays",
     "compare": "train and evaluate several methods with several seeds, and compare them with intervals",
-    "tune": "search for better settings of a learner with Optuna",
     "fly": "fly episodes, and keep or replay them as files, films, figures and pages",
     "advise": "advise real UAVs: from what they report, where each should land next",
     "export": "export a policy that flies without damian: damian export RUN",
@@ -72,7 +71,7 @@ def _checked(name: str, words: list[str]) -> list[str] | None:
         rest.append(FOLDERS[name].format(",".join(f"'{word}'" for word in plain)))
     elif plain:
         raise InputError(f"{plain[0]}: this word is not of the form KEY=VALUE")
-    if {"-m", "--multirun"} & {*options} and name in ("compare", "tune", *FOLDERS):
+    if {"-m", "--multirun"} & {*options} and name in ("compare", *FOLDERS):
         raise InputError(f"-m: not with damian {name}, which has many runs anyway")
     if not any(word.startswith(("--config-dir", "-cd")) for word in options):  # it may have any key
         check_words(name, rest)

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
-from damian.compare.config import LESS_IS_BETTER, POLICY_MEANS, SCORE_MEANS, SCORES, STORED
+from damian.compare.config import SCORES, STORED
 from damian.envs.config import ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.runs.config import LoggerConfig
@@ -209,32 +209,6 @@ class AdviseConfig(FlownPolicyConfig):
         given = [name for name in ("table", "fit") if getattr(self, name) is not None]
         problem = "is not the only one of table=FILE, fit=FILE: give one"
         checks.require(len(given) == 1, "table", " and ".join(given) or "nothing", problem)
-
-
-@dataclass
-class TuneConfig(TrainConfig):
-    """All settings of ``damian tune``: those of ``damian train``, and how to search."""
-
-    search: dict[str, Any] = setting(
-        {}, "What to vary, each setting as {low: 1, high: 8, log: true, step: 1} or {choices: [...]}."
-    )
-    trials: int = setting(30, "Number of trainings.", low=1, high=1_000_000)
-    processes: int = setting(1, "Trainings at the same time, of one thread each.", low=1, high=1024)
-    score: str = setting("return", SCORE_MEANS, choices=SCORES)
-    policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        alike = self.episode.success_share is None and "success" in self.score
-        self.refuse(alike, "score", "is the same for every policy: in this task nothing can be reached")
-        for name in ("checkpoint", "resume"):
-            problem = "is not for a search, which trains every policy from the beginning: leave it out"
-            self.refuse(getattr(self, name) is not None, name, problem)
-
-    @property
-    def sign(self) -> int:
-        """1 if the greatest score is the best, -1 if the least is."""
-        return -1 if self.score in LESS_IS_BETTER else 1
 
 
 @dataclass

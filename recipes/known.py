@@ -21,7 +21,7 @@ from damian.common.text_files import read_text
 from damian.compare.config import CompareConfig
 from damian.learners.config import LEARNERS
 
-from .config import AdviseConfig, ExportConfig, FlyConfig, ResultsConfig, TrainConfig, TuneConfig
+from .config import AdviseConfig, ExportConfig, FlyConfig, ResultsConfig, TrainConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 """Folder of the configuration files: one for each program, and in folders one for each option of a group."""
@@ -29,7 +29,6 @@ SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
     "evaluate": TrainConfig,
     "fly": FlyConfig,
-    "tune": TuneConfig,
     "advise": AdviseConfig,
     "compare": CompareConfig,
     "export": ExportConfig,
@@ -187,8 +186,6 @@ HINTS = {
     "evaluate": f"checkpoint=FOLDER eval_episodes=200\n{POLICY}{DELAYS}\n{SWEEP}, of checkpoint=A,B too",
     "fly": 'checkpoint=FOLDER policy=deterministic "formats=[gif,png,html]" "views=[2d,3d]" keep=extremes\n'
     f'{POLICY}{DELAYS}\n  "replay=[A.json,B.json]" (stored episodes in one page)\n{SWEEP}',
-    "tune": "trials=30 processes=2 score=return search=sac (the same command continues a search)\n"
-    f'  "+search.delay.history={{low: 1, high: 8}}" search.learner.lr.low=1e-4\n{DELAYS}\n{SWEEP}',
     "compare": "experiment=delaybench seeds=10 processes=2 (the same command continues a comparison)\n"
     '  "tasks=[crowded]" "delays=[paper]" "arms=[undelayed,naive]" "overrides=[\'frames=100000\']"\n'
     "  report_only=true (tables of what is stored)   keep=true (without the folders of finished runs)\n"

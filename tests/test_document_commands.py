@@ -26,7 +26,6 @@ OF_RUNS = f"overrides={json.dumps([word for word in TINY if word != 'logger=csv'
 FLIGHTS = ["eval_episodes=3"]
 SHORTER = {
     "train": TINY,
-    "tune": ["trials=2", "processes=1", *TINY],
     "evaluate": FLIGHTS,
     "fly": [*FLIGHTS, "episode.max_steps=12"],
     "compare": ["seeds=1", "processes=1", OF_RUNS],

@@ -1,6 +1,9 @@
 """The examples that a person copies run, and learn under delay (slow)."""
 
+import os
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -64,3 +67,14 @@ def test_a_recording_for_rerun_has_the_places_and_the_detections_of_every_uav(tm
             rows[chunk.entity_path] = chunk.to_record_batch().to_pydict().get("Points3D:positions")
     assert [len(points) for points in rows[r"/detections/A\/1"]] == [0, 1, 1, 0]
     assert rows["/uavs/B"] == [[[100.0, 100.0, 0.0]]] * 4
+
+
+@pytest.mark.slow
+def test_a_search_with_optuna_keeps_its_trials_and_goes_on(tmp_path):
+    pytest.importorskip("optuna")
+    words = ["frames=64", "worlds=2", "learner.steps=16", "eval_episodes=2", "episode.max_steps=8"]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for n in ("1", "2"):
+        command = [sys.executable, str(EXAMPLES / "tune.py"), n, *words]
+        subprocess.run(command, cwd=tmp_path, env=os.environ | {"PATH": path}, check=True)
+    assert len([*tmp_path.glob("runs/tune/*/result.csv")]) == 2

@@ -196,7 +196,7 @@ def test_every_option_is_a_file_that_begins_with_its_launch_line_and_composes():
             lines = (CONF / group / f"{option}.yaml").read_text(encoding="utf-8").splitlines()
             (first, *_) = [line for line in lines if not line.startswith("# @package")]
             assert first.startswith("# damian "), (group, option)
-            if group not in ("experiment", "search"):
+            if group != "experiment":
                 cli.composed(f"{group}={option}")
 
 
@@ -227,7 +227,7 @@ def test_every_program_is_a_module_and_says_what_it_does(capsys):
 def test_help_explains_a_program_a_section_and_a_setting(capsys):
     main(["train", "--help"])
     page = capsys.readouterr().out
-    assert all(name in page for name in {*groups()} - {"experiment", "search"})
+    assert all(name in page for name in {*groups()} - {"experiment"})
     main(["train", "--help", "delay", "learner.gamma"])
     printed = capsys.readouterr().out
     assert "delay.loss: float = 0.0\n    Probability that a message" in printed

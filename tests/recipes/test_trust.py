@@ -167,7 +167,7 @@ def test_links_in_a_run_folder_are_not_followed(store, name, linked, capsys):
     assert Path("outside/000007.pt").read_text(encoding="utf-8") == "mine"
 
 
-def test_comparisons_searches_and_tables_of_results_read_stored_runs_as_data(store, capsys):
+def test_comparisons_and_tables_of_results_read_stored_runs_as_data(store, capsys):
     store("learner.name", "evilmod:X")
     arms = "tasks: {{t: [agents=3]}}\narms: {{a: {{delayed: false, overrides: [{}]}}}}\n"
     Path("conf/experiment").mkdir(parents=True, exist_ok=True)
@@ -178,7 +178,6 @@ def test_comparisons_searches_and_tables_of_results_read_stored_runs_as_data(sto
     words = ["compare", "--config-dir=conf", "experiment=x", "seeds=1", "hydra.run.dir=old"]
     check_refuses(lambda: main(words), capsys, "learner.name is evilmod:X in this stored run")
     main(["results", "run"])
-    check_refuses(lambda: main(["tune", "checkpoint=run", "hydra.run.dir=new"]), capsys, "checkpoint: run")
 
 
 def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(store):
