@@ -86,9 +86,8 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
     write_atomically(trace, "\n".join(["delay", *trace_rows(fitted), ""]))
     print(summary(fitted))
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
-    steps = steps_of(fitted, config.clock.dt)
-    laws = fit_laws(steps)
-    print(law_summary(*laws, steps, config.clock.dt))
+    laws = fit_laws(steps_of(fitted, config.clock.dt))
+    print(law_summary(*laws, config.clock.dt))
     plot_delays(fitted, *laws, folder / "delays.png")
 
 

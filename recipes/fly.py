@@ -38,9 +38,9 @@ from .shared.runs import save_config, start
 
 
 def fly(config: FlyConfig) -> list[Episode]:
-    """Fly ``eval_episodes`` episodes, or take the one that the journal tells."""
+    """Fly ``eval_episodes`` episodes, or take those that the journal tells."""
     if config.journal is not None:
-        return [episode_of_journal(config)]
+        return episodes_of_journal(config)
     env = make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
     likely = config.flown == "deterministic"
     if config.learnt:
@@ -54,10 +54,10 @@ def fly(config: FlyConfig) -> list[Episode]:
     return record(rollout, env.uav_env, {**about, "overrides": list(config.overrides)})
 
 
-def episode_of_journal(config: FlyConfig) -> Episode:
-    """The flight that the journal tells."""
+def episodes_of_journal(config: FlyConfig) -> list[Episode]:
+    """The flight that the journal tells, an episode as long as the same UAVs fly."""
     from damian.field.node import Node, for_uavs  # noqa: PLC0415 (needs pydantic, which only reports do)
-    from damian.field.playback import episode_of  # noqa: PLC0415
+    from damian.field.playback import episodes_of  # noqa: PLC0415
 
     @cache
     def node_of(n_uavs: int) -> Node:
@@ -65,7 +65,7 @@ def episode_of_journal(config: FlyConfig) -> Episode:
 
     first, last = config.span or (0.0, math.inf)
     about = {"overrides": list(config.overrides)}
-    return episode_of(Path(str(config.journal)), node_of, about, (first, last))
+    return episodes_of(Path(str(config.journal)), node_of, about, (first, last))
 
 
 def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:

@@ -53,13 +53,6 @@ def fit_laws(steps: Integers) -> tuple[LawFit, LawFit]:
     return min(laws, key=attrgetter("bic")), min(own, paired, key=attrgetter("bic"))
 
 
-def autocorrelation(steps: Integers) -> float:
-    """Lag-1 autocorrelation of the delays; a loss counts as one step more than the longest delay."""
-    delay, there = np.where(steps == LOST_STEPS, steps.max() + 1, steps), steps[:, 1:] != NO_MESSAGE
-    pairs = np.stack([delay[:, :-1][there], delay[:, 1:][there]])
-    return float(np.corrcoef(pairs)[0, 1]) if pairs.size and pairs.std(1).all() else 0.0
-
-
 def _likelihood(counts: NDArray[Any], chances: Floats) -> float:
     """Logarithm of the likelihood of counts of independent outcomes [nats]."""
     with np.errstate(divide="ignore"):

@@ -21,7 +21,6 @@ from damian.server.belief import (
 from damian.server.server import Server
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.entries import Entries, add_spec, existing
-from damian.transforms.hold import SampleAndHold
 from damian.transforms.timeline import ObservationTimeline
 from damian.world.coverage import KnownCoverage
 
@@ -247,7 +246,7 @@ class EpisodeTotals(WorldTransform):
         return observation_spec
 
 
-# Reports that arrive late, or not at all for many steps (``damian.field``).
+# Reports that arrive late (``damian.field``).
 
 
 def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
@@ -267,11 +266,3 @@ def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, age
         memory["report"][slot, agent] = report_rows(transform.grid, messages, every).view(-1)
         memory["delay"][slot, agent] = lag
     return memory
-
-
-def after_idle_steps(transform: StatefulTransform, memory: Memory, n_steps: int) -> Memory:
-    """The memory after steps in which no message arrived and no agent chose an action; beliefs stay."""
-    counted = {name: memory[name] + n_steps for name in ("elapsed", "since", "age") if name in memory}
-    if isinstance(transform, SampleAndHold):
-        counted["elapsed"] = counted["elapsed"] % transform.period
-    return memory | counted

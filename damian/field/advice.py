@@ -1,19 +1,16 @@
 """Where each UAV should land next, from a table of reports: one answer, when all rows have come in."""
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from pydantic import BaseModel
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
-from damian.common.errors import InputError
-from damian.common.text_files import listed, named
+from damian.common.text_files import named
 from damian.field.node import Node
 from damian.field.rows import Rows
 from damian.field.tracker import Tracker
@@ -49,32 +46,23 @@ def next_landings(
     for where, report in rows:
         with named(where):
             report.stamp(now, file=True)
-    tracker = Tracker([*dict.fromkeys(report.id for _, report in rows)], lambda _: node)
+    tracker = Tracker(node, [*dict.fromkeys(report.id for _, report in rows)], rows)
+    latest = max(report.received for _, report in rows)
     sizes = [each.cell.hidden_size for each in policy.modules() if isinstance(each, AgentGRU)]
     hidden = torch.zeros(1, len(tracker.uavs), sizes[0]) if sizes else None
     kind = ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
-        for where, report in sorted(rows, key=lambda row: row[1].received):
-            for _ in tracker.advance(report.received, math.inf if hidden is None else 0):
-                hidden = policy(_read(tracker, [], hidden))[keys.HIDDEN]
-            with named(where):
-                tracker.report(report)
-        if tracker.start is None:
-            raise InputError(f"no report of {listed(tracker.missing)} is there")
+        for outputs in tracker.steps(latest):
+            read = outputs if hidden is None else outputs.set(keys.HIDDEN, hidden)
+            if hidden is not None:
+                hidden = policy(read.clone(False))[keys.HIDDEN]
         asking = [uav for uav in tracker.uavs if not tracker.held[uav].report.flies]
-        action = policy(_read(tracker, asking, hidden))[keys.ACTION]
-    return _answers(tracker, asking, action)
+        if keys.ACTION_MASK in read.keys(True):
+            read[keys.ACTION_MASK] = node.simulation.action_mask(tracker.state(asking))
+        return _answers(tracker, asking, policy(read)[keys.ACTION], latest)
 
 
-def _read(tracker: Tracker, asking: Sequence[str], hidden: Tensor | None) -> TensorDictBase:
-    """What the policy reads, if these UAVs are ready to choose."""
-    read = tracker.observe().clone(False)
-    if keys.ACTION_MASK in read.keys(True):
-        read[keys.ACTION_MASK] = tracker.node.simulation.action_mask(tracker.state(asking))
-    return read if hidden is None else read.set(keys.HIDDEN, hidden)
-
-
-def _answers(tracker: Tracker, asking: Sequence[str], action: Tensor) -> list[NextLanding]:
+def _answers(tracker: Tracker, asking: Sequence[str], action: Tensor, now: float) -> list[NextLanding]:
     """The landing points to which actions [1, N, ...] lead; only those of the UAVs that ask count."""
     before, ground = tracker.state(asking), tracker.node.ground
     chooses = torch.tensor([[uav in asking for uav in tracker.uavs]])
@@ -88,6 +76,6 @@ def _answers(tracker: Tracker, asking: Sequence[str], action: Tensor) -> list[Ne
             state, (distance, heading) = "hold" if here == there else "fly", ground.way(here, there)
             where |= dict(zip(ground.columns, ground.place(there), strict=True))
             where |= {"distance": distance, "heading": None if here == there else heading}
-        age = round(max(tracker.clock - tracker.held[uav].report.time, 0.0), 3)
+        age = round(max(now - tracker.held[uav].report.time, 0.0), 3)
         answers.append(NextLanding(ID=uav, state=state, **where, age=age))
     return answers

@@ -10,15 +10,11 @@ import pandas as pd
 from damian.common.errors import InputError
 from damian.common.plotting import COLOURS
 from damian.common.text_files import named
-from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers, LawFit, autocorrelation
+from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers, LawFit
 from damian.delays.laws import LOST, in_steps
 from damian.field.journal import SUFFIX, read_journal
 from damian.field.rows import Report, TimedReport, read_file
 
-REGULAR = 0.2
-"""Share of a period by which the time between two reports may differ from whole periods."""
-MOST = 0.8
-"""Share of the times between reports that must be whole periods, for the reports to count as regular."""
 LATEST_MEDIAN = 1800.0
 """Longest median delay of a UAV [s]; a longer one is a clock of another time zone, or one since the start."""
 LONGEST_GAP = 1000
@@ -49,46 +45,23 @@ def fit(reports: Iterable[Report]) -> pd.DataFrame:
 
     Columns: ``uav`` (ID), ``time`` when it was generated [s], ``received`` when it came in first [s], and its
     ``delay`` [s], 0 if clocks differ so that it came in before its time; the last two are nan for a message
-    that never came in, whose time is estimated. ``attrs["losses"]`` says how lost messages were found: where
-    reports of a UAV are numbered (``sequence``), a missing number is one. Where they are not, but most come
-    in whole periods, a gap of several periods has lost messages in it, unless the UAV was in the air, where
-    it is silent. Else no loss can be seen.
+    that never came in, whose time is estimated: one whose number (``sequence``) is missing. Where a UAV does
+    not number its reports, no loss can be seen.
     """
     told = pd.DataFrame(
-        [(each.id, each.time, each.sequence, each.received, each.flies) for each in reports],
-        columns=["uav", "time", "sequence", "received", "flies"],
+        [(each.id, each.time, each.sequence, each.received) for each in reports],
+        columns=["uav", "time", "sequence", "received"],
     ).astype({"sequence": float})
     identity = ["uav", "time", "sequence"]  # a UAV that starts anew counts from 0
     told = told.sort_values([*identity, "received"], na_position="first").drop_duplicates(identity)
-    parts, kinds = [], set()
+    parts = []
     for uav, own in told.groupby("uav"):
-        gaps, kind = _gaps(own)
-        kinds.add(kind)
-        lost = np.where(gaps <= LONGEST_GAP, gaps, 0)
-        rows = np.arange(len(own)) + np.r_[0, lost.cumsum()]  # where those that came in stand among all
-        received = np.full(rows[-1] + 1, math.nan)
-        received[rows] = own.received
-        time = np.interp(np.arange(len(received)), rows, own.time)
-        parts.append(pd.DataFrame({"uav": uav, "time": time, "received": received}))
+        gaps = own.sequence.diff().sub(1).fillna(0).clip(lower=0)
+        rows = np.arange(len(own)) + gaps.where(gaps <= LONGEST_GAP, 0).cumsum().to_numpy(int)
+        every = own.set_index(rows)[["time", "received"]].reindex(range(rows[-1] + 1))
+        parts.append(every.assign(uav=uav, time=every.time.interpolate()))
     messages = pd.concat(parts, ignore_index=True)
-    messages["delay"] = (messages.received - messages.time).clip(lower=0)
-    messages.attrs["losses"] = " and ".join(sorted(kinds))
-    return messages
-
-
-def _gaps(own: pd.DataFrame) -> tuple[Integers, str]:
-    """Number of messages missing between each report of a UAV and the next one, and how this was found."""
-    if len(own) > 1 and own.sequence.notna().all():
-        return (np.diff(own.sequence).astype(int) - 1).clip(min=0), "by their numbers"
-    between = np.diff(own.time)
-    if len(between) >= 2:
-        period = float(np.median(between))
-        periods = between / period
-        whole = periods.round()
-        if ((np.abs(periods - whole) <= REGULAR) & (whole >= 1)).mean() >= MOST:
-            missing = np.where(own.flies[:-1], 0, (whole.astype(int) - 1).clip(min=0))
-            return missing, f"by their period of {period:.3g} s"
-    return np.zeros(len(between), int), "not to be seen (no numbers, no period)"
+    return messages.assign(delay=(messages.received - messages.time).clip(lower=0))
 
 
 def check_clocks(messages: pd.DataFrame, path: Path) -> None:
@@ -122,23 +95,21 @@ def summary(messages: pd.DataFrame) -> str:
     clocks = f"\n{len(early)} {problem} {early.max():.3g} s" if len(early) else ""
     return (
         f"{n} messages of {messages.uav.nunique()} UAVs over {time.max() - time.min():.0f} s; lost: {n_lost} "
-        f"({n_lost / n:.1%}), {messages.attrs['losses']}\n"
+        f"({n_lost / n:.1%})\n"
         f"delay [s]: mean {delays.mean():.3f}, median {median:.3f}, 90 % {most:.3f}, 99 % {nearly_all:.3f}, "
         f"longest {delays.max():.3f}{clocks}"
     )
 
 
-def law_summary(best: LawFit, own: LawFit, steps: Integers, dt: float) -> str:
+def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
     """The law that ``fit_laws`` finds as settings, and what of the delays it does not repeat, as text."""
     other, gain = np.abs(best.chances - own.chances).sum() / 2, (own.likelihood - best.likelihood) / best.n
     law, loss = str(best.written).replace("'", ""), f" delay.loss={best.loss}" * (best.loss > 0)
     text = f'best law: "delay.obs={law}"{loss} clock.simulation={dt:g}s\n'
     text += (
-        f"it gives {other:.1%} of the messages another delay; {own.written} are likelier by {gain:.3f} nats "
+        f"it gives {other:.1%} of the messages another delay; {own.written} are likelier by {gain:.3f} nats"
     )
-    text += f"a message; autocorrelation of delays {(alike := autocorrelation(steps)):.2f}"
-    if alike > max(0.1, 4 / best.n**0.5):
-        text += "\nlate messages come in bursts: no law without memory repeats them, only burst and the trace"
+    text += " a message"
     if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
         text += "\na bad fit: take the trace"
     return text

@@ -77,8 +77,8 @@ class FilledReport:
     report: Report
     step: int
     """Step in which it was generated."""
-    sent: tuple[int, int] | None
-    """Landing points from which and to which the UAV had last been sent by then, if it had."""
+    origin: int | None = None
+    """Landing point from which a UAV in flight took off, if that is known otherwise."""
     point: int = 0
     """Landing point where the UAV is; in flight, where it took off."""
     target: int = 0
@@ -137,11 +137,9 @@ class UavLog:
         """Number of reports that were generated before this time."""
         return bisect.bisect_left(self.reports, time, key=lambda filled: filled.report.time)
 
-    def add(
-        self, report: Report, step: int, detected: int | None, sent: tuple[int, int] | None = None
-    ) -> FilledReport:
+    def add(self, report: Report, step: int, detected: int | None, origin: int | None = None) -> FilledReport:
         """Add a report, in its place by the time when it was generated; arguments as of ``FilledReport``."""
-        filled = FilledReport(report, step, sent, detected=detected)
+        filled = FilledReport(report, step, origin, detected=detected)
         at = self._place_of(report.time)
         self.reports.insert(at, filled)
         for i in range(at, len(self.reports)):
@@ -154,10 +152,8 @@ class UavLog:
         here, target = report.place(), report.place("target_")
         assert here is not None  # every report has it
         filled.point = filled.target = near(here)
-        if report.flies and filled.sent:  # it is on its way, and took off from where it was sent
-            filled.point, filled.target = filled.sent
-        elif report.flies and before:
-            filled.point = filled.target = before.point
+        if report.flies and (before or filled.origin is not None):
+            filled.point = filled.target = before.point if filled.origin is None else filled.origin
         if target is not None:
             filled.target = near(target)
         track, battery, readings = 0.0, 100.0, (0.0,) * self.n_readings

@@ -17,7 +17,7 @@ from damian.common import checks
 from damian.common.tensors import tree_map
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.nodes import Belief, ServerNode, after_idle_steps, note_late
+from damian.envs.nodes import ServerNode, note_late
 from damian.envs.pipeline import observation_transforms, remembering_transforms
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.field.known import Ground
@@ -117,13 +117,6 @@ class Node:
         """The environment for which the policy is built; nobody steps it."""
         self.env.reset()
         self.ground = Ground(self.simulation.airspace, 2 * scenario.region.lattice_step + 50.0)
-        periods = [scenario.clock.steps(name) for name in ("agents", "server")]
-        self.settles = 2 + sum(periods)
-        """Steps after which all that has arrived is known to all, if nothing else arrives."""
-        self.held_back = 0 if periods == [1, 1] else self.settles
-        """Steps for which an observation may be held, which must be taken even if nothing arrives."""
-        self.diffuses = any(isinstance(each, Belief) for each in transforms)
-        """Whether something changes in every step, even if nothing arrives."""
         self.transforms = cast(list[StatefulTransform], transforms)
         self._unused = [transform.memory for transform in self.transforms]
         self.blank = tree_map(lambda table: table[:1].clone(), self.simulation.initial)
@@ -150,11 +143,6 @@ class Node:
         entries: Entries = {keys.ACTION: action, keys.READY: chosen}
         _, memories, outputs = self.env.step_fn(cast(Any, reported), memories, entries)
         return memories, self.worlds.to_tensordict(outputs)
-
-    def skip(self, memories: Memories, n_steps: int) -> Memories:
-        """The memories after steps in which nothing was reported and nobody chose; beliefs stay the same."""
-        pairs = zip(self.transforms, memories, strict=True)
-        return [after_idle_steps(transform, memory, n_steps) for transform, memory in pairs]
 
 
 def _copies(memories: Memories) -> Memories:

@@ -14,7 +14,7 @@ from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.field.node import Node, for_uavs
-from damian.field.playback import episode_of
+from damian.field.playback import episodes_of
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.show.episode import Episode, record
 from damian.world.config import BatteryConfig, MotionConfig, SourceConfig
@@ -36,12 +36,12 @@ MOTIONS = {
 SCENARIOS = {name: replace(SCENARIO, motion=motion) for name, motion in MOTIONS.items()}
 
 
-def played(path, scenario: ScenarioConfig, *span) -> Episode:
+def played(path, scenario: ScenarioConfig, *span) -> list[Episode]:
     @cache
     def node_of(n: int) -> Node:
         return Node(for_uavs(scenario, n), 3, reward_terms=True)
 
-    return episode_of(path, node_of, {}, *span)
+    return episodes_of(path, node_of, {}, *span)
 
 
 @pytest.fixture(scope="module", params=[pytest.param("instant", marks=pytest.mark.slow), "flights"])
@@ -66,7 +66,7 @@ def flown(tmp_path_factory, scenario) -> tuple:
 
 @pytest.fixture(scope="module")
 def told(flown, scenario) -> Episode:
-    return played(flown[1], scenario)
+    return played(flown[1], scenario)[0]
 
 
 def test_a_journal_tells_what_the_server_knew_bit_for_bit(flown, told):
@@ -121,7 +121,7 @@ def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
     first = int(np.flatnonzero(told.reward.any(-1))[0])
     last = first + 10
     span = told.time[first], told.time[last]
-    part = played(flown[1], scenario, span)
+    (part,) = played(flown[1], scenario, span)
     assert part.n_steps == last - first
     assert part.time[0] == 0
     assert np.array_equal(part.true, told.true[first : last + 1])
@@ -141,7 +141,7 @@ def test_a_journal_without_a_flight_is_refused(tmp_path):
         played(path, SCENARIO)
 
 
-def test_uavs_that_join_and_leave_are_in_the_flight(tmp_path):
+def test_another_episode_begins_when_uavs_join_and_leave(tmp_path):
     ground = Node(SCENARIO, 3).ground
 
     def reports(now: float, *uavs: int) -> dict:
@@ -150,34 +150,12 @@ def test_uavs_that_join_and_leave_are_in_the_flight(tmp_path):
             row["lat"], row["lon"] = ground.place(100 * i)
         return {"received": now, "reports": rows}
 
-    first, *_, last = names_of(4)
+    first, *others, last = names_of(4)
     members = {"join": [last], "leave": [first], "received": 1005.0}
-    lines = [reports(1000.0, 0, 1, 2), members, reports(1007.0, 1, 3), {"asked": 1012.0, "told": {}}]
-    path = write_journal(tmp_path / "x.jsonl", *lines, uavs=names_of(3))
-    episode = played(path, replace(SCENARIO, observation=ObservationConfig()))
-    assert episode.names == names_of(4)
-    assert episode.age[-1].tolist() == [0.0, 5.0, 12.0, 5.0]
-    assert np.array_equal(episode.believed[-1, 3], ground.points[300].astype(np.float32))
-
-
-@pytest.mark.parametrize("accepted", [True, False])
-def test_a_uav_in_flight_is_bound_for_where_it_was_told_and_has_accepted(tmp_path, accepted):
-    ground = Node(SCENARIO, 3).ground
-
-    def row(uav: str, now: float, point: int, **more) -> dict:
-        lat, lon = ground.place(point)
-        return {"ID": uav, "time": now, "lat": lat, "lon": lon, **more}
-
-    lat, lon = ground.place(400)
-    lines = [
-        {"received": 1000.0, "reports": [row(uav, 1000.0, 200) for uav in names_of(3)]},
-        {"asked": 1001.0, "told": {}, "advice": [{"ID": "uav-0", "answer": "a", "lat": lat, "lon": lon}]},
-        {"received": 1002.0, "acknowledged": [{"answer": "a", "status": "accepted"}] * accepted},
-        {"received": 1004.0, "reports": [row("uav-0", 1004.0, 250, FLA=20)]},
-        {"received": 1009.0, "reports": [row("uav-0", 1009.0, 300)]},
-    ]
-    path = write_journal(tmp_path / "x.jsonl", *lines, uavs=names_of(3))
-    episode = played(path, replace(SCENARIO, observation=ObservationConfig()))
-    goal = ground.points[400 if accepted else 300]
-    np.testing.assert_allclose(episode.target[4, 0], goal, atol=0.01)
-    np.testing.assert_allclose(episode.target[-1, 0], ground.points[300], atol=0.01)
+    lines = [reports(1000.0, 0, 1, 2), members, reports(1007.0, 1, 3), reports(1009.0, 2)]
+    path = write_journal(tmp_path / "x.jsonl", *lines, {"asked": 1012.0, "told": {}}, uavs=names_of(3))
+    before, after = played(path, replace(SCENARIO, observation=ObservationConfig()))
+    assert (before.names, after.names) == ([first, *others], [*others, last])
+    assert (before.n_steps, after.n_steps) == (0, 3)
+    assert after.age[-1].tolist() == [5.0, 3.0, 5.0]
+    assert np.array_equal(after.believed[-1, 2], ground.points[300].astype(np.float32))

@@ -71,15 +71,6 @@ def recurrent(env):
     return actor
 
 
-def take(tracker: Tracker, rows: list[dict[str, Any]], now: float) -> None:
-    """Let rows come in now."""
-    for _ in tracker.advance(now):
-        pass
-    for _, report in read_json(rows) if rows else ():
-        report.stamp(now)
-        tracker.report(report)
-
-
 @pytest.mark.sample(4)
 @pytest.mark.parametrize(
     ("task", "fraction"), [*((task, 0.0) for task in TASKS), ("late", 0.7), ("flights", 0.7)]
@@ -87,20 +78,25 @@ def take(tracker: Tracker, rows: list[dict[str, Any]], now: float) -> None:
 def test_it_observes_what_the_simulation_does_bit_for_bit(task, fraction):
     scenario = scenario_of(**TASKS[task])
     env = make_env(scenario, 1, 3, extras=["message"])
-    node, policy, n_spotted = Node(scenario, 3), greedy_policy(env), 0
-    tracker, shown = Tracker(names_of(3), lambda _: node), env.reset()
-    reporter = Reporter(env, node.ground, fraction)
-    reporter.send(shown, 0, at_once=True)
+    node, policy, n_spotted, rows = Node(scenario, 3), greedy_policy(env), 0, []
+    seen, reporter = [env.reset()], Reporter(env, node.ground, fraction)
+    reporter.send(seen[0], 0, at_once=True)
     for step in range(90 if task == "flights" else 40):
-        take(tracker, reporter.arriving(step), reporter.time_of(step) + 0.2 * reporter.dt)
-        read = tracker.observe()
+        now = reporter.time_of(step) + 0.2 * reporter.dt
+        came = reporter.arriving(step)
+        rows += [(where, report) for where, report in (read_json(came) if came else [])]
+        for _, report in rows[len(rows) - len(came) :]:
+            report.stamp(now)
+        seen.append(env.step(policy(seen[-1].clone()))["next"])
+        reporter.send(seen[-1], step + 1)
+    tracker = Tracker(node, names_of(3), rows)
+    for step, (read, shown) in enumerate(zip(tracker.steps(now), seen, strict=False)):
         for key in (keys.OBSERVATION, keys.TIMELINE, keys.BELIEF):
             if key in shown.keys(True):
                 assert torch.equal(read[key], shown[key]), (step, key)
         assert torch.equal(read[keys.RECEIVED], shown.get(keys.RECEIVED, shown[keys.MESSAGE])), step
         n_spotted += sum(held.spotted for held in tracker.held.values())
-        shown = env.step(policy(shown))["next"]
-        reporter.send(shown, step + 1)
+    assert step == len(seen) - 2
     assert n_spotted > 0
 
 
@@ -136,83 +132,55 @@ def test_who_is_in_flight_is_not_advised():
     assert {each.age for each in answers} == {1.0}
 
 
-def tracker_of(**changed) -> Tracker:
-    node = Node(scenario_of(**changed), 3)
-    return Tracker(["a", "b", "c"], lambda _: node)
+def told(uav: str, time: float, point: int, received: float | None = None, **more) -> dict[str, Any]:
+    """A report of a UAV at a landing point, which comes in a tenth of a second later."""
+    came = time + 0.1 if received is None else received
+    return {"uav": uav, "time": time, "point": point, "receive_time": came, **more}
 
 
-def tell(tracker: Tracker, uav: str, time: float, point: int, received: float | None = None, **more) -> None:
-    lat, lon = tracker.node.ground.place(point)
-    row = Report(**{"id": uav, "time": time, "lat": lat, "lon": lon, **more})
-    row.stamp(time + 0.1 if received is None else received)
-    for _ in tracker.advance(row.received):
+FIRST = [told(uav, START, 200 + i) for i, uav in enumerate("abc")]
+
+
+def followed(*reports: dict[str, Any], until: float, **changed) -> Tracker:
+    """What the server node knows at an instant [s] from the first reports of three UAVs and these."""
+    node, rows = Node(scenario_of(**changed), 3), []
+    for said in [*FIRST, *reports]:
+        lat, lon = node.ground.place(said["point"])
+        more = {name: value for name, value in said.items() if name not in ("uav", "point")}
+        rows.append(("", Report(**more, id=said["uav"], lat=lat, lon=lon)))
+    tracker = Tracker(node, ["a", "b", "c"], rows)
+    for _ in tracker.steps(until):
         pass
-    tracker.report(row)
-
-
-def begun(**changed) -> Tracker:
-    """One that has begun."""
-    tracker = tracker_of(**changed)
-    for i, uav in enumerate(tracker.uavs):
-        tell(tracker, uav, START, 200 + i)
     return tracker
 
 
-@pytest.mark.parametrize("task", ["belief", "clocks", "held back"])
-def test_a_long_silence_is_skipped_without_a_difference(task, monkeypatch):
-    monkeypatch.setattr("damian.field.tracker.SILENT_STEPS", 40)
-    seen = []
-    for first in (10**9, 0):  # skipped, and step by step
-        tracker = begun(**TASKS[task])
-        tell(tracker, "b", START + 4, 30, START + 5.5, source_spotted=True)
-        assert len([*tracker.advance(START + 130, first)]) == (0 if first else 125)
-        tell(tracker, "a", START + 131.5, 17, source_spotted=True)
-        assert [*tracker.advance(START + 140)] == []
-        seen.append(tracker.observe())
-    for key in (keys.OBSERVATION, keys.RECEIVED):
-        assert torch.equal(seen[0][key], seen[1][key])
-
-
 def test_a_scenario_that_holds_messages_holds_reports_until_its_longest_delay():
-    tracker = begun(**TASKS["held back"])
-    tell(tracker, "a", START + 3, 7)
     for second, point in ((6, 200), (7, 7)):
-        assert [*tracker.advance(START + second)] == []
+        tracker = followed(told("a", START + 3, 7), until=START + second, **TASKS["held back"])
         assert tracker.held["a"].point == point
 
 
 def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
-    tracker = begun()
-    tell(tracker, "a", START + 5, 210)
-    tell(tracker, "a", START + 3, 205, START + 6, source_spotted=True)
-    tell(tracker, "a", START + 3, 100, START + 6)  # of the same time: it is known already
-    tell(tracker, "a", START - 3, 100, START + 6)  # before the start
-    assert [*tracker.advance(START + 7)] == []
-    held = tracker.held["a"]
+    reports = [
+        told("a", START + 5, 210),
+        told("a", START + 3, 205, START + 6, source_spotted=True),
+        told("a", START + 3, 100, START + 6),  # of the same time: it is known already
+        told("a", START - 3, 100, START + 6),  # before the start
+    ]
+    held = followed(*reports, until=START + 7).held["a"]
     assert (held.point, held.detected, held.detected_at) == (210, 3, 205)
-
-
-def test_uavs_leave_at_once_and_join_with_their_first_report():
-    tracker = Tracker(["a", "b", "c"], lambda n: Node(replace(scenario_of(), agents=n), 3))
-    for i, uav in enumerate(tracker.uavs):
-        tell(tracker, uav, START, 200 + i)
-    tracker.change_members(["d"], ["a"])
-    assert tracker.uavs == ["b", "c"]
-    tell(tracker, "d", START + 3, 7)
-    assert tracker.uavs == ["b", "c", "d"]
-    assert tracker.observe()[keys.RECEIVED].shape[1] == 3
-    assert [tracker.held[uav].point for uav in tracker.uavs] == [201, 202, 7]
 
 
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"uav": "d"}, "ID: 'd' is not a UAV of this fleet: a, b, c"),
-        ({"time": START + 60}, "time: 1700000060 s is 60.0 s after it came in"),
+        ({"time": START + 60}, "time: 1700000060 s is 59.9 s after it came in"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
+        ({"time": START + 2e6, "receive_time": START + 2e6}, "time: the first reports are more than 1e+06 s"),
     ],
 )
 def test_what_no_uav_can_say_is_refused(changed, message):
     with pytest.raises(InputError) as error:
-        tell(tracker_of(), point=3, received=START, **{"uav": "a", "time": START, **changed})
-    assert str(error.value).startswith(message)
+        followed(told("a", START, 3) | changed, until=START)
+    assert message in str(error.value)

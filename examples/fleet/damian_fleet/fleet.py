@@ -27,6 +27,7 @@ from damian.world.messages import Messages
 from damian.world.state import State
 from damian.world.vehicles import check_levels
 from damian_fleet.answers import Acknowledgement, Advice, FleetStatus, UavStatus
+from damian_fleet.idle import diffuses, held_back, settles, skip
 from damian_fleet.known import UavLog
 from damian_fleet.orders import (
     ABORTED,
@@ -155,7 +156,10 @@ class Fleet:
         return math.floor((time - (self.start or 0.0)) / self.node.dt + _ROUNDING)
 
     def check(self, report: Report, now: float | None = None) -> None:
-        """Check a report before it is added, at the time ``now`` [s], or None for one that is recorded."""
+        """Check a report before it is added, at the time ``now`` [s], or None for one that is recorded.
+
+        A report from a flight says then where the UAV was sent, if it does not say that itself.
+        """
         log = self.joining.get(report.id) or self.logs[self.number_of(report.id)]
         came = report.received if now is None else now
         for name, time in (("time", report.time), ("source time", report.source_time)):
@@ -164,6 +168,14 @@ class Fleet:
                 raise InputError(f"{name}: {late}: set the clock of the UAV")
         self._check_life(report.received)
         log.check(report)
+        if report.flies and report.place("target_") is None and (sent := self._sent(report)):
+            for column, value in zip(self.ground.columns, self.ground.place(sent.goal), strict=True):
+                setattr(report, f"target_{column}", value)
+
+    def _sent(self, report: Report) -> Decision | None:
+        """What the UAV of a report had followed last when the report was generated."""
+        told = self.told[self.number[report.id]] if report.id in self.number else []
+        return next((each for each in reversed(told) if each.time < report.time), None)
 
     def number_of(self, uav: str, key: str = "ID") -> int:
         """Number of a UAV of the fleet."""
@@ -199,8 +211,8 @@ class Fleet:
             return "old"
         now = self.step_of(self.clock)
         step = min(self.step_of(report.time), now)
-        sent = next((each for each in reversed(self.told[uav]) if each.time < report.time), None)
-        filled = log.add(report, step, self._detected(report), sent and (sent.origin, sent.goal))
+        sent = self._sent(report)
+        filled = log.add(report, step, self._detected(report), sent and sent.origin)
         self._note_flight(uav, filled)
         due = max(now, self.step)
         if self.node.scenario.delay.hold == "max":
@@ -260,7 +272,7 @@ class Fleet:
     @property
     def changes_by_itself(self) -> bool:
         """Whether steps must be taken one by one, even if nothing is reported."""
-        return self.node.diffuses or self.hidden is not None
+        return diffuses(self.node) or self.hidden is not None
 
     def advance(self, now: float) -> None:
         """Take all steps up to an instant [s]."""
@@ -268,14 +280,14 @@ class Fleet:
         if self.start is None:
             return
         last = self.step_of(now)
-        settles = SILENT_STEPS if self.changes_by_itself else self.node.settles
-        skipped = last - self.node.held_back
+        settled = SILENT_STEPS if self.changes_by_itself else settles(self.node)
+        skipped = last - held_back(self.node)
         while self.step < last:
-            quiet = self.step >= self.last_arrival + settles
+            quiet = self.step >= self.last_arrival + settled
             quiet = quiet and self.step < skipped and self.before is not None
             if quiet and not self.chosen.any() and not self.previous[1].any():
                 following = min([skipped, *(due for due, _, _ in self.pending)])
-                self.before = self.node.skip(cast(Memories, self.before), following - self.step)
+                self.before = skip(self.node, cast(Memories, self.before), following - self.step)
             else:
                 if self.hidden is not None and self.hidden_after is self.hidden:
                     _, self.hidden_after = self.ask_policy([])  # hidden states change in every step

@@ -16,6 +16,7 @@ from damian.field.rows import Report
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.world.config import ActionConfig, MotionConfig, RegionConfig, SourceConfig
 from damian_fleet.fleet import Fleet, Waiting
+from damian_fleet.idle import settles
 from damian_fleet.orders import GRACE
 
 LLANBEDR = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
@@ -127,7 +128,9 @@ def test_after_a_long_silence_it_does_not_matter_when_somebody_asked(task, monke
     monkeypatch.setattr("damian_fleet.fleet.SILENT_STEPS", SILENT)
     fleets = [begun(**TASKS[task]) for _ in range(2)]
     if task != "belief":
-        fleets[0].node.settles = 10**9  # so that it skips none
+        never = fleets[0].node  # it skips no step
+        settled = "damian_fleet.fleet.settles"
+        monkeypatch.setattr(settled, lambda node: 10**9 if node is never else settles(node))
     for fleet in fleets:
         told(fleet, "b", START + 4, 30, START + 5.5, source_spotted=True)
         advise(fleet, START + 6, ["c"])

@@ -4,7 +4,7 @@ import ast
 from pathlib import Path
 
 FILES = sorted((Path(__file__).parents[1] / "damian_fleet").rglob("*.py"))
-ROOMS = ("baselines", "common", "field", "keys", "learners", "runs", "show", "world")
+ROOMS = ("baselines", "common", "envs", "field", "keys", "learners", "runs", "show", "transforms", "world")
 """Rooms of damian whose names it uses, beside those of ``damian`` itself."""
 
 

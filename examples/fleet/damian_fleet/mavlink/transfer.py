@@ -76,12 +76,12 @@ class Truth:
                 continue  # it is silent in flight
             if copter.landed and len(copter.flights) == len(bridge.flights):
                 del stops[:1]  # the bridge knows that it has landed here
-            row, sent = {"ID": bridge.uav, "time": flying.now, "previous": stops}, None
+            row = {"ID": bridge.uav, "time": flying.now, "previous": stops}
             if not copter.landed:
-                at, near, goal = copter.start, self.node.ground.landing_point, bridge.goal
-                sent = near(at), near((goal.lat, goal.lon)) if goal else near(at)
-                row |= {"FLA": 1.0, "previous": stops[1:]}
-            log.add(validated(Report, row | {"lat": at[0], "lon": at[1]}), step, None, sent)
+                at, goal = copter.start, bridge.goal
+                target = (goal.lat, goal.lon) if goal else at
+                row |= {"FLA": 1.0, "previous": stops[1:], "target lat": target[0], "target lon": target[1]}
+            log.add(validated(Report, row | {"lat": at[0], "lon": at[1]}), step, None)
         held = [log.newest for log in self.logs]
         points = self.node.simulation.airspace.points[0]
         self.steps.append(messages_of(held, self.node.server, points, dt))
