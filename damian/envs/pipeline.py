@@ -9,7 +9,6 @@ What a step passes, in this order (a transform is there only if the scenario ask
     reward -> RewardDelay -> CumulativeReward
     observation -> SampleAndHold (server) -> ObservationDelay (broadcast) -> SampleAndHold (agents)
                 -> ActionHistory -> policy
-    With clock.skip, DelayedEnv repeats all of it until a UAV can choose again.
 """
 
 from collections.abc import Collection
@@ -23,7 +22,7 @@ from damian import keys
 from damian.common import checks
 from damian.delays.scenario import CONTEXT_KEYS
 from damian.envs.config import ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv, Skip
+from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import Belief, OnboardNode, ServerNode
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
@@ -58,16 +57,11 @@ def make_env(
     ``earned_reward``, all under ``"agents"``.
     """
     extras = checks.names("extras", extras, ALL_EXTRAS)
-    problem = "skips steps, but back-updating and evaluation need the messages of every step"
-    checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
-    remote, skips = has_server_node(scenario), scenario.clock.skip
+    remote = has_server_node(scenario)
     needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
-    needed |= {*["position"] * scenario.delays.reads_positions, *["duration"] * skips}
+    needed |= {*["position"] * scenario.delays.reads_positions}
     env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
-    names = scenario.reward.terms if "reward_terms" in extras else []
-    rewards = [keys.REWARD, *((*keys.REWARD_TERMS, name) for name in names)]
-    skip = Skip(scenario.clock.skip_discount, rewards) if skips else None
-    pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras), skip)
+    pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras))
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
     pipeline.set_seed(seed)

@@ -32,7 +32,7 @@ Bounds = dict[NestedKey, tuple[Tensor, Tensor]]
 EXTRAS = ("message", "state", "reward_terms")
 """Default optional outputs."""
 
-ALL_EXTRAS = (*EXTRAS, "position", "privileged", "duration")
+ALL_EXTRAS = (*EXTRAS, "position", "privileged")
 """All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments only."""
 
 
@@ -55,18 +55,17 @@ class UavEnv(EnvBase):
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
     At the root lie ``state`` (the simulator's truth, never for an actor), ``success``, and TorchRL's
-    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over``, and as an
-    extra the ``duration`` of a step in simulation steps, 1 or after a reset 0, [B, 1]. A step
-    also reads the flag ``("agents", "action_valid")`` [B, N], if it exists: a UAV with a false flag does not
-    act; and TorchRL's ``_step`` [B].
+    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over`` [B, 1]. A
+    step also reads the flag ``("agents", "action_valid")`` [B, N], if it exists: a UAV with a false flag does
+    not act; and TorchRL's ``_step`` [B].
 
     Args:
         scenario: all settings; the defaults if not given.
         num_worlds: number of parallel environments, B.
         seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
         device: of all tensors.
-        extras: which of ``message``, ``state``, ``reward_terms``, ``position``, ``duration`` and (reference
-            experiments only) ``privileged`` are output; each costs time. Delays need ``message``.
+        extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and (reference experiments
+            only) ``privileged`` are output; each costs time. Delays need ``message``.
         messages_only: a step outputs no observation, reward or end: a ``ServerNode`` computes them.
     """
 
@@ -237,8 +236,6 @@ class UavEnv(EnvBase):
             outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, features)
         if self.scenario.episode.end_with_source:
             outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
-        if "duration" in self.extras:
-            outputs[keys.DURATION] = torch.ones_like(state.steps).view(-1, 1)
         if "state" in self.extras:
             _, emits, _ = self.simulation.source_now(state)
             outputs[keys.STATE] = Truth(state.position, state.battery, emits, state.source).pack()
@@ -259,8 +256,6 @@ class UavEnv(EnvBase):
         if "reward_terms" in self.extras:
             zero = torch.zeros_like(initial.track)
             outputs |= {(*keys.REWARD_TERMS, name): zero for name in self.scenario.reward.terms}
-        if "duration" in self.extras:
-            outputs[keys.DURATION] = torch.zeros_like(initial.steps).view(-1, 1)
         false = torch.zeros_like(initial.source_over).unsqueeze(-1)
         return outputs | dict.fromkeys((*keys.ENDS, keys.SUCCESS), false)
 
