@@ -171,10 +171,6 @@ class Belief(WorldTransform):
         self.server, self.longest, self.delayed, self.own = server, longest, delayed, own
         self.step_keys = reads
 
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return dict.fromkeys(("belief", "same_as_server", "report", "delay"), 2)
-
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]
         return empty_window(self.grid, self.longest, n_worlds, n_agents, self.own)._asdict()
@@ -271,7 +267,7 @@ def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, age
 
 def after_idle_steps(transform: StatefulTransform, memory: Memory, n_steps: int) -> Memory:
     """The memory after steps in which no message arrived and no agent chose an action; beliefs stay."""
-    counted = {name: memory[name] + n_steps for name in ("elapsed", "since", "age") if name in memory}
+    counted = {name: memory[name] + n_steps for name in ("elapsed", "since") if name in memory}
     if isinstance(transform, SampleAndHold):
         counted["elapsed"] = counted["elapsed"] % transform.period
     return memory | counted

@@ -20,7 +20,6 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
-from damian.delays.scenario import CONTEXT_KEYS
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import Belief, OnboardNode, ServerNode
@@ -89,10 +88,9 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
         act,
         keys.ACTION,
         default=hold_action(scenario.actions),
-        dt=clock.dt,
         sent_key="ready",
         valid_key=keys.ACTION_VALID,
-        context_keys=CONTEXT_KEYS,
+        **scenario.delays.told,
     )
     return [late]
 
@@ -108,11 +106,10 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
             keys.MESSAGE,
             keys.RECEIVED,
             order=scenario.delay.order,
-            dt=scenario.clock.dt,
             sent_key=keys.MESSAGE_SENT,
             age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
             delay_key=keys.DELAY if output_messages or remembers else None,
-            context_keys=CONTEXT_KEYS,
+            **scenario.delays.told,
         )
         transforms.append(uplink)
     longest = scenario.delays.obs.longest if delayed else 0
@@ -170,7 +167,6 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         hears=links.hears,
         comm_range=links.range,
         position_key=keys.POSITION if delays.links.reads or links.range is not None else None,
-        limit=links.limit,
         sent_key=keys.MESSAGE_SENT,
         known_at_reset=True,
         dt=scenario.clock.dt,
@@ -191,10 +187,9 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
         late = RewardDelay(
             delays.rew,
             keys.REWARD,
-            dt=scenario.clock.dt,
-            context_keys=CONTEXT_KEYS,
             delay_key=keys.REWARD_DELAY if reported else None,
             earned_key=earned_key,
+            **delays.told,
         )
         transforms.append(late)
     if delay.reward_window > 1:
@@ -214,9 +209,8 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
             scenario.delays.links,
             keys.OBSERVATION,
             order=scenario.delay.order,
-            dt=clock.dt,
             age_key=None,
-            context_keys=CONTEXT_KEYS,
+            **scenario.delays.told,
         )
         transforms.append(downlink)
     if clock.steps("agents") > 1:
