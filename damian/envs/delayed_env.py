@@ -13,7 +13,7 @@ from damian import keys
 from damian.common import devices
 from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask
-from damian.envs.nodes import WorldTransform
+from damian.envs.nodes import Drop
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
 from damian.transforms.base import Memory, StatefulTransform
@@ -221,7 +221,7 @@ class DelayedEnv(TransformedEnv):
 
 def _without_dropped(outputs: Outputs, transforms: Sequence[StatefulTransform]) -> Outputs:
     """The outputs without those that a transform drops."""
-    dropped = {key for each in transforms if isinstance(each, WorldTransform) for key in each.dropped_keys}
+    dropped = {key for each in transforms if isinstance(each, Drop) for key in each.dropped_keys}
     return {key: value for key, value in outputs.items() if key not in dropped} if dropped else outputs
 
 

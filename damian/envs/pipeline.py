@@ -22,7 +22,7 @@ from damian import keys
 from damian.common import checks
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.nodes import Belief, OnboardNode, ServerNode
+from damian.envs.nodes import Belief, Drop, OnboardNode, ServerNode
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
 from damian.transforms import (
@@ -38,7 +38,8 @@ from damian.transforms import (
 from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
-_SENT = [keys.MESSAGE, keys.MESSAGE_SENT]
+_REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.BELIEF, keys.OWN_BELIEF]
+"""Entries that only the extra ``message`` outputs."""
 
 
 def make_env(
@@ -69,13 +70,16 @@ def make_env(
 
 def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
     """All transforms of a scenario in order: outputs pass them forwards, a policy's actions backwards."""
+    hear_each_other = scenario.links.kind == "matrix"
     transforms = [
         *action_transforms(scenario),
         *(server_transforms(scenario, server, extras) if has_server_node(scenario) else []),
-        *(link_transforms(scenario, server, extras) if scenario.links.kind == "matrix" else []),
+        *(link_transforms(scenario, server) if hear_each_other else []),
         *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
     ]
+    if hear_each_other or (has_server_node(scenario) and "message" not in extras):
+        transforms.append(Drop([keys.LINKED, *([] if "message" in extras else _REPORTED)]))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
@@ -114,16 +118,8 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         transforms.append(uplink)
     longest = scenario.delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
-    dropped = []
-    if not output_messages:  # the server node drops what only it and the transforms before it read
-        kept = (keys.TIMELINE, keys.AGE)  # which an action history reads
-        written = [key for each in transforms for key in each.out_keys if key not in kept]
-        dropped = [*([] if scenario.links.kind == "matrix" else _SENT), *written]
     held = keys.RECEIVED if delayed else keys.MESSAGE
-    return [
-        *transforms,
-        ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras),
-    ]
+    return [*transforms, ServerNode(server, held, reward_terms="reward_terms" in extras)]
 
 
 def remembering_transforms(
@@ -157,7 +153,7 @@ def scaled_messages(server: Server, rows: Tensor) -> Tensor:
     return torch.cat([messages.position / scale, way / scale, flags], -1)
 
 
-def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
+def link_transforms(scenario: ScenarioConfig, server: Server) -> list[Transform]:
     """The links over which UAVs hear each other, and the nodes that compute observations on board."""
     links, delays = scenario.links, scenario.delays
     channel = Channel(
@@ -173,8 +169,7 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         age_key=None,
         mask_key=None,
     )
-    dropped = [keys.LINKED, *([] if "message" in extras else _SENT)]
-    return [channel, OnboardNode(server, dropped_keys=dropped)]
+    return [channel, OnboardNode(server)]
 
 
 def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
