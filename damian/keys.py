@@ -70,8 +70,6 @@ expect one reset key."""
 ENDS = (DONE, TERMINATED, TRUNCATED)
 STEPPED = "_step"
 """TorchRL's flag of the worlds that take this step, [B] bool; all of them if there is no such entry."""
-DURATION = "duration"
-"""Number of simulation steps of this step, more than 1 with ``clock.skip``, [B, 1] long."""
 
 # Data collection and learning.
 STEP_COUNT = "step_count"

@@ -13,7 +13,6 @@ def main(n_worlds: int = 64, n_steps: int = 100) -> dict[str, tuple[float, float
     """Print, and return, the share of others heard of and the mean age of their messages, by channel."""
     channels = {
         "direct": Channel(Uniform(1, 5), loss=0.2, seed=0),
-        "one sends at once": Channel(Uniform(1, 5), loss=0.2, limit=1, seed=0),
         "within 0.8 m": Channel(Uniform(1, 5), loss=0.2, comm_range=0.8, position_key="observation", seed=0),
     }
     results = {}

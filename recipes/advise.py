@@ -50,14 +50,14 @@ def advise(config: AdviseConfig, folder: Path) -> None:
 
 def answer_table(config: AdviseConfig, folder: Path) -> None:
     """Print where each UAV of a table should land next, and write it into the run folder."""
-    scenario_of_reports(config.eval_scenario)
+    scenario_of_reports(config)
     check_motion(config)
     if config.observation.own and config.learnt:
         print("note: the policy knew a UAV's own messages at once; here they are known when they arrive")
     with named(path := Path(str(config.table))):
         rows = read_file(path)
         n_uavs = len({report.id for _, report in rows})
-        node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed)
+        node = Node(for_uavs(config, n_uavs), config.seed)
         policy = stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
         answers = next_landings(rows, node, policy, time.time(), config.flown == "sampled")
     save_config(config, folder)

@@ -89,17 +89,6 @@ class TrainConfig(ScenarioConfig):
         return self.clock.steps("system") if self.clock.system else self.learner.steps
 
     @property
-    def eval_scenario(self) -> ScenarioConfig:
-        """The scenario of an evaluation; it skips no steps, because every step is measured."""
-        return replace(self, clock=replace(self.clock, skip=False, skip_discount=1.0))
-
-    @property
-    def train_scenario(self) -> ScenarioConfig:
-        """The scenario of the training; rewards of skipped steps are discounted by ``learner.gamma``."""
-        discount = self.learner.gamma if self.clock.skip else 1.0
-        return replace(self, clock=replace(self.clock, skip_discount=discount))
-
-    @property
     def eval_seed(self) -> int:
         """Seed of the initial conditions of an evaluation; they differ from those of the training."""
         return self.seed + 10_000

@@ -101,7 +101,7 @@ def load(
         config = with_policy_of(values, words)
         check_components(config)  # imports all of the user's own that is ever needed
         eval_seed = config.eval_seed if seed is None else seed
-        env = make_env(config.eval_scenario, worlds, eval_seed, config.device)
+        env = make_env(config, worlds, eval_seed, config.device)
         policy = stored_actor(config, env).eval().requires_grad_(False)
     add_recurrent_state(env, policy)
     kind = InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
@@ -111,7 +111,7 @@ def load(
 
 def make_eval_env(config: TrainConfig) -> DelayedEnv:
     """The environment of an evaluation, a world for each episode; its initial conditions are new."""
-    return make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, ["message"])
+    return make_env(config, config.eval_episodes, config.eval_seed, config.device, ["message"])
 
 
 def report(

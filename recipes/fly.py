@@ -41,7 +41,7 @@ def fly(config: FlyConfig) -> list[Episode]:
     """Fly ``eval_episodes`` episodes, or take those that the journal tells."""
     if config.journal is not None:
         return episodes_of_journal(config)
-    env = make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
+    env = make_env(config, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
     likely = config.flown == "deterministic"
     if config.learnt:
         policy: TensorDictModuleBase = stored_actor(config, env)
@@ -61,7 +61,7 @@ def episodes_of_journal(config: FlyConfig) -> list[Episode]:
 
     @cache
     def node_of(n_uavs: int) -> Node:
-        return Node(for_uavs(config.eval_scenario, n_uavs), config.seed, reward_terms=True)
+        return Node(for_uavs(config, n_uavs), config.seed, reward_terms=True)
 
     first, last = config.span or (0.0, math.inf)
     about = {"overrides": list(config.overrides)}

@@ -146,20 +146,6 @@ class Drift(EnvBase):
         """The environment has no randomness."""
 
 
-class Servos(Drift):
-    """``Drift``, pushed by the sum of two entries of an action: a place and the index of a gear."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.action_spec = Composite(
-            place=Bounded(-1.0, 1.0, (3, 2)), gear=Categorical(5, shape=(3,)), shape=(3,)
-        )
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        pushed = tensordict["place"] + tensordict["gear"].unsqueeze(-1)
-        return super()._step(TensorDict({"action": pushed}, [3]))
-
-
 cartpole, uavs = KINDS["CartPole"].make, KINDS["UAVs"].make
 
 

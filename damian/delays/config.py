@@ -70,9 +70,6 @@ class LinkConfig(Settings):
         kinds=("matrix",),
     )
     hears: Any = setting(None, "Whom UAVs hear: per receiver a list of true and false.", kinds=("matrix",))
-    limit: int | None = setting(
-        None, "At most so many UAVs of a world, drawn, send in a step.", low=1, high=1000, kinds=("matrix",)
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -321,8 +321,7 @@ class Distance(Law):
         in_steps(f"{key}.base", self.base, dt)  # refuses what is not a delay
         base = _exact_steps(f"{key}.base", self.base, dt)
         loses, compute = math.isfinite(self.range), partial(self.delays, base)
-        reads = {"reads": ["position"], "optional_reads": ["receiver_position"]}
-        return ContextSampler(compute, longest, loss, loses=loses, **reads)
+        return ContextSampler(compute, longest, loss, loses=loses, reads=["position"])
 
     def delays(self, base: float, context: MessageContext) -> Tensor:
         """Delay of each of M messages [steps], [M], -1 if it is lost; ``base`` is in steps, too."""

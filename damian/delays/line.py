@@ -75,10 +75,6 @@ class DelayLine:
             memory[f"held_{i}"] = value.clone()
         return memory
 
-    def row_dims(self, n_values: int) -> dict[str, int]:
-        """The dimension of the senders in the buffers in which it is not the first."""
-        return {"stamps": 1} | {f"slots_{i}": 1 for i in range(n_values)}
-
     def reset(self, memory: Memory, values: list[Tensor], mask: Tensor) -> tuple[Memory, Delivery]:
         """Where the mask [M] is true, hold ``values`` [M, ...] and discard all messages in transit."""
         clock = memory["clock"]

@@ -49,8 +49,6 @@ class Sampler(nn.Module, ABC):
     """Whether a delay depends on the message's context."""
     reads: tuple[str, ...] = ()
     """Names of the entries that the context must contain."""
-    optional_reads: tuple[str, ...] = ()
-    """Names of the entries that the context contains where the transform has a key for them."""
     same_draws_for_all_agents: bool = False
     """Whether all agents of a world draw the same numbers."""
     constant_delay: int | None = None
@@ -192,7 +190,6 @@ class HeldSampler(Sampler):
     def __init__(self, drawn: Sampler) -> None:
         super().__init__(drawn.longest, drawn.loses)
         self.drawn, self.sees_context, self.reads = drawn, drawn.sees_context, drawn.reads
-        self.optional_reads = drawn.optional_reads
         self.same_draws_for_all_agents = drawn.same_draws_for_all_agents
         self.constant_delay = None if self.loses else self.longest
 
@@ -267,8 +264,8 @@ class ContextSampler(Sampler):
         loss: probability that a message is lost, whatever its delay.
         loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, as rewards
             need it.
-        reads, optional_reads: names of the entries that ``delay_fn`` reads, such as ``position``, always or
-            if the transform has a key for them.
+        reads: names of the entries that ``delay_fn`` must get, such as ``position``; it gets all those for
+            which the transform has a key.
 
     Examples:
         >>> ContextSampler(lambda context: context.n_sending // 4, longest=5, loses=False)
@@ -282,10 +279,9 @@ class ContextSampler(Sampler):
         *,
         loses: bool = True,
         reads: Sequence[str] = (),
-        optional_reads: Sequence[str] = (),
     ) -> None:
         super().__init__(longest, loses, loss)
-        self.sees_context, self.reads, self.optional_reads = True, tuple(reads), tuple(optional_reads)
+        self.sees_context, self.reads = True, tuple(reads)
         self._delay_fn, self._lost_if_negative = delay_fn, loses
 
     def forward(

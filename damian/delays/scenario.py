@@ -1,13 +1,12 @@
 """The delays of a scenario as one object, whose laws are resolved once from the settings."""
 
+from typing import Any
+
 from damian import keys
 from damian.common import checks
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.laws import LOSES, link_sampler, sampler_of
 from damian.delays.samplers import HeldSampler, Sampler
-
-CONTEXT_KEYS = {"position": keys.POSITION}
-"""TensorDict keys of the entries that a delay law of a scenario may read, by the name in ``reads``."""
 
 
 class ScenarioDelays:
@@ -33,12 +32,15 @@ class ScenarioDelays:
         }
         for key, sampler in laws.items():
             told_receiver = key == "links.delay" and links.kind == "matrix"
-            known = [*CONTEXT_KEYS, *["receiver_position"] * told_receiver]
+            known = ["position", *["receiver_position"] * told_receiver]
             for name in sampler.reads:
                 problem = f"reads {name}, but a law can read only {', '.join(known)}"
                 checks.require(name in known, key, type(sampler).__name__, problem)
         self.reads_positions = links.range is not None or any(sampler.reads for sampler in laws.values())
         """Whether a law, or the range of the links, needs to know where the UAVs are."""
+        context_keys = {"position": keys.POSITION} if self.reads_positions else {}
+        self.told: dict[str, Any] = {"dt": dt, "context_keys": context_keys}
+        """Arguments that every transform which delays something gets, beside its sampler."""
 
     @property
     def longest(self) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from damian.common import checks
-from damian.common.fields import Settings, constant, setting
+from damian.common.fields import Settings, setting
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import WorldConfig
@@ -32,10 +32,6 @@ class ClockConfig(Settings):
     )
     shortest: str | None = setting(None, "Shortest triggered period; ``trigger`` if not given.")
     longest: str | None = setting(None, "Longest triggered period; twice the first one if not given.")
-    skip: bool = setting(False, "Let a step last until some UAV can choose again.")
-    skip_discount: float = constant(
-        1.0, "Discount within a step that ``skip`` makes longer; a training sets it.", low=0, high=1
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -47,8 +43,6 @@ class ClockConfig(Settings):
         for name, faster in itertools.product(given, fast):
             self._check_multiple(name, faster)
         checks.in_range("clock.simulation", self.dt, 1e-3, 86_400, "s")  # a millisecond to a day
-        unread = not self.skip and self.skip_discount != 1
-        self.refuse(unread, "skip_discount", "means nothing without clock.skip=true")
         for name in given:
             self.refuse(self.trigger is None, name, "means nothing without clock.trigger")
 

@@ -2,18 +2,18 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian import keys
 from damian.common import devices
 from damian.common.compiling import CompiledMethods
-from damian.common.tensors import expand_mask, tree_where
-from damian.envs.nodes import WorldTransform
+from damian.common.tensors import expand_mask
+from damian.envs.nodes import Drop
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
 from damian.transforms.base import Memory, StatefulTransform
@@ -24,46 +24,16 @@ _BASE = "base_env."
 """Begin of the keys of the base environment in a ``state_dict``."""
 
 
-class Skip(NamedTuple):
-    """A step lasts until some agent can choose an action again, or the episode ends (``clock.skip``).
-
-    The outputs equal, bit for bit, those of stepping until then with actions that no agent executes. Only the
-    rewards ``reward_keys`` are the sums of gamma^k r_k over the merged steps k = 0, 1, ..., and ``duration``
-    is the number of these steps, as in a semi-Markov decision process (Sutton, Precup and Singh, 1999).
-    """
-
-    gamma: float
-    reward_keys: Sequence[NestedKey]
-
-    def skipped_worlds(self, outputs: Outputs) -> Tensor:
-        """Worlds in which no agent is ready after a step and the episode goes on, [B] bool."""
-        return ~(outputs[keys.READY].flatten(1).any(-1) | outputs[keys.DONE].view(-1))
-
-    def merged(self, outputs: Outputs, later: Outputs, stepped: Tensor) -> Outputs:
-        """The outputs with those of a later step in the worlds ``stepped`` [B] that took it."""
-        duration = outputs[keys.DURATION]
-        weight = (self.gamma**duration).view(-1)
-        sums = {k: outputs[k] + expand_mask(weight, later[k]) * later[k] for k in self.reward_keys}
-        later = later | sums | {keys.DURATION: duration + 1}
-        return {key: torch.where(expand_mask(stepped, new), new, outputs[key]) for key, new in later.items()}
-
-
 class DelayedEnv(TransformedEnv):
     """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function, with equal results.
 
     ``step_fn`` and ``reset_fn`` are that function: pure, of the worlds and of the transforms' memories. All
     leading transforms of damian's step in it; those after them, and steps of some worlds only (TorchRL's
-    ``_step``), go through TorchRL's hooks. With ``skip``, whose ``UavEnv`` outputs the extra ``duration``,
-    transforms that are appended later see only the merged steps: ``StepCounter`` then counts decisions.
+    ``_step``), go through TorchRL's hooks.
     """
 
     _compiled: CompiledMethods | None = None
     """The compiled methods; None if nothing is compiled."""
-
-    def __init__(self, env: UavEnv, transform: Compose, skip: Skip | None = None) -> None:
-        n_transforms = len(transform)
-        super().__init__(env, transform)
-        self.skip, self._n_skipping = skip, n_transforms
 
     @property
     def uav_env(self) -> UavEnv:
@@ -124,22 +94,19 @@ class DelayedEnv(TransformedEnv):
     # Pure functions of worlds and memories, which can be compiled.
 
     def step_fn(
-        self, worlds: PackedState, memories: list[Memory], entries: Entries, stepped: Tensor | None = None
+        self, worlds: PackedState, memories: list[Memory], entries: Entries
     ) -> tuple[PackedState, list[Memory], Outputs]:
-        """One step, in the worlds ``stepped`` [B] or all.
+        """One step: inputs pass the transforms backwards, outputs forwards.
 
-        Inputs pass the transforms backwards, outputs forwards. ``entries`` are those that a policy has
-        written, and those that it has read.
+        ``entries`` are those that a policy has written, and those that it has read.
         """
         transforms, changed = self._fused(), list(memories)
-        extra: Entries = {} if stepped is None else {keys.STEPPED: stepped}
-        entries = entries | extra
         for i, transform in reversed([*enumerate(transforms)]):
             changed[i], written = transform.on_action(changed[i], entries)
             entries = entries | written
         worlds, outputs = self.uav_env.step_fn(worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID))
         for i, transform in enumerate(transforms):
-            changed[i], written = transform.on_step(changed[i], outputs | extra)
+            changed[i], written = transform.on_step(changed[i], outputs)
             outputs = outputs | written
         return worlds, changed, _without_dropped(outputs, transforms)
 
@@ -169,35 +136,21 @@ class DelayedEnv(TransformedEnv):
             }
         return worlds, memories, outputs, following
 
-    def further_step_fn(
-        self, worlds: PackedState, memories: list[Memory], entries: Entries, outputs: Outputs, stepped: Tensor
-    ) -> tuple[PackedState, list[Memory], Outputs]:
-        """One more step of the worlds of the mask ``stepped`` [B], which have no ready agent; others stay."""
-        # Flags such as ``ready`` are those after the latest step.
-        entries = entries | {key: outputs[key] for key in entries if key in outputs}
-        new_worlds, new_memories, new_outputs = self.step_fn(worlds, memories, entries, stepped)
-        triples = zip(self._fused(), memories, new_memories, strict=True)
-        memories = [transform.merge_worlds(old, new, stepped) for transform, old, new in triples]
-        outputs = cast(Skip, self.skip).merged(outputs, new_outputs, stepped)
-        return tree_where(stepped, new_worlds, worlds), memories, outputs
-
     def _fused(self) -> list[StatefulTransform]:
         return self._split_transforms()[0]
 
     def _split_transforms(self) -> tuple[list[StatefulTransform], list[Transform]]:
         """The leading stateful transforms that step in one function, and every transform after them."""
         transforms: list[Any] = [*cast(Compose, self.transform)]
-        most = self._n_skipping if self.skip else len(transforms)
-        n = next((i for i, t in enumerate(transforms) if not isinstance(t, StatefulTransform)), most)
-        return transforms[: min(n, most)], transforms[min(n, most) :]
+        others = (i for i, each in enumerate(transforms) if not isinstance(each, StatefulTransform))
+        n = next(others, len(transforms))
+        return transforms[:n], transforms[n:]
 
     # Methods that TorchRL calls.
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if "_step" in tensordict or "next" in tensordict:
-            if self.skip:
-                raise RuntimeError("clock.skip: all worlds step together, so '_step' and 'next' mean nothing")
             return super()._step(tensordict)
         fused, others = self._split_transforms()
         if others:
@@ -208,9 +161,6 @@ class DelayedEnv(TransformedEnv):
         worlds, memories, outputs = self._compiled_fn("step_fn", *entries)(
             self.uav_env.worlds, memories, entries
         )
-        while self.skip is not None and (skipped := self.skip.skipped_worlds(outputs)).any():
-            step = self._compiled_fn("further_step_fn", *entries)
-            worlds, memories, outputs = step(worlds, memories, entries, outputs, skipped)
         self._store(fused, worlds, memories)
         result = self.uav_env.to_tensordict(outputs)
         for transform in others:
@@ -237,7 +187,7 @@ class DelayedEnv(TransformedEnv):
         """As TorchRL's, in one graph; what a policy has written stays after a reset."""
         fused, others = self._split_transforms()
         partial = "_step" in tensordict or "next" in tensordict or tensordict.device != self.device
-        if others or partial or self.skip:
+        if others or partial:
             return super()._step_and_maybe_reset(tensordict)
         self._assert_tensordict_shape(tensordict)
         env, (memories, entries) = self.uav_env, self._step_inputs(fused, tensordict)
@@ -271,7 +221,7 @@ class DelayedEnv(TransformedEnv):
 
 def _without_dropped(outputs: Outputs, transforms: Sequence[StatefulTransform]) -> Outputs:
     """The outputs without those that a transform drops."""
-    dropped = {key for each in transforms if isinstance(each, WorldTransform) for key in each.dropped_keys}
+    dropped = {key for each in transforms if isinstance(each, Drop) for key in each.dropped_keys}
     return {key: value for key, value in outputs.items() if key not in dropped} if dropped else outputs
 
 

@@ -28,22 +28,27 @@ from damian.world.coverage import KnownCoverage
 class WorldTransform(StatefulTransform):
     """Base class of transforms whose memory has a row for each world, whatever entries they read."""
 
-    dropped_keys: Sequence[NestedKey] = ()
-    """Keys of entries that are removed, because nothing reads them later and each one costs time."""
-
     @property
     def row_key(self) -> NestedKey:
         return keys.DONE
 
+
+class Drop(WorldTransform):
+    """Removes entries, as far as there are any, that nothing reads after it: each one costs time."""
+
+    stage = "history"
+
+    def __init__(self, dropped_keys: Sequence[NestedKey]) -> None:
+        super().__init__()
+        self.dropped_keys = dropped_keys
+
     def _write(self, tensordict: TensorDictBase, change: Change) -> TensorDictBase:
-        written = super()._write(tensordict, change)
-        for key in self.dropped_keys:
-            written.pop(key, None)
-        return written
+        return tensordict.exclude(*self.dropped_keys, inplace=True)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        for key in self.dropped_keys:
-            del observation_spec[key]
+        for key in [*observation_spec.keys(True, True)]:
+            if key in self.dropped_keys:
+                del observation_spec[key]
         return observation_spec
 
 
@@ -71,23 +76,17 @@ class ServerNode(_Node):
     Args:
         server: server node that does the computations.
         message_key: key of the packed messages that the server holds, [B, N, M].
-        dropped_keys: as in ``WorldTransform``.
         reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
     """
 
     def __init__(
-        self,
-        server: Server,
-        message_key: NestedKey = keys.RECEIVED,
-        *,
-        dropped_keys: Sequence[NestedKey] = (),
-        reward_terms: bool = False,
+        self, server: Server, message_key: NestedKey = keys.RECEIVED, *, reward_terms: bool = False
     ) -> None:
         names = server.reward.terms if reward_terms else []
         created = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.REWARD]
         created += [(*keys.REWARD_TERMS, name) for name in names]
         super().__init__([message_key], [*created, keys.SUCCESS, *keys.ENDS])
-        self.server, self.dropped_keys, self.reward_terms = server, list(dropped_keys), reward_terms
+        self.server, self.reward_terms = server, reward_terms
         self.own_key = keys.MESSAGE if server.observation.own else None
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + server.observation.own] if server.grid else []
         self.step_keys = existing([*self.in_keys, self.own_key, *self.belief_keys, keys.SOURCE_OVER])
@@ -114,22 +113,15 @@ class ServerNode(_Node):
         steps, messages = elapsed.view(self.rows), self.server.messages(received)
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
         outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, entries.get(keys.BELIEF))
+        written = outputs.entries(self.reward_terms)
         if self.own_key:
-            own = self.server.observe_with_own_messages(
+            written[keys.OBSERVATION] = self.server.observe_with_own_messages(
                 received, entries[self.own_key], steps, belief=entries.get(keys.OWN_BELIEF)
             )
-            outputs = outputs._replace(observation=own)
-        written: Entries = {
-            keys.OBSERVATION: outputs.observation,
-            keys.GLOBAL_OBSERVATION: outputs.global_observation,
-            keys.REWARD: outputs.reward.unsqueeze(-1),
-        }
-        if self.reward_terms:
-            written |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
         memory = {"elapsed": elapsed}
         if outputs.coverage is not None:
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
-        return memory, written | outputs.status.entries()
+        return memory, written
 
 
 class OnboardNode(_Node):
@@ -139,9 +131,9 @@ class OnboardNode(_Node):
     UAV knows the first message of every other. ``damian.make_env`` adds the transform with ``links=matrix``.
     """
 
-    def __init__(self, server: Server, *, dropped_keys: Sequence[NestedKey] = ()) -> None:
+    def __init__(self, server: Server) -> None:
         super().__init__(keys.LINKED, keys.OBSERVATION)
-        self.server, self.dropped_keys, self.step_keys = server, list(dropped_keys), self.in_keys
+        self.server, self.step_keys = server, self.in_keys
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed = memory["elapsed"] + 1
@@ -169,10 +161,6 @@ class Belief(WorldTransform):
         super().__init__(reads, [keys.BELIEF, *([keys.OWN_BELIEF] if own else [])])
         self.server, self.longest, self.delayed, self.own = server, longest, delayed, own
         self.step_keys = reads
-
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return dict.fromkeys(("belief", "same_as_server", "report", "delay"), 2)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]

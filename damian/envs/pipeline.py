@@ -9,7 +9,6 @@ What a step passes, in this order (a transform is there only if the scenario ask
     reward -> RewardDelay -> CumulativeReward
     observation -> SampleAndHold (server) -> ObservationDelay (broadcast) -> SampleAndHold (agents)
                 -> ActionHistory -> policy
-    With clock.skip, DelayedEnv repeats all of it until a UAV can choose again.
 """
 
 from collections.abc import Collection
@@ -21,10 +20,9 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
-from damian.delays.scenario import CONTEXT_KEYS
 from damian.envs.config import ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv, Skip
-from damian.envs.nodes import Belief, OnboardNode, ServerNode
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.nodes import Belief, Drop, OnboardNode, ServerNode
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
 from damian.transforms import (
@@ -40,7 +38,8 @@ from damian.transforms import (
 from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
-_SENT = [keys.MESSAGE, keys.MESSAGE_SENT]
+_REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.BELIEF, keys.OWN_BELIEF]
+"""Entries that only the extra ``message`` outputs."""
 
 
 def make_env(
@@ -58,16 +57,11 @@ def make_env(
     ``earned_reward``, all under ``"agents"``.
     """
     extras = checks.names("extras", extras, ALL_EXTRAS)
-    problem = "skips steps, but back-updating and evaluation need the messages of every step"
-    checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
-    remote, skips = has_server_node(scenario), scenario.clock.skip
+    remote = has_server_node(scenario)
     needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
-    needed |= {*["position"] * scenario.delays.reads_positions, *["duration"] * skips}
+    needed |= {*["position"] * scenario.delays.reads_positions}
     env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
-    names = scenario.reward.terms if "reward_terms" in extras else []
-    rewards = [keys.REWARD, *((*keys.REWARD_TERMS, name) for name in names)]
-    skip = Skip(scenario.clock.skip_discount, rewards) if skips else None
-    pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras), skip)
+    pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras))
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
     pipeline.set_seed(seed)
@@ -76,13 +70,16 @@ def make_env(
 
 def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
     """All transforms of a scenario in order: outputs pass them forwards, a policy's actions backwards."""
+    hear_each_other = scenario.links.kind == "matrix"
     transforms = [
         *action_transforms(scenario),
         *(server_transforms(scenario, server, extras) if has_server_node(scenario) else []),
-        *(link_transforms(scenario, server, extras) if scenario.links.kind == "matrix" else []),
+        *(link_transforms(scenario, server) if hear_each_other else []),
         *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
     ]
+    if hear_each_other or (has_server_node(scenario) and "message" not in extras):
+        transforms.append(Drop([keys.LINKED, *([] if "message" in extras else _REPORTED)]))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
@@ -95,10 +92,9 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
         act,
         keys.ACTION,
         default=hold_action(scenario.actions),
-        dt=clock.dt,
         sent_key="ready",
         valid_key=keys.ACTION_VALID,
-        context_keys=CONTEXT_KEYS,
+        **scenario.delays.told,
     )
     return [late]
 
@@ -114,25 +110,16 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
             keys.MESSAGE,
             keys.RECEIVED,
             order=scenario.delay.order,
-            dt=scenario.clock.dt,
             sent_key=keys.MESSAGE_SENT,
             age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
             delay_key=keys.DELAY if output_messages or remembers else None,
-            context_keys=CONTEXT_KEYS,
+            **scenario.delays.told,
         )
         transforms.append(uplink)
     longest = scenario.delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
-    dropped = []
-    if not output_messages:  # the server node drops what only it and the transforms before it read
-        kept = (keys.TIMELINE, keys.AGE)  # which an action history reads
-        written = [key for each in transforms for key in each.out_keys if key not in kept]
-        dropped = [*([] if scenario.links.kind == "matrix" else _SENT), *written]
     held = keys.RECEIVED if delayed else keys.MESSAGE
-    return [
-        *transforms,
-        ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras),
-    ]
+    return [*transforms, ServerNode(server, held, reward_terms="reward_terms" in extras)]
 
 
 def remembering_transforms(
@@ -166,7 +153,7 @@ def scaled_messages(server: Server, rows: Tensor) -> Tensor:
     return torch.cat([messages.position / scale, way / scale, flags], -1)
 
 
-def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
+def link_transforms(scenario: ScenarioConfig, server: Server) -> list[Transform]:
     """The links over which UAVs hear each other, and the nodes that compute observations on board."""
     links, delays = scenario.links, scenario.delays
     channel = Channel(
@@ -176,15 +163,13 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         hears=links.hears,
         comm_range=links.range,
         position_key=keys.POSITION if delays.links.reads or links.range is not None else None,
-        limit=links.limit,
         sent_key=keys.MESSAGE_SENT,
         known_at_reset=True,
         dt=scenario.clock.dt,
         age_key=None,
         mask_key=None,
     )
-    dropped = [keys.LINKED, *([] if "message" in extras else _SENT)]
-    return [channel, OnboardNode(server, dropped_keys=dropped)]
+    return [channel, OnboardNode(server)]
 
 
 def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
@@ -197,10 +182,9 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
         late = RewardDelay(
             delays.rew,
             keys.REWARD,
-            dt=scenario.clock.dt,
-            context_keys=CONTEXT_KEYS,
             delay_key=keys.REWARD_DELAY if reported else None,
             earned_key=earned_key,
+            **delays.told,
         )
         transforms.append(late)
     if delay.reward_window > 1:
@@ -220,9 +204,8 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
             scenario.delays.links,
             keys.OBSERVATION,
             order=scenario.delay.order,
-            dt=clock.dt,
             age_key=None,
-            context_keys=CONTEXT_KEYS,
+            **scenario.delays.told,
         )
         transforms.append(downlink)
     if clock.steps("agents") > 1:

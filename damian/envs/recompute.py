@@ -26,7 +26,6 @@ def server_recompute(
     ``corrected``: names in ``CORRECTED``; the ends of episodes always are.
     """
     observes = not {"critic", "actor"}.isdisjoint(corrected)
-    names = None if observes else server.reads
     believes = server.grid is not None and (observes or server.rewards_belief)
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
@@ -34,18 +33,13 @@ def server_recompute(
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
         belief = beliefs_in_hindsight(server, steps) if believes else None
         held = server.messages(messages)
-        features = server.features(held, elapsed, names, belief=belief)
-        reward, terms, status = server.reward_and_status(features, held, elapsed, source_over)
-        entries: dict[NestedKey, Tensor] = {keys.REWARD: reward.unsqueeze(-1), **status.entries()}
+        outputs = server(held, elapsed, source_over, belief=belief, observes=observes)
+        entries = outputs.entries(reward_terms)
         if belief is not None:
             entries[keys.BELIEF] = belief
-        if observes:
-            entries[keys.OBSERVATION], entries[keys.GLOBAL_OBSERVATION] = server.observations(features)
         if "actor" in corrected and server.observation.own:
             sent, own_belief = steps[next_key(keys.MESSAGE)], steps.get(next_key(keys.OWN_BELIEF), None)
             entries[keys.OBSERVATION] = server.observe_with_own_messages(messages, sent, elapsed, own_belief)
-        if reward_terms:
-            entries |= {(*keys.REWARD_TERMS, name): term for name, term in terms.items()}
         kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
         return {next_key(key): value for key, value in entries.items() if key not in kept}
 

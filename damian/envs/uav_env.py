@@ -32,7 +32,7 @@ Bounds = dict[NestedKey, tuple[Tensor, Tensor]]
 EXTRAS = ("message", "state", "reward_terms")
 """Default optional outputs."""
 
-ALL_EXTRAS = (*EXTRAS, "position", "privileged", "duration")
+ALL_EXTRAS = (*EXTRAS, "position", "privileged")
 """All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments only."""
 
 
@@ -55,18 +55,17 @@ class UavEnv(EnvBase):
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
     At the root lie ``state`` (the simulator's truth, never for an actor), ``success``, and TorchRL's
-    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over``, and as an
-    extra the ``duration`` of a step in simulation steps, 1 or after a reset 0, [B, 1]. A step
-    also reads the flag ``("agents", "action_valid")`` [B, N], if it exists: a UAV with a false flag does not
-    act; and TorchRL's ``_step`` [B].
+    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over`` [B, 1]. A
+    step also reads the flag ``("agents", "action_valid")`` [B, N], if it exists: a UAV with a false flag does
+    not act; and TorchRL's ``_step`` [B].
 
     Args:
         scenario: all settings; the defaults if not given.
         num_worlds: number of parallel environments, B.
         seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
         device: of all tensors.
-        extras: which of ``message``, ``state``, ``reward_terms``, ``position``, ``duration`` and (reference
-            experiments only) ``privileged`` are output; each costs time. Delays need ``message``.
+        extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and (reference experiments
+            only) ``privileged`` are output; each costs time. Delays need ``message``.
         messages_only: a step outputs no observation, reward or end: a ``ServerNode`` computes them.
     """
 
@@ -207,25 +206,15 @@ class UavEnv(EnvBase):
             return self.simulation.layout.pack(state), self._state_outputs(state)
         remembers = self.server.remembers_coverage
         known = KnownCoverage(self.server.counted(before.sent), before.coverage) if remembers else None
-        features = self.server.features(state.sent, state.steps, coverage=known)
-        if remembers:
-            state = state._replace(coverage=features["coverage"])
-        packed = self.simulation.layout.pack(state)
-        outputs = self._state_outputs(state, features)
-        reward, terms, status = self.server.reward_and_status(
-            features, state.sent, state.steps, state.source_over
-        )
-        outputs[keys.REWARD] = reward.unsqueeze(-1)
-        if "reward_terms" in self.extras:
-            outputs |= {(*keys.REWARD_TERMS, name): term for name, term in terms.items()}
-        return packed, outputs | status.entries()
+        served = self.server(state.sent, state.steps, state.source_over, known)
+        if served.coverage is not None:
+            state = state._replace(coverage=served.coverage.share)
+        outputs = self._state_outputs(state, served.global_observation)
+        return self.simulation.layout.pack(state), outputs | served.entries("reward_terms" in self.extras)
 
-    def _state_outputs(self, state: State, features: Features | None = None) -> Outputs:
-        """The outputs that depend on a state and, if given, on the features of its messages."""
+    def _state_outputs(self, state: State, global_observation: Tensor | None = None) -> Outputs:
+        """The outputs that depend on a state alone; the critic's observation [B, N, G] saves time."""
         outputs: Outputs = {keys.READY: self.simulation.vehicles.ready(state)}
-        if features is not None:
-            observation, global_observation = self.server.observations(features)
-            outputs |= {keys.OBSERVATION: observation, keys.GLOBAL_OBSERVATION: global_observation}
         if self.scenario.actions.kind == "discrete" and self.scenario.actions.mask:
             outputs[keys.ACTION_MASK] = self.simulation.action_mask(state)
         if "message" in self.extras:
@@ -234,33 +223,31 @@ class UavEnv(EnvBase):
             offset = gather_rows(self.simulation.airspace.offset, state.region).unsqueeze(-2)
             outputs[keys.POSITION] = state.position[..., :2] + offset
         if "privileged" in self.extras:
-            outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, features)
+            outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, global_observation)
         if self.scenario.episode.end_with_source:
             outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
-        if "duration" in self.extras:
-            outputs[keys.DURATION] = torch.ones_like(state.steps).view(-1, 1)
         if "state" in self.extras:
             _, emits, _ = self.simulation.source_now(state)
             outputs[keys.STATE] = Truth(state.position, state.battery, emits, state.source).pack()
         return outputs
 
-    def _privileged(self, state: State, features: Features | None) -> Tensor:
+    def _privileged(self, state: State, global_observation: Tensor | None) -> Tensor:
         """Observation of a critic that knows the simulator's true state, [B, N, G + 2]."""
-        if features is None or self.server.grid is not None:
+        if global_observation is None or self.server.grid is not None:
             features = self.server.privileged_features(state.sent, state.steps, state.source)
-        _, global_observation = self.server.observations(features)
+            _, global_observation = self.server.observations(features)
         scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
         to_source = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
         return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         """Outputs of a reset, [Q, ...] by key, from Q first states of episodes and their features."""
-        outputs = self._state_outputs(initial, features)
+        observation, global_observation = self.server.observations(features)
+        outputs = self._state_outputs(initial, global_observation)
+        outputs |= {keys.OBSERVATION: observation, keys.GLOBAL_OBSERVATION: global_observation}
         if "reward_terms" in self.extras:
             zero = torch.zeros_like(initial.track)
             outputs |= {(*keys.REWARD_TERMS, name): zero for name in self.scenario.reward.terms}
-        if "duration" in self.extras:
-            outputs[keys.DURATION] = torch.zeros_like(initial.steps).view(-1, 1)
         false = torch.zeros_like(initial.source_over).unsqueeze(-1)
         return outputs | dict.fromkeys((*keys.ENDS, keys.SUCCESS), false)
 

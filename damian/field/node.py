@@ -151,14 +151,10 @@ def _copies(memories: Memories) -> Memories:
 
 
 def scenario_of_reports(scenario: ScenarioConfig) -> ScenarioConfig:
-    """The scenario as reports tell it: own messages are known as late as others, and no step is skipped."""
+    """The scenario as reports tell it: own messages are known as late as others."""
     problem = "is not server: reports are what the server node knows, not what links bring to a UAV"
     checks.require(scenario.links.kind == "server", "links", scenario.links.kind, problem)
-    return replace(
-        scenario,
-        observation=replace(scenario.observation, own=False),
-        clock=replace(scenario.clock, skip=False, skip_discount=1.0),
-    )
+    return replace(scenario, observation=replace(scenario.observation, own=False))
 
 
 def for_uavs(scenario: ScenarioConfig, n_uavs: int) -> ScenarioConfig:

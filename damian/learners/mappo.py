@@ -184,14 +184,11 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     next_step = cast(TensorDictBase, batch["next"])
     value, next_value = state_values(batch, critic)
     batch[keys.STATE_VALUE], next_step[keys.STATE_VALUE] = value, next_value
-    ends = [next_step[key] for key in (keys.DONE, keys.TERMINATED)]
-    # Only with ``clock.skip`` do steps have durations other than 1.
-    durations = next_step.get(keys.DURATION, torch.ones_like(ends[0], dtype=torch.long))
-    gamma, done, terminated = (x.unsqueeze(-2).expand_as(value) for x in (config.gamma**durations, *ends))
+    ends = (next_step[key].unsqueeze(-2).expand_as(value) for key in (keys.DONE, keys.TERMINATED))
     # TorchRL says float, but broadcasts tensors.
     lmbda: Any = torch.where(next_step[keys.READY].unsqueeze(-1), config.lmbda, 1.0)
     advantage, batch[keys.VALUE_TARGET] = generalized_advantage_estimate(
-        gamma, lmbda, value, next_value, next_step[keys.REWARD], done, terminated, time_dim=-3
+        config.gamma, lmbda, value, next_value, next_step[keys.REWARD], *ends, time_dim=-3
     )
     if isinstance(critic.module, NormalizedValue):
         critic.module.norm.update(batch[keys.VALUE_TARGET].double())

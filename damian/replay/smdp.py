@@ -68,11 +68,8 @@ def transitions(
     at_begin = {"action": agents["action"][before], **{key: agents[key][before] for key in observed}}
     step = begin + torch.arange(int((end - begin).max()) + 1, device=begin.device).unsqueeze(-1)  # [H, K]
     index = order[torch.minimum(step, end)], world
-    durations = (step <= end).long()
-    if next_key(keys.DURATION) in steps:
-        durations = durations * steps[next_key(keys.DURATION)].squeeze(-1)[index]  # with ``clock.skip``
     rewards = after["reward"].squeeze(-1)[*index, agent] * (step <= end)
-    reward = (gamma ** (durations.cumsum(0) - durations) * rewards).sum(0)
+    reward = (gamma ** (step - begin) * rewards).sum(0)
     at_end = {"reward": reward.unsqueeze(-1), **{key: after[key][last] for key in observed}}
     ends = {key: steps[next_key(key)][last[:2]] for key in (keys.DONE, keys.TERMINATED)}
     n = len(begin)
@@ -80,7 +77,7 @@ def transitions(
         {
             keys.AGENTS: TensorDict(at_begin, [n]),
             "next": TensorDict({keys.AGENTS: TensorDict(at_end, [n]), **ends}, [n]),
-            "steps_to_next_obs": durations.sum(0).unsqueeze(-1),
+            "steps_to_next_obs": (end - begin + 1).unsqueeze(-1),
         },
         [n],
     )

@@ -8,8 +8,10 @@ import itertools
 from typing import Any, NamedTuple
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
 
+from damian import keys
 from damian.common import checks
 from damian.common.tensors import gather_rows, move_attributes
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
@@ -28,10 +30,10 @@ Features = dict[str, Tensor]
 class ServerOutputs(NamedTuple):
     """Everything that the server computes from one message of each UAV."""
 
-    observation: Tensor
-    """Observations of the actors, [*, N, F]."""
-    global_observation: Tensor
-    """Observations of the critic, [*, N, G]."""
+    observation: Tensor | None
+    """Observations of the actors, [*, N, F], if they are wanted."""
+    global_observation: Tensor | None
+    """Observations of the critic, [*, N, G], if they are wanted."""
     reward: Tensor
     """Rewards (paper, eq. 8) with bonus and penalty, [*, N]."""
     terms: dict[str, Tensor]
@@ -40,6 +42,14 @@ class ServerOutputs(NamedTuple):
     """Success and the end of the episode, [*]."""
     coverage: KnownCoverage | None
     """For the next step, if ``Server.remembers_coverage``."""
+
+    def entries(self, reward_terms: bool = False) -> dict[NestedKey, Tensor]:
+        """The outputs by their keys in a TensorDict, ``reward_terms`` only if they are wanted."""
+        found: dict[NestedKey, Tensor] = {keys.REWARD: self.reward.unsqueeze(-1), **self.status.entries()}
+        if self.observation is not None and self.global_observation is not None:
+            found |= {keys.OBSERVATION: self.observation, keys.GLOBAL_OBSERVATION: self.global_observation}
+        terms = self.terms if reward_terms else {}
+        return found | {(*keys.REWARD_TERMS, name): term for name, term in terms.items()}
 
 
 class Server:
@@ -156,14 +166,24 @@ class Server:
         source_over: Tensor | None = None,
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
+        observes: bool = True,
     ) -> ServerOutputs:
-        """Observations, rewards and status; without ``source_over`` the source never ends."""
-        features = self.features(messages, steps, coverage=coverage, belief=belief)
-        result = self.reward_and_status(features, messages, steps, source_over)
+        """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and, if wanted, observations.
+
+        Without ``source_over`` the source never ends.
+        """
+        names = self.names if observes else self.reads
+        features = self.features(messages, steps, names, coverage, belief)
+        over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
+        counters = Counters(steps, messages.motions)
+        ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
+        terms = reward(features, counters, self.terms)
+        final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
+        seen = self.observations(features) if observes else (None, None)
         known = None
-        if self.remembers_coverage:
+        if self.remembers_coverage and observes:
             known = KnownCoverage(self.counted(messages), features["coverage"])
-        return ServerOutputs(*self.observations(features), *result, known)
+        return ServerOutputs(*seen, sum(terms.values(), start=final), terms, ended, known)
 
     def features(
         self,
@@ -208,20 +228,6 @@ class Server:
         """Features of UAVs, [*, N] each, who know messages [*, N, N] and beliefs as in ``observe_each``."""
         context = self._known(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
         return observe_own(known, context._replace(belief=belief), names)
-
-    def reward_and_status(
-        self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor | None
-    ) -> tuple[Tensor, Features, Status]:
-        """Rewards (paper, eq. 5-8), their terms, and the end of the episode (section 4.1).
-
-        Shapes as in ``ServerOutputs``; features are of the messages.
-        """
-        over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
-        counters = Counters(steps, messages.motions)
-        ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
-        terms = reward(features, counters, self.terms)
-        final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
-        return sum(terms.values(), start=final), terms, ended
 
     def _known(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages now."""

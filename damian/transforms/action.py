@@ -7,16 +7,15 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
-from damian.common import checks
 from damian.common.errors import InputError
 from damian.delays.laws import sampler_of
 from damian.delays.line import DelayLine
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
-from damian.transforms.entries import Entries, existing, path_of, sibling_key, spec_rows
+from damian.transforms.entries import Entries, existing, sibling_key, spec_rows
 
 
 class ActionSpecs(NamedTuple):
@@ -76,32 +75,25 @@ def _default_action(space: tuple[Tensor, Tensor], default: Any) -> Tensor:
 
 
 class ActionTransform(StatefulTransform):
-    """Base class of transforms that remember actions; ``keys`` are arguments of ``StatefulTransform``.
+    """Base class of transforms that remember actions."""
 
-    ``default`` is that of one action; of several, a list with one for each, or None.
-    """
-
-    def __init__(self, action_key: NestedKey | Sequence[NestedKey], default: Any, **keys: Any) -> None:
-        super().__init__(in_keys_inv=action_key, **keys)
+    def __init__(self, action_key: NestedKey, default: Any, seed: int | None = None) -> None:
+        super().__init__(in_keys_inv=action_key, seed=seed)
         self.action_key: NestedKey = self.in_keys_inv[0]
-        n = len(self.in_keys_inv)
-        self.defaults = [None] * n if default is None else [default] if n == 1 else default
-        listed = isinstance(self.defaults, list | tuple) and len(self.defaults) == n
-        checks.require(listed, "default", default, f"is not a list of {n} defaults, one for each entry")
+        self.default = default
 
     @property
     def row_key(self) -> NestedKey:
         return self.action_key
 
     def action_rows(self, value: Tensor) -> Tensor:
-        """A value of ``all_actions`` for each of the M rows, [M, ...]."""
+        """A value of ``actions`` for each of the M rows, [M, ...]."""
         return self.as_rows_of_spec(value, self.env.full_action_spec, self.action_key)
 
     @cached_property
-    def all_actions(self) -> list[ActionSpecs]:
-        """Shape, range and default of each of the actions, by the environment's specs."""
-        pairs = zip(self.in_keys_inv, self.defaults, strict=True)
-        return [read_action_specs(self.env, key, default) for key, default in pairs]
+    def actions(self) -> ActionSpecs:
+        """Shape, range and default of the actions, by the environment's specs."""
+        return read_action_specs(self.env, self.action_key, self.default)
 
     def empty_cache(self) -> None:
         super().empty_cache()
@@ -111,10 +103,9 @@ class ActionTransform(StatefulTransform):
 class ActionDelay(ActionTransform):
     """Delays actions: the environment executes the action that the policy chose some steps ago.
 
-    In each step, the entries ``in_keys_inv`` of a world (or agent) travel together as one message. Until the
-    first action of an episode arrives, the environment executes a default action. In a step in which no newer
-    action arrives, it executes the same action again. The TensorDict keeps the chosen action. With delay 0
-    the rollout is the same, bit for bit, as without the transform.
+    Until the first action of an episode arrives, the environment executes a default action. In a step in
+    which no newer action arrives, it executes the same action again. The TensorDict keeps the chosen action.
+    With delay 0 the rollout is the same, bit for bit, as without the transform.
 
     A worked timeline, with a delay of 3 steps: the action a0, chosen at t = 0, is executed in the step that
     begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
@@ -122,12 +113,9 @@ class ActionDelay(ActionTransform):
     Args:
         delay, dt, context_keys, seed: as in ``ObservationDelay``; the policy's input and the outputs of a
             reset must have the entries that the law reads.
-        in_keys_inv: keys of the entries of an action that the environment executes, all of them beside each
-            other, or one key. A bare name for another key means an entry beside the first one.
-        out_keys_inv: keys under which the policy writes what it chooses; if not given, ``in_keys_inv``.
+        action_key: key of the action. A bare name for another key means an entry beside it.
         default: action that is executed until the first one arrives: a number, or values in the shape of an
-            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0. Of
-            several entries, a list with one for each, which may be None.
+            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
         loss: probability that an action never arrives.
         sent_key: key of a flag in the policy's input, [...] bool: which actions are sent; if not given, all.
         valid_key: key of a flag that is written for the environment, [...] bool: true if the action is
@@ -142,8 +130,7 @@ class ActionDelay(ActionTransform):
     def __init__(
         self,
         delay: Any,
-        in_keys_inv: NestedKey | Sequence[NestedKey] = "action",
-        out_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
+        action_key: NestedKey = "action",
         *,
         default: Any = None,
         loss: float = 0.0,
@@ -153,58 +140,35 @@ class ActionDelay(ActionTransform):
         context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
     ) -> None:
-        super().__init__(in_keys_inv, default, out_keys_inv=out_keys_inv or in_keys_inv, seed=seed)
-        same, paths = len(self.in_keys_inv) == len(self.out_keys_inv), set(map(path_of, self.in_keys_inv))
-        checks.require(same, "out_keys_inv", out_keys_inv, "does not have one key for each of in_keys_inv")
-        problem = "are not beside each other: delay actions of several groups by a transform for each"
-        checks.require(len(paths) == 1, "in_keys_inv", in_keys_inv, problem)
+        super().__init__(action_key, default, seed)
+        self.out_keys_inv = self.in_keys_inv
         self.sampler = sampler_of(delay, dt, loss)
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(self.sampler, context_keys, dt, self.action_key, before_step=True)
-        self.action_keys = existing([*self.out_keys_inv, self.sent_key, *self.contexts.keys.values()])
+        self.action_keys = existing([self.action_key, self.sent_key, *self.contexts.keys.values()])
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
         return [*self.contexts.keys.values()]
 
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return self.line.row_dims(len(self.in_keys_inv))
-
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        initial = [self.action_rows(actions.initial) for actions in self.all_actions]
-        streams = self.streams(tensordict.batch_size, initial[0].device, self.sampler)
-        memory = self.line.init_memory(initial, streams)
-        memory |= {f"initial_{i}": each for i, each in enumerate(initial)}
+        initial = self.action_rows(self.actions.initial)
+        streams = self.streams(tensordict.batch_size, initial.device, self.sampler)
+        memory = self.line.init_memory([initial], streams) | {"initial": initial}
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        initial = [memory[f"initial_{i}"] for i in range(len(self.in_keys_inv))]
-        memory, _ = self.line.reset(memory, initial, mask)
-        return memory, {}
+        return self.line.reset(memory, [memory["initial"]], mask)[0], {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         # A distribution may draw one-hot actions as floats, where the specs have integers.
-        chosen = [
-            self.to_rows(entries[key]).to(memory[f"initial_{i}"].dtype)
-            for i, key in enumerate(self.out_keys_inv)
-        ]
+        chosen = self.to_rows(entries[self.action_key]).to(memory["initial"].dtype)
         sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
-        memory, delivery = self.line.step(memory, chosen, sent, context)
-        executed: Entries = {
-            key: self.from_rows(held).clone()
-            for key, held in zip(self.in_keys_inv, delivery.held, strict=True)
-        }
+        memory, delivery = self.line.step(memory, [chosen], sent, context)
+        executed: Entries = {self.action_key: self.from_rows(delivery.held[0]).clone()}
         if self.valid_key:
             default = memory["generated_at"] == memory["reset_at"]
             executed[self.valid_key] = (delivery.fresh | default).view(self.rows)
         return memory, executed
-
-    def transform_action_spec(self, action_spec: Composite) -> Composite:  # type: ignore[override]
-        for key, chosen in zip(self.in_keys_inv, self.out_keys_inv, strict=True):
-            if chosen != key:
-                action_spec[chosen] = action_spec[key].clone()
-                del action_spec[key]
-        return action_spec

@@ -146,11 +146,6 @@ class StatefulTransform(Transform):
         return [*self.in_keys, *self.in_keys_inv][0]
 
     @property
-    def row_dims(self) -> dict[str, int]:
-        """The dimension of a buffer, by name, in which its M rows lie, where that is not the first."""
-        return {}
-
-    @property
     def created_keys(self) -> Sequence[NestedKey]:
         """Keys of the entries that the transform adds to the outputs of the environment."""
         return [key for key in self.out_keys if key not in self.in_keys]
@@ -213,12 +208,14 @@ class StatefulTransform(Transform):
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
     def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        """The memory if only the worlds ``stepped`` [B] have stepped; the others have sent nothing."""
+        """The memory if only the worlds ``stepped`` [B] have stepped; the others have sent nothing.
+
+        Buffers that a step writes in place are right already, as ``on_step`` knows who has stepped.
+        """
         rows, merged = self.expand_worlds(stepped), {}
         for name, new in after.items():
-            mask = rows.view(*[1] * self.row_dims.get(name, 0), *rows.shape)
             old = before[name]
-            merged[name] = new if new is old else torch.where(expand_mask(mask, new), new, old)
+            merged[name] = new if new is old else torch.where(expand_mask(rows, new), new, old)
         return merged
 
     def sending_rows(self, entries: Entries) -> Tensor | None:
@@ -425,16 +422,11 @@ class StatefulTransform(Transform):
         self._seed, self._world_seeds = None, seeds.to(torch.long)
         self.clear_memory()
 
-    def streams(
-        self, batch: torch.Size, device: torch.device, sampler: Sampler, draws_more: bool = False
-    ) -> Tensor:
-        """A random stream (a key of the counter-based generator) for each row, [M] int64, for a sampler.
-
-        They are 0 where neither the sampler draws nor, with ``draws_more``, the transform itself.
-        """
+    def streams(self, batch: torch.Size, device: torch.device, sampler: Sampler) -> Tensor:
+        """A random stream (a key of the counter-based generator) for each row, [M] int64, 0 if none draws."""
         n_worlds = batch.numel()
         n_agents = self.rows.numel() // n_worlds
-        if sampler.constant_delay is not None and not draws_more:
+        if sampler.constant_delay is not None:
             return torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
         if self._world_seeds is not None:
             worlds = self._world_seeds.to(device)

@@ -25,9 +25,6 @@ from damian.transforms.entries import (
     spec_rows,
 )
 
-_TURN_DRAW = 4
-"""Counter that keeps the draws of who may send apart from those of the delays."""
-
 
 class Channel(StatefulTransform):
     """Lets the agents of a group send messages to each other, which arrive some steps later or are lost.
@@ -59,8 +56,6 @@ class Channel(StatefulTransform):
         hears: which sender each receiver hears, [N, N] of bool; all if not given.
         comm_range: an agent hears only agents within this distance [m] when they send.
         position_key: key of an entry [*B, N, ...] whose first two numbers are the agent's position [m].
-        limit: so many agents of a world may send in a step, as on a shared medium, drawn from those that want
-            to.
         sent_key: key of a flag [*B, N] bool: does the agent send in this step.
         action_key: key of an action [*B, N, message_size] in [-1, 1], which the transform adds to the specs.
         message_size: how many numbers ``action_key`` has.
@@ -87,7 +82,6 @@ class Channel(StatefulTransform):
         hears: Any = None,
         comm_range: float | None = None,
         position_key: NestedKey | None = None,
-        limit: int | None = None,
         sent_key: NestedKey | None = None,
         action_key: NestedKey | None = None,
         message_size: int | None = None,
@@ -102,8 +96,6 @@ class Channel(StatefulTransform):
             checks.whole("message_size", message_size, 1, unit="numbers")
             should = "does not go with in_keys or known_at_reset: at a reset no message has been chosen yet"
             checks.require(in_keys is None and not known_at_reset, "action_key", action_key, should)
-        if limit is not None:
-            checks.whole("limit", limit, 1, unit="agents")
         placed = position_key is not None
         checks.require(comm_range is None or placed, "comm_range", comm_range, "needs a position_key")
         sent = None if action_key is not None else in_keys or ("agents", "observation")
@@ -120,7 +112,7 @@ class Channel(StatefulTransform):
         )
         self.out_keys += existing([self.age_key, self.mask_key, self.delay_key])
         self.message_size, self.known_at_reset, self.dt = message_size, known_at_reset, dt
-        self.comm_range, self.limit = comm_range, limit
+        self.comm_range = comm_range
         self.hears = None if hears is None else torch.as_tensor(hears, dtype=torch.bool).flatten().tolist()
         self.sampler = link_sampler(delay, loss, dt)
         links = {"delay": delay, "loss": loss} | ({} if hears is None else {"hears": hears})
@@ -154,8 +146,8 @@ class Channel(StatefulTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         entries = select_entries(tensordict, self.step_keys)
         contents = self._contents(entries, next(iter(tensordict.values(True, True))).device)
-        n, draws = self.agents[-1], self.limit is not None
-        streams = self.streams(tensordict.batch_size, contents[0].device, self.sampler, draws)
+        n = self.agents[-1]
+        streams = self.streams(tensordict.batch_size, contents[0].device, self.sampler)
         links = torch.arange(len(streams), device=streams.device)
         receiver, sender = links // n, links % n
         hears = receiver % n != sender
@@ -238,8 +230,6 @@ class Channel(StatefulTransform):
             place = cast(Tensor, position).view(-1, n, 2)
             distance = torch.linalg.vector_norm(place.unsqueeze(1) - place.unsqueeze(2), dim=-1)
             sent = sent & (distance <= self.comm_range).view(-1)
-        by_link = sent.view(-1, n, n)
-        sent = (by_link & self._may_send(memory, by_link.any(1)).unsqueeze(1)).view(-1)
         context = self._context(memory, sent, position) if self.sampler.sees_context else None
         memory, delivery = self.line.step(memory, [], sent, context)
         memory = self._hold(memory, delivery.fresh)
@@ -255,19 +245,6 @@ class Channel(StatefulTransform):
         time = (memory["clock"] - memory["reset_at"]) * self.dt
         uniform = counter_rng.uniform(memory["streams"], memory["clock"] + 1)
         return MessageContext(sender % n, receiver % n, n_sending, time, uniform, self.dt, read)
-
-    def _may_send(self, memory: Memory, wants: Tensor) -> Tensor:
-        """Draw who may send if not all may, [B, N] bool, among those who want to, [B, N] bool."""
-        if self.limit is None:
-            return wants
-        link = memory["link"]
-        streams, clock = memory["streams"][link], memory["clock"][link] + 1
-        n = wants.shape[-1]
-        agent = torch.arange(len(clock), device=clock.device) % n
-        draw = counter_rng.bits(streams, clock, torch.full_like(clock, _TURN_DRAW), agent)
-        turn = (draw * n + agent).view(wants.shape)
-        before = wants.unsqueeze(1) & (turn.unsqueeze(1) < turn.unsqueeze(2))
-        return wants & (before.sum(-1) < self.limit)
 
     def _outputs(self, memory: Memory) -> Entries:
         """What the agents hold, with ages and flags; each agent holds its own message at once."""

@@ -17,9 +17,9 @@ class ContextReader:
     """Builds the context of the messages that a transform delays; does nothing if their law sees none.
 
     The transform's memory must hold ``streams``, ``state``, ``clock`` and ``reset_at``, as in
-    ``DelayLine``. ``context_keys`` are those of the entries that the law may read, by name; a bare name means
-    an entry beside ``beside``. ``before_step``: the messages are sent before the environment steps, as
-    actions are.
+    ``DelayLine``. ``context_keys`` are those of the entries that the law gets, by name; a bare name means an
+    entry beside ``beside``. ``before_step``: the messages are sent before the environment steps, as actions
+    are.
     """
 
     def __init__(
@@ -30,14 +30,14 @@ class ContextReader:
         beside: NestedKey,
         before_step: bool = False,
     ) -> None:
-        known = dict(context_keys or {})
-        self.keys: dict[str, NestedKey] = {}
-        """Keys of the entries that the law reads, by name."""
-        for name in (*sampler.reads, *(name for name in sampler.optional_reads if name in known)):
+        self._sees_context, self._dt, self.keys = sampler.sees_context, dt, dict[str, NestedKey]()
+        """Keys of the entries that the law gets, by name."""
+        known = dict(context_keys or {}) if sampler.sees_context else {}
+        for name in sampler.reads:
             should = f"has no key for {name}, which the delay law reads"
             checks.require(name in known, "context_keys", known, should)
-            self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(known[name])))
-        self._sees_context, self._dt = sampler.sees_context, dt
+        for name, key in known.items():
+            self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(key)))
         self._since_clock = 0 if before_step else 1
 
     def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:

@@ -70,7 +70,7 @@ class ActionHistory(ActionTransform):
         self.step_keys = existing([*self.in_keys, self.age_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        _, initial, low, width, _ = self.all_actions[0]
+        _, initial, low, width, _ = self.actions
         initial, low, width = (self.action_rows(value) for value in (initial, low, width))
         scale = {"low": low, "width": width}
         if self.codes is not None:
@@ -132,7 +132,7 @@ class ActionHistory(ActionTransform):
         return ((action.float() - scale["low"]) / scale["width"]).reshape(len(action), -1)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        actions, key, codes = self.all_actions[0], self.out_keys[0], self.codes
+        actions, key, codes = self.actions, self.out_keys[0], self.codes
         rows, initial = actions.rows, actions.initial
         numbers = initial.shape[len(rows) :].numel() if codes is None else codes.shape[-1]
         width = self.steps * numbers
@@ -149,7 +149,7 @@ class ActionHistory(ActionTransform):
     def _appended(self, old: TensorSpec, width: int) -> TensorSpec:
         """The spec ``old`` with ``width`` more columns for the history; bounded if all of them are."""
         shape = torch.Size((*old.shape[:-1], old.shape[-1] + width))
-        if not isinstance(old, Bounded) or (self.codes is None and not self.all_actions[0].bounded):
+        if not isinstance(old, Bounded) or (self.codes is None and not self.actions.bounded):
             return Unbounded(shape, dtype=old.dtype, device=old.device)
         if self.codes is None:
             lowest, highest = torch.zeros(width), torch.ones(width)

@@ -11,7 +11,7 @@ from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
 from damian.keys import next_key
 from damian.transforms.base import Change, Correction, Memory, StatefulTransform
-from damian.transforms.entries import Entries, existing, select_entries, sibling_key
+from damian.transforms.entries import Entries, existing, select_entries
 
 
 class SampleAndHold(StatefulTransform):
@@ -29,8 +29,6 @@ class SampleAndHold(StatefulTransform):
         period: time between two ticks: steps (``4``), or a time (``"2s"``).
         in_keys, in_keys_inv: keys of the entries that are sampled and held, and of the actions that are held.
         ready_key: key of a flag, [...] bool, that is set to false between two ticks; or None.
-        age_key: key of the age of the held entries [steps], [..., 1], which grows between two ticks; or None.
-            A bare name means an entry beside ``in_keys[0]``.
         dt: length of a step [s], for a period given as a time.
 
     Examples:
@@ -45,7 +43,6 @@ class SampleAndHold(StatefulTransform):
         in_keys_inv: NestedKey | Sequence[NestedKey] = (),
         *,
         ready_key: NestedKey | None = None,
-        age_key: NestedKey | None = None,
         dt: float = 1.0,
     ) -> None:
         super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv)
@@ -54,9 +51,8 @@ class SampleAndHold(StatefulTransform):
         checks.above("dt", dt, 0.0, "s")
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
-        self.ready_key, self.age_key = ready_key, sibling_key(self.row_key, age_key)
-        self.action_keys = self.in_keys_inv
-        self.step_keys = existing([*self.in_keys, ready_key, self.age_key])
+        self.ready_key, self.action_keys = ready_key, self.in_keys_inv
+        self.step_keys = existing([*self.in_keys, ready_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         first = select_entries(tensordict, self.in_keys)
@@ -66,13 +62,11 @@ class SampleAndHold(StatefulTransform):
         specs = self.env.full_action_spec
         for i, key in enumerate(self.in_keys_inv):
             memory[f"action_at_tick_{i}"] = self.as_rows_of_spec(specs[key].zero(), specs, key)
-        if self.age_key:
-            memory["age"] = self.to_rows(tensordict.get(self.age_key))
         return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
-        return self._hold_entries(memory, entries, mask, 0)
+        return self._hold(memory, entries, self.in_keys, "held", mask)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         return self._hold(memory, entries, self.in_keys_inv, "action_at_tick", memory["elapsed"] == 0)
@@ -80,21 +74,11 @@ class SampleAndHold(StatefulTransform):
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed = memory["elapsed"] + 1
         ticks = elapsed >= self.period
-        memory, held = self._hold_entries(
-            memory | {"elapsed": elapsed.masked_fill(ticks, 0)}, entries, ticks, 1
-        )
+        memory = memory | {"elapsed": elapsed.masked_fill(ticks, 0)}
+        memory, held = self._hold(memory, entries, self.in_keys, "held", ticks)
         if self.ready_key:
             ready = entries[self.ready_key]
             held[self.ready_key] = ready & ticks.view_as(ready)
-        return memory, held
-
-    def _hold_entries(self, memory: Memory, entries: Entries, sampled: Tensor, n_steps: int) -> Change:
-        """Hold the entries ``in_keys``; where they are not sampled, their age grows by ``n_steps``."""
-        memory, held = self._hold(memory, entries, self.in_keys, "held", sampled)
-        if self.age_key:
-            new = self.to_rows(entries[self.age_key])
-            age = torch.where(expand_mask(sampled, new), new, memory["age"] + n_steps)
-            memory, held[self.age_key] = memory | {"age": age}, self.from_rows(age).clone()
         return memory, held
 
     def _hold(

@@ -39,7 +39,6 @@ class ObservationDelay(StatefulTransform):
             by at most one per step. ``arrival``: it holds the message that arrived last.
         dt: length of a step [s], for delays given as times.
         age_key: key for the age of the held message [steps], [..., 1] float; or None.
-        fresh_key: key for a flag, [..., 1] bool: did the held message arrive in this step; or None.
         delay_key: key for the delay of the message sent in this step [steps], [..., 1] long, -1 if it never
             arrives; or None. An actor must not observe it; back-updating needs it.
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
@@ -61,7 +60,6 @@ class ObservationDelay(StatefulTransform):
         order: str = "generation",
         dt: float = 1.0,
         age_key: NestedKey | None = "age",
-        fresh_key: NestedKey | None = None,
         delay_key: NestedKey | None = None,
         sent_key: NestedKey | None = None,
         context_keys: Mapping[str, NestedKey] | None = None,
@@ -71,16 +69,12 @@ class ObservationDelay(StatefulTransform):
         super().__init__(in_keys, out_keys or in_keys, seed=seed)
         self.sampler = sampler_of(delay, dt, loss)
         self.line = DelayLine(self.sampler, order)
-        self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
-            sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
+        self.age_key, self.delay_key, self.sent_key = (
+            sibling_key(self.row_key, key) for key in (age_key, delay_key, sent_key)
         )
-        self.out_keys = [*self.out_keys, *existing([self.age_key, self.fresh_key, self.delay_key])]
+        self.out_keys = [*self.out_keys, *existing([self.age_key, self.delay_key])]
         self.contexts = ContextReader(self.sampler, context_keys, dt, self.row_key)
         self.step_keys = existing([*self.in_keys, self.sent_key, *self.contexts.keys.values()])
-
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return self.line.row_dims(len(self.in_keys))
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
@@ -109,8 +103,6 @@ class ObservationDelay(StatefulTransform):
         }
         if self.age_key:
             entries[self.age_key] = delivery.age.to(torch.float32).view(*self.rows, 1)
-        if self.fresh_key:
-            entries[self.fresh_key] = delivery.fresh.view(*self.rows, 1)
         if self.delay_key:
             delay = torch.where(delivery.delay < self.sampler.lost, delivery.delay, -1)
             entries[self.delay_key] = delay.view(*self.rows, 1)
@@ -122,6 +114,5 @@ class ObservationDelay(StatefulTransform):
                 observation_spec[out_key] = observation_spec[key].clone()
         shape = (*spec_rows(observation_spec, self.row_key), 1)
         add_spec(observation_spec, self.age_key, shape)
-        add_spec(observation_spec, self.fresh_key, shape, torch.bool)
         add_spec(observation_spec, self.delay_key, shape, torch.long)
         return observation_spec

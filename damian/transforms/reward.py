@@ -21,39 +21,7 @@ from damian.transforms.context import ContextReader
 from damian.transforms.entries import Entries, add_spec, any_flag, existing, flag_keys, sibling_key, spec_rows
 
 
-class RewardTransform(StatefulTransform):
-    """Base class of transforms that remember rewards, in the buffer ``past`` [K, M, ...]."""
-
-    n_slots: int
-    """Number of rewards that are remembered for each of the M rows, K."""
-
-    def __init__(self, reward_key: NestedKey, seed: int | None = None) -> None:
-        super().__init__(reward_key, reward_key, seed=seed)
-        self.reward_key: NestedKey = self.in_keys[0]
-
-    @property
-    def step_keys(self) -> Sequence[NestedKey]:  # type: ignore[override]
-        return [self.reward_key]
-
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return [self.reward_key]
-
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return {"past": 1, "due": 1}
-
-    def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        specs = self.env.full_reward_spec
-        zero = self.as_rows_of_spec(specs[self.reward_key].zero(), specs, self.reward_key)
-        return {"past": zero.new_zeros(self.n_slots, *zero.shape)}
-
-    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        past = memory["past"]
-        return memory | {"past": past.masked_fill(expand_mask(mask, past[0]), 0)}, {}
-
-
-class RewardDelay(RewardTransform):
+class RewardDelay(StatefulTransform):
     """Delays rewards: each reward is received some steps after it was earned.
 
     Rewards that are received in the same step are added up. In the last step of an episode, all rewards in
@@ -97,7 +65,8 @@ class RewardDelay(RewardTransform):
         earned_key: NestedKey | None = None,
         seed: int | None = None,
     ) -> None:
-        super().__init__(reward_key, seed)
+        super().__init__(reward_key, reward_key, seed=seed)
+        self.reward_key: NestedKey = self.in_keys[0]
         self.delay_key, self.earned_key = (
             sibling_key(self.reward_key, key) for key in (delay_key, earned_key)
         )
@@ -108,8 +77,12 @@ class RewardDelay(RewardTransform):
         self.contexts = ContextReader(self.sampler, context_keys, dt, self.reward_key)
 
     @property
-    def step_keys(self) -> Sequence[NestedKey]:
-        return [self.reward_key, *self.done_keys, *self.contexts.keys.values()]
+    def required_keys(self) -> Sequence[NestedKey]:
+        return [self.reward_key, *self.contexts.keys.values()]
+
+    @property
+    def step_keys(self) -> Sequence[NestedKey]:  # type: ignore[override]
+        return [*self.required_keys, *self.done_keys]
 
     @cached_property
     def done_keys(self) -> list[NestedKey]:
@@ -117,22 +90,19 @@ class RewardDelay(RewardTransform):
         return flag_keys("done", self.reward_key, self.env.done_keys)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        memory = super().init_memory(tensordict)
-        streams = self.streams(tensordict.batch_size, memory["past"].device, self.sampler)
-        state = self.sampler.initial_state(streams)
-        zero = torch.zeros_like(streams)
-        memory |= {"clock": zero, "slot": zero.clone(), "streams": streams, "state": state}
-        memory |= {"time": zero.clone(), "due": zero.repeat(self.n_slots, 1)}
-        if not self.sampler.sees_context:
-            return memory
-        return self.contexts.init_memory(memory | {"reset_at": zero.clone()}, tensordict, self.rows)
+        reward = _zero_rewards(self)
+        streams = self.streams(tensordict.batch_size, reward.device, self.sampler)
+        zero, state = torch.zeros_like(streams), self.sampler.initial_state(streams)
+        memory = {name: zero.clone() for name in ("clock", "slot", "time", "reset_at")}
+        memory |= {"streams": streams, "state": state, "due": zero.repeat(self.n_slots, 1)}
+        memory["past"] = reward.new_zeros(self.n_slots, *reward.shape)
+        return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory = memory | {"state": self.sampler.begin_episode(memory["state"], mask)}
-        if self.sampler.sees_context:
-            memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
-        memory["time"] = memory["time"] + self.n_slots * mask
-        return memory, self._told(torch.zeros_like(memory["clock"]), torch.zeros_like(memory["past"][0]))
+        clock, time = memory["clock"], memory["time"] + self.n_slots * mask
+        memory = memory | {"reset_at": torch.where(mask, clock, memory["reset_at"]), "time": time}
+        memory["state"] = self.sampler.begin_episode(memory["state"], mask)
+        return memory, self._told(torch.zeros_like(clock), torch.zeros_like(memory["past"][0]))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock = memory["clock"] + 1
@@ -225,7 +195,13 @@ class RewardDelay(RewardTransform):
         return (step + delay <= last) | done.gather(0, last)
 
 
-class CumulativeReward(RewardTransform):
+def _zero_rewards(transform: StatefulTransform) -> Tensor:
+    """A reward of 0 for each of the M rows of a transform of rewards, [M, ...]."""
+    specs, key = transform.env.full_reward_spec, transform.in_keys[0]
+    return transform.as_rows_of_spec(specs[key].zero(), specs, key)
+
+
+class CumulativeReward(StatefulTransform):
     """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
     R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode; gamma is in
@@ -240,14 +216,21 @@ class CumulativeReward(RewardTransform):
         checks.whole("steps", steps, 1)
         checks.above("gamma", gamma, 0.0)
         checks.in_range("gamma", gamma, 0.0, 1.0)
-        super().__init__(reward_key)
-        self.n_slots, self.gamma = steps, gamma
+        super().__init__(reward_key, reward_key)
+        self.reward_key: NestedKey = self.in_keys[0]
+        self.step_keys, self.n_slots, self.gamma = self.in_keys, steps, gamma
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        return {"past": _zero_rewards(self).unsqueeze(1).repeat_interleave(self.n_slots, 1)}  # [M, K, ...]
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        return {"past": memory["past"].masked_fill(expand_mask(mask, memory["past"]), 0)}, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         reward = self.to_rows(entries[self.reward_key])
-        past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
-        total = discounted_sum(past, self.gamma)
-        return memory | {"past": past}, {self.reward_key: self.from_rows(total)}
+        past = torch.cat([reward.unsqueeze(1), memory["past"][:, :-1]], 1)
+        total = discounted_sum(past.movedim(1, 0), self.gamma)
+        return {"past": past}, {self.reward_key: self.from_rows(total)}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
         old = reward_spec[self.reward_key]

@@ -140,5 +140,5 @@ class Qmix:
             now[JOINT] = found[self.setup.critic_key].flatten(-2)
         team[keys.ACTION] = steps[keys.ACTION] * steps[keys.READY]
         team["next", "reward"] = steps[next_key(keys.REWARD)].mean(-2)
-        team["steps_to_next_obs"] = steps.get(next_key(keys.DURATION), torch.ones(len(steps), 1))
+        team["steps_to_next_obs"] = torch.ones(len(steps), 1)
         return team

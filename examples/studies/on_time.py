@@ -40,7 +40,7 @@ def script_rows(config: TrainConfig) -> dict[str, Evaluation]:
     )
     features = config.observation.belief or ["belief_moments"]
     late, own = (
-        replace(config.eval_scenario, observation=replace(config.observation, own=knows, belief=features))
+        replace(config, observation=replace(config.observation, own=knows, belief=features))
         for knows in (False, True)
     )
     undelayed = replace(late, delay=replace(config.delay, obs=0, loss=0.0, hold="none"))

@@ -41,7 +41,7 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
     warn_of_memory(config)
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
-    env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
+    env = make_env(config, config.worlds, config.seed, config.device, extras)
     if config.compiles:
         env.compile()
     env.append_transform(EpisodeTotals())
@@ -54,7 +54,7 @@ def warn_of_memory(config: TrainConfig) -> None:
     if steps * config.agents < 10**8 or config.device != "cpu" or not hasattr(os, "sysconf"):
         return
     region = replace(config.region, pool=1, initial_conditions=1)
-    one = make_env(replace(config.train_scenario, region=region), 1)
+    one = make_env(replace(config, region=region), 1)
     needed, there = (
         one.fake_tensordict().bytes() * steps,
         os.sysconf("SC_PAGESIZE") * os.sysconf("SC_PHYS_PAGES"),
@@ -119,7 +119,7 @@ def corrected_storage(
 
 
 def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:
-    """The returns of the learning curve; None if they are those perceived, or if steps are skipped."""
+    """The returns of the learning curve; None if they are those perceived."""
     if not measures_hindsight(config):
         return None
     worlds = min(config.worlds, HindsightReturns.WORLDS)

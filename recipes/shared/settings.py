@@ -20,14 +20,8 @@ def late(config: TrainConfig) -> list[str]:
 
 
 def measures_hindsight(config: TrainConfig) -> bool:
-    """Whether messages or rewards are late, and the messages of every step are known to correct them."""
-    return bool({"delay.obs", "delay.rew"} & {*late(config)}) and not config.clock.skip
-
-
-def action_delay(config: TrainConfig) -> int | None:
-    """Delay of every action [steps of the training]; None if it differs between actions."""
-    delay = config.delays.act.constant_delay
-    return None if delay and config.clock.skip else delay  # a step of the training then has any length
+    """Whether messages or rewards are late."""
+    return bool({"delay.obs", "delay.rew"} & {*late(config)})
 
 
 def backupdates(config: TrainConfig) -> bool:
@@ -51,7 +45,7 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
         critic_key=keys.PRIVILEGED_OBSERVATION if privileged else keys.GLOBAL_OBSERVATION,
         compile=config.compiles,
         frames=config.frames,
-        action_delay=action_delay(config),
+        action_delay=config.delays.act.constant_delay,
     )
 
 
@@ -71,8 +65,6 @@ def check_learning(config: TrainConfig) -> None:
     """Check that the settings allow training; an evaluation has fewer requirements."""
     check_components(config)
     config.learner.check(learning_setup(config))
-    problem = "does not go with model.rnn: hidden states change at every step, not only at decisions"
-    checks.require(not (config.model.recurrent and config.clock.skip), "clock.skip", True, problem)
     _check_backupdate(config)
     messages, name = config.delay.messages, config.learner.name
     problem = f"is not read by learner={name}, only by a learner of your own: leave it out"

@@ -20,7 +20,7 @@ def test_until_the_first_step_of_a_training_a_trace_is_read_once(tmp_path):
     check_learning(config)
     next(tmp_path.iterdir()).unlink()  # so that to read it again fails
     learning_setup(config)
-    make_env(config.eval_scenario, 1)
+    make_env(config, 1)
     learning_env(config).rollout(3)
 
 

@@ -155,11 +155,11 @@ def options(law: Any) -> dict[str, Any]:
     ("order", "loss", "sent_key"), [("generation", 0.0, None), ("arrival", 0.25, "message_sent")]
 )
 def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sent_key):
-    further = {"loss": loss, "order": order, "sent_key": sent_key, "fresh_key": "fresh", "delay_key": "delay"}
+    further = {"loss": loss, "order": order, "sent_key": sent_key, "delay_key": "delay"}
     transform = ObservationDelay(law, [OBSERVATION], [("agents", "seen")], **further, **options(law))
     outputs = play(delayed(transform), choices())
     observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
-    found = {key: column(outputs, "agents", key) for key in ("seen", "age", "fresh", "delay")}
+    found = {key: column(outputs, "agents", key) for key in ("seen", "age", "delay")}
     done = column(outputs, "done")
     for sender, (w, n) in zip(senders(transform, law, loss), ROWS, strict=True):
         receiver = Receiver(order)
@@ -169,18 +169,13 @@ def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sen
             n_sending = sum(message_sent[at][w]) if sent_key else N_AGENTS
             delay = sender.send(now, observed[at][w][n][4], n_sending)
             delay = delay if sent_key is None or message_sent[at][w][n] else None
-            fresh, held = receiver.step(now, observed[at][w][n], delay), receiver.holds
-            told = -1 if delay is None else delay
-            assert [found[key][at][w][n] for key in found] == [
-                held.content,
-                [now - held.sent],
-                [fresh],
-                [told],
-            ]
+            receiver.step(now, observed[at][w][n], delay)
+            held, told = receiver.holds, -1 if delay is None else delay
+            assert [found[key][at][w][n] for key in found] == [held.content, [now - held.sent], [told]]
             if done[at][w][0]:
                 receiver.begin(now, observed[reset][w][n])
                 sender.begin()
-                assert [found[key][reset][w][n] for key in found] == [observed[reset][w][n], [0], [True], [0]]
+                assert [found[key][reset][w][n] for key in found] == [observed[reset][w][n], [0], [0]]
 
 
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])

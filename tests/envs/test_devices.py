@@ -28,7 +28,6 @@ LINKS = {
     "own": {"delay": DelayConfig(obs=2), "observation": replace(everything().observation, own=True)},
     "updown": {"links": LinkConfig("updown", delay=2, loss=0.1)},
     "matrix": {"links": LinkConfig("matrix", delay=[[0, 1, LAG]] * 3, loss=0.1, range=100.0), "delay": LATE},
-    "limit": {"links": LinkConfig("matrix", limit=2)},
 }
 SCENARIOS = {
     **{name: square(**sections) for name, sections in KINDS.items()},

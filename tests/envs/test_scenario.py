@@ -22,9 +22,6 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "observation.belief: ['belief_gain'] does not go with links=matrix": lambda: square(
         observation=BELIEF, links=LinkConfig("matrix")
     ),
-    "clock.skip: True skips steps": lambda: make_env(
-        square(clock=ClockConfig(skip=True)), extras=["message"]
-    ),
     "extras: mesage is not one of message, state": lambda: make_env(square(), extras=["mesage"]),
     "motion.max_level: 2 m leaves room for 2 flight levels": lambda: make_env(
         square(motion=MotionConfig("polynomial", min_level=1, max_level=2, level_separation=1))

@@ -33,7 +33,6 @@ CASES = {
     "everything": [*WHOLE, "settle=true", "learner.steps=16", "frames=512"],
     "triggered": TRIGGERED,
     "slow clocks": [*SLOW_CLOCKS, "frames=512"],
-    "skipped": ["clock.skip=true", "motion=polynomial", "scenario=energy"],
     "lags": ["delay=lag", "delay.rew=2", "scenario=coverage", "region=random", "region.pool=2"],
     "matrix": ["links=matrix", "links.delay=2", "scenario=mixed", "actions=continuous"],
     "privileged": ["critic=privileged", "source.motion=dynamic", "observation.own=true", "delay.obs=2"],

@@ -3,12 +3,10 @@
 import pytest
 import torch
 from delay_twin import ACTION
-from environments import Servos
 from tensordict import TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, MultiOneHot, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
-from damian.delays.laws import Uniform
 from damian.transforms import ActionDelay, ActionHistory
 
 GROUP = (3, 2)
@@ -75,30 +73,6 @@ def test_every_number_of_every_agent_is_scaled_by_its_own_bounds(spec, low, high
             a, lowest, highest = (float(values[tuple(at)]) for values in (action, low, high))
             expected = (a - lowest) / (highest - lowest) if highest > lowest else 0.0
             assert found[tuple(at)].item() == pytest.approx(expected, abs=1e-6)
-
-
-# Several entries.
-
-
-@pytest.mark.parametrize(("default", "first"), [(None, ([0.0, 0.0], 0)), ([0.5, 3], ([0.5, 0.5], 3))])
-def test_the_entries_of_an_action_travel_as_one_message(default, first):
-    """Each gear is executed with the place that was chosen with it, whatever the delay and the loss."""
-    keys = {"in_keys_inv": ["place", "gear"], "out_keys_inv": ["wish", "gear"]}
-    delay = ActionDelay(Uniform(0, 3), **keys, default=default, loss=0.2, seed=0)
-    env, chosen, ages = TransformedEnv(Servos(), delay), {}, []
-    assert env.action_keys == ["gear", "wish"]
-    now, worlds = env.reset(), torch.arange(3)
-    for t in range(40):
-        now["gear"], now["wish"] = (worlds + t) % 5, (worlds / 5 + t / 40 - 0.7).unsqueeze(-1).repeat(1, 2)
-        wishes, executed = now["wish"].tolist(), delay.inv(now.clone())
-        chosen |= {(w, *wishes[w]): (t, now["gear"][w].item()) for w in range(3)}
-        places, gears = executed["place"].tolist(), executed["gear"].tolist()
-        known = [chosen.get((w, *places[w])) for w in range(3)]
-        for place, gear, found in zip(places, gears, known, strict=True):
-            assert gear == found[1] if found else (place, gear) == first
-        ages.append([t - found[0] if found else None for found in known])
-    assert {None, 0, 1, 2, 3} <= {age for step in ages for age in step}
-    assert len(set(zip(*ages, strict=True))) == 3, "worlds draw apart"
 
 
 # Defaults.

@@ -35,8 +35,6 @@ class World:
     Args:
         n_agents: number of agents, N.
         delay: delay of what is sent on a link at a clock [steps], None if it is lost.
-        limit: number of agents that may send in a step.
-        turn: who may send first at a clock: the agent with the smallest number.
         known: does everyone know everyone's first message.
         own_at_reset: is there an own message at the reset.
     """
@@ -44,14 +42,11 @@ class World:
     def __init__(
         self,
         n_agents: int,
-        delay: Callable[[int, Link, int], int | None],
-        limit: int | None = None,
-        turn: Callable[[int, int], tuple] | None = None,
+        delay: Callable[[int, Link], int | None],
         known: bool = False,
         own_at_reset: bool = True,
     ) -> None:
-        self.agents, self.delay, self.limit = range(n_agents), delay, limit
-        self.turn, self.known, self.own_at_reset = turn, known, own_at_reset
+        self.agents, self.delay, self.known, self.own_at_reset = range(n_agents), delay, known, own_at_reset
         self.clock, self.began = 0, 0
 
     def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
@@ -59,12 +54,8 @@ class World:
         self.clock += 1
         if begins:
             self.began, self.in_transit, self.holds = self.clock, [], {}
-        senders = [*{sender for _, sender in wanted}]
-        if self.limit is not None:
-            senders = sorted(senders, key=lambda sender: self.turn(self.clock, sender))[: self.limit]
         for link in wanted:
-            delay = self.delay(self.clock, link, len(senders)) if link[1] in senders else None
-            if delay is not None:
+            if (delay := self.delay(self.clock, link)) is not None:
                 self.in_transit.append((self.clock + delay, link, self.clock, contents[link[1]]))
         for arrives, link, sent, content in self.in_transit:
             if arrives == self.clock and (link not in self.holds or self.holds[link][0] < sent):
@@ -161,14 +152,10 @@ def twin_of(law: Any, loss: float = 0.0, **rules: Any) -> Callable[[int, Tensor]
     def make(b: int, streams: Tensor) -> World:
         delays = table(law, streams, CLOCKS, loss)
 
-        def order(clock: int, sender: int) -> tuple:
-            stream = streams[b * N * N + (N - 1) * N + sender]
-            return int(counter_rng.bits(stream, *map(torch.tensor, (clock, 4, sender)))), sender
-
-        def delay(clock: int, link: tuple, _: int) -> int | None:
+        def delay(clock: int, link: tuple) -> int | None:
             return delays(clock, b * N * N + link[0] * N + link[1])
 
-        return World(N, delay, turn=order, **rules)
+        return World(N, delay, **rules)
 
     return make
 
@@ -180,15 +167,14 @@ def test_messages_arrive_as_their_law_says(law, known):
     check_against_twin(env, twin_of(law, 0.2, known=known), everyone)
 
 
-@pytest.mark.parametrize("limit", [1, 2])
-def test_a_limit_and_a_flag_choose_who_sends(limit):
-    channel = Channel(Uniform(0, 3), limit=limit, sent_key="message_sent", loss=0.1, known_at_reset=True)
+def test_a_flag_chooses_who_sends():
+    channel = Channel(Uniform(0, 3), sent_key="message_sent", loss=0.1, known_at_reset=True)
 
     def wants(outputs: Any, _: Any, b: int) -> set:
         sent = outputs["agents", "message_sent"][b]
         return {(i, j) for i, j in ALL if sent[j]}
 
-    make = twin_of(Uniform(0, 3), 0.1, limit=limit, known=True)
+    make = twin_of(Uniform(0, 3), 0.1, known=True)
     check_against_twin(counting(channel), make, wants)
 
 
@@ -210,7 +196,7 @@ def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
     def make(b: int, streams: Tensor) -> World:
         tables = {link: table(laws[link[0]][link[1]], streams, CLOCKS) for link in ALL}
 
-        def delay(clock: int, link: tuple, _: int) -> int | None:
+        def delay(clock: int, link: tuple) -> int | None:
             row = b * N * N + link[0] * N + link[1]
             draw = counter_rng.uniform(streams[row], torch.tensor(clock), torch.tensor(3))
             return None if draw < losses[link[0]][link[1]] else tables[link](clock, row)
@@ -268,7 +254,7 @@ def test_a_law_may_read_the_positions_of_sender_and_receiver(navigation):
     now = {}
 
     def make(b: int, _: Tensor) -> World:
-        def delay(clock: int, link: tuple, n_sending: int) -> int | None:
+        def delay(clock: int, link: tuple) -> int | None:
             metres = math.dist(*(place(now["outputs"], b, agent) for agent in link))
             return None if metres > 1.5 else min(math.floor(metres / 0.3), 9)
 
@@ -290,17 +276,6 @@ def test_an_agent_sends_what_its_policy_chooses(navigation):
 
     make = twin_of(Uniform(0, 3), own_at_reset=False)
     check_against_twin(env, make, wants, forced=some_worlds, sent=key)
-
-
-def test_a_limited_medium_is_shared_fairly():
-    env = TransformedEnv(Counting([*range(200)], N, ends=0.0), Channel(0, limit=1, seed=1))
-    steps = env.rollout(20)
-    fresh = torch.stack([*(steps["next", "agents", "received_age"] == 0).unbind(1)])
-    others = ~torch.eye(N, dtype=torch.bool)
-    assert (fresh & others).flatten(-2).sum(-1).eq(N - 1).all()
-    counts = (fresh & others).flatten(0, 1)[:, [1, 2, 0], [0, 1, 2]].sum(0)
-    expected, n = 20 * 200 / N, 20 * 200
-    assert all(abs(count - expected) < 5 * math.sqrt(n * 2 / 9) for count in counts.tolist())
 
 
 def test_a_chosen_message_is_an_action_that_the_environment_never_gets():

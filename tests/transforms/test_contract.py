@@ -18,7 +18,6 @@ from environments import (
     REWARD,
     Drift,
     Kind,
-    Servos,
     cartpole,
     uavs,
     unserved,
@@ -72,9 +71,6 @@ def _belief() -> Transform:
 CASES = {
     "Belief": Case(uavs, _belief),
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
-    "ActionDelay, two entries": Case(
-        Servos, lambda: ActionDelay(LATE, ["place", "gear"], ["wish", "gear"], loss=0.2)
-    ),
     "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
     "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
     "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),
@@ -94,7 +90,7 @@ CASES = {
         lambda: ObservationTimeline(3, ("agents", "message"), sent_key="message_sent", group=True, own=True),
     ),
     "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
-    "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"}, fresh_key="fresh")),
+    "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"})),
     "ObservationDelay, agents": Case(
         uavs,
         lambda: ObservationDelay(LATE, [OBSERVATION], loss=0.2, delay_key="delay", sent_key="message_sent"),
@@ -105,7 +101,7 @@ CASES = {
     "Channel, links": Case(
         uavs,
         lambda: Channel(
-            [[0, LATE, 1], [3, 0, 0], [0, LATE, 0]], OBSERVATION, loss=0.2, limit=2, sent_key="message_sent"
+            [[0, LATE, 1], [3, 0, 0], [0, LATE, 0]], OBSERVATION, loss=0.2, sent_key="message_sent"
         ),
     ),
     "Channel, messages": Case(uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)),
@@ -144,7 +140,7 @@ GROUPS = {name: kind for name, kind in KINDS.items() if isinstance(kind.observat
 
 
 def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
-    return ObservationDelay(law, kind.observation, fresh_key="fresh", delay_key="delay", **options)
+    return ObservationDelay(law, kind.observation, delay_key="delay", **options)
 
 
 TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {

@@ -124,14 +124,3 @@ def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_
             expected = [action if since - at < reflected_after else default for at, action in latest]
             assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)
             recorded = [] if done[t][w][0] else recorded
-
-
-@pytest.mark.parametrize("clocks", [[3], [2, 3], [1]])
-def test_the_age_is_that_of_the_observation_that_clocks_hold(law, clocks):
-    late = ObservationDelay(law, [OBSERVATION], order="arrival")
-    slow = [SampleAndHold(period, [OBSERVATION], age_key="age") for period in clocks]
-    outputs = play(delayed(late, *slow), choices())
-    sent_at = torch.tensor(column(outputs, *OBSERVATION))[..., 2]
-    age = torch.tensor(column(outputs, "agents", "age")).squeeze(-1)
-    now = (torch.arange(len(outputs)) + 1) // 2
-    assert age.equal((now.view(-1, 1, 1) - sent_at).float())

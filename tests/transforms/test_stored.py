@@ -45,9 +45,7 @@ KINDS: dict[str, tuple[Callable[[], EnvBase], Any]] = {
     "VMAS": (vmas, AGENTS),
 }
 CHAINS: dict[str, Callable[[Any, Any, Any], Transform]] = {
-    "observation": lambda o, a, r: ObservationDelay(
-        LATE, [o], loss=0.1, fresh_key="new", delay_key="d", seed=1
-    ),
+    "observation": lambda o, a, r: ObservationDelay(LATE, [o], loss=0.1, delay_key="d", seed=1),
     "reward": lambda o, a, r: RewardDelay(LATE, r, seed=1),
     "sum": lambda o, a, r: CumulativeReward(3, 0.9, r),
     "clock": lambda o, a, r: SampleAndHold(3, [o]),
@@ -55,7 +53,7 @@ CHAINS: dict[str, Callable[[Any, Any, Any], Transform]] = {
     "all": lambda o, a, r: Compose(
         ObservationDelay(LATE, [o], order="arrival", seed=1),
         Compose(RewardDelay(LATE, r, seed=2), CumulativeReward(2, 0.9, r)),
-        SampleAndHold(2, [o], age_key="age"),
+        SampleAndHold(2, [o]),
         ActionHistory(2, a, append_to=o, age_key="age"),
         RewardSum([r], ["sum"] if isinstance(r, str) else [("agents", "sum")]),
         InitTracker(),
