@@ -13,6 +13,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.world.config import RegionConfig
+from damian.world.paths import Detours, detours
 from damian.world.regions.polygon import RESOLUTION, Floats, landing_lattice, largest_vertex_distance
 from damian.world.regions.region import Region
 
@@ -55,6 +56,7 @@ class Airspace(NamedTuple):
         edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres, double precision.
         scale: largest distance between two vertices, [R] metres; features divide distances by it.
         offset: place of the local origin in the coordinates of the settings, [R, 2] metres.
+        detours: ways between landing points that are not straight; None if all are.
     """
 
     points: Tensor
@@ -65,11 +67,26 @@ class Airspace(NamedTuple):
     scale: Tensor
     offset: Tensor
     regions: tuple[Region, ...]
+    detours: Detours | None
 
     @property
     def max_points(self) -> int:
         """Largest number of landing points in a region (L)."""
         return self.points.shape[1]
+
+    def way(self, origin: Tensor, goal: Tensor) -> Tensor:
+        """Places on the ways between landing points, flat ids [*], from end to end, [*, W, 2] metres."""
+        points = self.points.flatten(0, 1)
+        if self.detours is not None:
+            return self.detours.way(origin, goal, points)
+        return torch.stack([gather_rows(points, origin), gather_rows(points, goal)], -2)
+
+    def length(self, origin: Tensor, goal: Tensor) -> Tensor:
+        """Lengths of the ways between landing points, flat ids [*], in m [*]; infinite if there is none."""
+        points = self.points.flatten(0, 1)
+        if self.detours is not None:
+            return self.detours.length(origin, goal, points)
+        return torch.linalg.vector_norm(gather_rows(points, goal) - gather_rows(points, origin), dim=-1)
 
     def nearest(self, places: Floats, region: int) -> Tensor:
         """The landing points nearest to places [P, 2] m, as ids within their region, [P]."""
@@ -77,8 +94,14 @@ class Airspace(NamedTuple):
         return nearest_points(self.cells, self.exact_points, regions, target, 1).squeeze(-1)
 
 
-def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -> Airspace:
-    """Lay the lattice of landing points over each region, as the settings of regions say."""
+def build_airspace(
+    regions: list[Region], config: RegionConfig, n_agents: int, longest: float = math.inf
+) -> Airspace:
+    """Lay the lattice of landing points over each region, as the settings of regions say.
+
+    ``longest`` is the longest action [m]; landing points more than twice as far apart are not connected in a
+    region that is not convex.
+    """
     step, degrees, n_points = config.lattice_step, config.lattice_angle, config.n_landing_points
     lattices = [landing_lattice(r.polygon, step, degrees, n_points) for r in regions]
     for region, lattice in zip(regions, lattices, strict=True):
@@ -95,6 +118,7 @@ def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -
         scale=torch.tensor([largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32),
         offset=torch.tensor([r.offset for r in regions], dtype=torch.float32),
         regions=tuple(regions),
+        detours=detours([region.polygon for region in regions], lattices, 2 * longest + step),
     )
 
 

@@ -39,6 +39,13 @@ class RegionConfig(Settings):
     where: Any = setting(
         None, "Property of the feature, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
+    zones: Any = setting(
+        [],
+        "No-fly zones: a list of the corners of each (places, as those of a source), a map, or the number of "
+        "random ones.",
+    )
+    zone_area: float = setting(2500.0, "Area of a random zone.", unit="m^2", above=0)
+    zone_margin: float = setting(0.0, "Distance that UAVs keep from zones.", unit="m", low=0)
     lattice_step: float = setting(30.0, "Distance between landing points of a row.", unit="m", above=0)
     lattice_angle: float = setting(45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90)
     n_landing_points: int | None = setting(
@@ -71,6 +78,20 @@ class RegionConfig(Settings):
         self.refuse(not good, "where", problem)
         both = self.index is not None and self.where is not None
         self.refuse(both, "where", "and region.index both choose; give one of them")
+        drawn, listed = checks.is_number(self.zones), isinstance(self.zones, list)
+        wrong = (
+            self.zones % 1 or not 0 <= self.zones <= 100 if drawn else not isinstance(self.zones, list | str)
+        )
+        problem = "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100"
+        self.refuse(wrong, "zones", problem)
+        for zone in self.zones if listed else []:
+            good = isinstance(zone, list) and len(zone) > 2
+            problem = (
+                "has a zone that is not a list of three or more corners: region.zones=[[[0,0],[50,0],[0,50]]]"
+            )
+            self.refuse(not good, "zones", problem)
+            for place in zone:
+                check_place("region.zones", place)
         self.refuse_unread()
         for place in self.start_positions or []:
             check_place("region.start_positions", place)

@@ -39,7 +39,7 @@ class Ranking(NamedTuple):
     point: Tensor
     """Ids of the landing points within their region, [M, K]."""
     distance: Tensor
-    """Distance from the point where the UAV stands [m], [M, K]."""
+    """Length of the way from the point where the UAV stands [m], [M, K]."""
 
 
 class Candidates:
@@ -64,13 +64,12 @@ class Candidates:
         action = action.double().clamp(0, 1)
         move = displacement(action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi).flatten(0, 1)
         own, base = flat.flatten(), (flat - flat % self.airspace.max_points).flatten()
-        points, exact_points = self.airspace.points.flatten(0, 1), self.airspace.exact_points
+        exact_points = self.airspace.exact_points
         target = gather_rows(exact_points.flatten(0, 1), own) + move
         where = region.unsqueeze(-1).expand_as(flat).flatten(), target, own - base
         edges, cells = self.airspace.edges, [*self.airspace.cells]
         nearest = _nearest_inside(edges, cells, exact_points, *where, self.n_candidates)
-        offset = gather_rows(points, nearest + base.unsqueeze(-1)) - gather_rows(points, own).unsqueeze(1)
-        distance = torch.linalg.vector_norm(offset, dim=-1)
+        distance = self.airspace.length(own.unsqueeze(1).expand_as(nearest), nearest + base.unsqueeze(-1))
         return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
 
     def goals(self) -> Tensor:
@@ -100,7 +99,7 @@ class Candidates:
 
     def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
         """Candidates [P, A, K] of moves from the points ``own`` [P], and whether these end inside [P, A]."""
-        polygon, points = self.airspace.regions[region].polygon, self.airspace.points[region]
+        polygon, base = self.airspace.regions[region].polygon, region * self.airspace.max_points
         target = self.airspace.exact_points[region, own].unsqueeze(1) + move
         shapely.prepare(polygon)
         within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
@@ -108,8 +107,8 @@ class Candidates:
         cells, exact_points = self.airspace.cells, self.airspace.exact_points
         nearest = _nearest_or_own(cells, exact_points, *where, within.flatten(), self.n_candidates)
         nearest = nearest.view(*within.shape, -1)
-        offset = gather_rows(points, nearest) - points[own, None, None]
-        return Ranking(nearest, torch.linalg.vector_norm(offset, dim=-1)), within
+        origin = (own + base).view(-1, 1, 1).expand_as(nearest)
+        return Ranking(nearest, self.airspace.length(origin, nearest + base)), within
 
 
 @torch.library.custom_op("damian::nearest_inside", mutates_args=())

@@ -52,28 +52,37 @@ def minimum_time(length: Tensor, degree: int, max_speed: float, max_acceleration
     return torch.maximum(for_speed, for_acceleration)
 
 
+def place_on(way: Tensor, share: Tensor) -> Tensor:
+    """Places [*, 2] m after a share [*] of the ways over places [*, W, 2] m."""
+    if way.shape[-2] == 2:
+        return torch.lerp(way[..., 0, :], way[..., 1, :], share.unsqueeze(-1))
+    legs = way.diff(dim=-2)
+    length = torch.linalg.vector_norm(legs, dim=-1)
+    since = (share * length.sum(-1)).unsqueeze(-1) - (length.cumsum(-1) - length)  # since each leg began [m]
+    done = (since / length.clamp_min(_TINY)).clamp(0, 1) * (length > 0)
+    return way[..., 0, :] + (done.unsqueeze(-1) * legs).sum(-2)
+
+
 def poses(
-    origin: Tensor,
-    target: Tensor,
+    way: Tensor,
     level: Tensor,
     elapsed: Tensor,
     vertical: Tensor,
     cruise: Tensor,
     degree: int,
 ) -> tuple[Tensor, Tensor]:
-    """Positions [*, 3] m of UAVs ``elapsed`` seconds after takeoff, and the distances cruised so far [*] m.
+    """Positions [*, 3] m of UAVs ``elapsed`` seconds after takeoff, and how much of the cruise is flown [*].
 
     After their flights, they stand at the targets.
 
-    ``origin`` and ``target`` [*, 2] m, ``level`` above 0 [*] m, and durations [s] of takeoff or landing,
-    above 0, and of the cruise, 0 for no flight; ``elapsed`` in double precision.
+    ``way``: places from the origin to the target, [*, W, 2] m, ``level`` above 0 [*] m, and durations [s] of
+    takeoff or landing, above 0, and of the cruise, 0 for no flight; ``elapsed`` in double precision. The
+    second result is a share, from 0 to 1.
     """
     # A landing is a takeoff reversed in time, s(1 - tau) = 1 - s(tau), so one evaluation serves both.
     remaining = torch.add(cruise, vertical, alpha=2) - elapsed
     climbing = torch.minimum(elapsed, remaining) / vertical
     cruising = (elapsed - vertical) / cruise.clamp_min(_TINY)
-    shares = torch.stack([climbing, cruising]).to(origin.dtype)
+    shares = torch.stack([climbing, cruising]).to(way.dtype)
     climbed, crossed = time_law(shares, degree).unbind(0)
-    place = torch.lerp(origin, target, crossed.unsqueeze(-1))
-    position = torch.cat([place, (level * climbed).unsqueeze(-1)], dim=-1)
-    return position, crossed * torch.linalg.vector_norm(target - origin, dim=-1)
+    return torch.cat([place_on(way, crossed), (level * climbed).unsqueeze(-1)], dim=-1), crossed

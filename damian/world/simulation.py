@@ -31,7 +31,8 @@ class Simulation:
         self.config, self.dt = config, dt
         self.sensors = sensors_of(config.sensors)
         self.radius = footprint_radius(config.source)
-        self.airspace = build_airspace(regions_of(config.region, rng), config.region, config.agents)
+        regions, longest = regions_of(config.region, rng), max(config.actions.distances)
+        self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         region, start, self.walk = _draw_initial_conditions(config, self.airspace, rng)
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)

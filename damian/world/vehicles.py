@@ -33,7 +33,7 @@ class MotionModel(ABC):
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt
-        self.points = airspace.points.flatten(0, 1)
+        self.airspace, self.points = airspace, airspace.points.flatten(0, 1)
         levels = flight_levels(config.motion, config.agents, shared=self.instant)
         if not self.instant:
             check_levels(levels, airspace)
@@ -83,11 +83,6 @@ class MotionModel(ABC):
             return torch.full_like(state.battery, checks.METRES)
         return cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
 
-    def length(self, origin: Tensor, goal: Tensor) -> Tensor:
-        """Distance between two landing points, given by flat ids [B, N], in metres [B, N]."""
-        offset = gather_rows(self.points, goal) - gather_rows(self.points, origin)
-        return torch.linalg.vector_norm(offset, dim=-1)
-
     def shortest_time(self, length: Tensor) -> Tensor:
         """Shortest duration [s] of a flight phase of the given length [m], any shape."""
         motion = self.motion
@@ -127,7 +122,7 @@ class InstantMotion(MotionModel):
         state = state._replace(position=torch.cat([place, torch.zeros_like(place[..., :1])], -1))
         if not self.battery.enabled:
             return state
-        length = self.length(state.origin, state.goal)
+        length = self.airspace.length(state.origin, state.goal)
         drain = flight_drain(self.vertical, length, self.battery) * (length > 0)
         return state._replace(battery=self.battery_after(state.battery, drain, length == 0, state.goal))
 
@@ -152,7 +147,7 @@ class PolynomialFlight(MotionModel):
 
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
         state = state._replace(origin=torch.where(ready, state.goal, state.origin), goal=goal)
-        cruise = self.shortest_time(self.length(state.origin, state.goal))
+        cruise = self.shortest_time(self.airspace.length(state.origin, state.goal))
         return state._replace(
             elapsed=torch.where(ready, 0, state.elapsed),
             vertical=torch.where(ready, self.vertical * departs, state.vertical),
@@ -163,12 +158,13 @@ class PolynomialFlight(MotionModel):
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)
         elapsed, times = state.elapsed.double() * self.dt, (state.vertical, state.cruise)
-        ends = gather_rows(self.points, state.origin), gather_rows(self.points, state.goal)
-        position, cruised = poses(*ends, self.levels, elapsed, *times, self.motion.degree)
+        way = self.airspace.way(state.origin, state.goal)
+        position, crossed = poses(way, self.levels, elapsed, *times, self.motion.degree)
         state = state._replace(position=position)
         if not self.battery.enabled:
             return state
         # From the latest decision on, not from step to step, because rounding errors would add up.
+        cruised = crossed * self.airspace.length(state.origin, state.goal)
         used = used_so_far(elapsed, state.vertical, state.cruise, cruised, self.battery)
         rested = (state.elapsed - self.steps(state)).clamp(min=0)
         battery = self.battery_after(state.battery_before, used.to(cruised.dtype), rested, state.goal)

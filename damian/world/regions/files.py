@@ -44,7 +44,9 @@ class _Feature(NamedTuple):
         return f"is a {kind}{' without corners' * (kind in _AREAS)}" if kind else "has no geometry"
 
 
-def read_area(path: str | os.PathLike[str], index: Any = None, where: Any = None) -> Region:
+def read_area(
+    path: str | os.PathLike[str], index: Any = None, where: Any = None, every: bool = False
+) -> Region:
     """Read one area of a file, or unite several; the suffix of the file says how it is read.
 
     An area is a Polygon, a MultiPolygon, or what a GeometryCollection has of them. Heights are ignored.
@@ -56,6 +58,7 @@ def read_area(path: str | os.PathLike[str], index: Any = None, where: Any = None
         path: the file.
         index: the feature's index, counted from 0 over all features of the file, or a list of them.
         where: a property that only the feature has, as ``property:value`` or ``property=value``, or a list.
+        every: unite all features that are areas.
 
     Raises:
         InputError: the file cannot be read, the chosen geometry is invalid, or the choice does not single
@@ -66,7 +69,8 @@ def read_area(path: str | os.PathLike[str], index: Any = None, where: Any = None
     with named(path):
         try:
             features = read(path)
-            chosen = _choose(features, index, where)
+            areas = [number for number, each in enumerate(features) if not each.fault]
+            chosen = _choose(features, areas if every and areas else index, where)
             parts, excluded = (
                 [
                     [_degrees(ring, each) for ring in rings]

@@ -69,7 +69,7 @@ def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
     ``region.vertices``; of a file: about the area's centroid), or, where a file gives the region,
     ``{lat: 53.1, lon: -4.5}`` in degrees. ``key`` is that of the setting, for errors.
     """
-    local = np.array([_local_place(key, place, region) for place in places])
+    local = to_local_places(key, places, region)
     inside = shapely.contains_xy(region.polygon, local)
     if not inside.all():
         first = int(np.argmin(inside))
@@ -79,6 +79,11 @@ def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
         bounds = f"x {west:.10g} to {east:.10g} m, y {south:.10g} to {north:.10g} m"
         raise InputError(f"{key}: {shown} is not inside {region.name} ({bounds})")
     return local
+
+
+def to_local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
+    """As ``local_places``, but they may lie anywhere."""
+    return np.array([_local_place(key, place, region) for place in places])
 
 
 def _local_place(key: str, place: Any, region: Region) -> Floats:

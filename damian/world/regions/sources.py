@@ -2,8 +2,12 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
+from typing import cast
 
 import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common import checks
 from damian.common.registry import Registry
@@ -11,8 +15,14 @@ from damian.common.text_files import data_file
 from damian.world.config import RegionConfig
 from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
-from damian.world.regions.polygon import polygon_from_vertices, random_polygon
-from damian.world.regions.region import Region, centred
+from damian.world.regions.geodesy import Floats, to_latlon, to_local
+from damian.world.regions.polygon import (
+    polygon_from_rings,
+    polygon_from_vertices,
+    random_polygon,
+    sample_interior,
+)
+from damian.world.regions.region import Region, centred, to_local_places
 
 RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]
 """From the settings and a random generator to the regions; each episode flies over one of them."""
@@ -44,10 +54,51 @@ def _region_of_map(config: RegionConfig, rng: np.random.Generator) -> list[Regio
     return [read_area(data_file(config.path), config.index, config.where)]
 
 
+def _without_zones(region: Region, config: RegionConfig, rng: np.random.Generator) -> Region:
+    """The region without the zones where nobody lands or flies, which become holes of it or cut its edge."""
+    if not config.zones:
+        return region
+    if isinstance(config.zones, list):
+        zones = [
+            polygon_from_rings([to_local_places("region.zones", corners, region)], "region.zones", "m")
+            for corners in config.zones
+        ]
+    elif isinstance(config.zones, str):
+        zones = [_zones_of_map(config.zones, region)]
+    else:
+        zones = [_random_zone(region.polygon, config, rng) for _ in range(int(config.zones))]
+    margin = config.zone_margin
+    kept = region.polygon - shapely.union_all(shapely.buffer(zones, margin, join_style="mitre"))
+    checks.require(not kept.is_empty, "region.zones", config.zones, f"leave nothing of {region.name}")
+    return replace(region, polygon=cast(Polygon | MultiPolygon, kept))
+
+
+def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
+    """All areas of a map, in local metres of a region."""
+    problem = f"is a map, but {region.name} has no position on Earth: give corners in metres"
+    checks.require(region.origin is not None, "region.zones", path, problem)
+    area = read_area(data_file(path), every=True)
+    origins = cast(tuple[float, float], area.origin), cast(tuple[float, float], region.origin)
+
+    def moved(places: Floats) -> Floats:
+        latitude, longitude = to_latlon(places[:, 0], places[:, 1], origins[0])
+        return np.column_stack(to_local(latitude, longitude, origins[1]))
+
+    return shapely.transform(area.polygon, moved)
+
+
+def _random_zone(polygon: Polygon | MultiPolygon, config: RegionConfig, rng: np.random.Generator) -> Polygon:
+    """A random convex zone about a place in the region."""
+    zone = random_polygon(rng, config.zone_area, 2 * config.zone_area)
+    place = sample_interior(polygon, 1, rng)[0]
+    scale = np.sqrt(config.zone_area / zone.area)
+    return shapely.transform(zone, lambda corners: place + scale * corners)
+
+
 def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     """Read the region from its file or vertices, or draw ``pool`` random regions."""
     source = REGION_SOURCES.get(config.kind, "region.kind")
-    found = [centred(region) for region in source(config, rng)]
+    found = [_without_zones(centred(region), config, rng) for region in source(config, rng)]
     most, problem = config.initial_conditions, "regions: each needs at least one initial condition"
     checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
     return found
