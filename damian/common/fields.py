@@ -37,6 +37,8 @@ class Rule:
     paths: bool = False
     kinds: tuple[str, ...] = ()
     """Kinds of the section that read this setting; all of them if empty. Another kind does not have it."""
+    each: bool = False
+    """A list gives one value for each UAV."""
     fixed: bool = False
     """A constant: no key of the command line or of a file, but Python programs may set it."""
     unit: str = ""
@@ -73,6 +75,8 @@ class Settings:
     def checked(self, name: str, value: Any) -> Any:
         """A value of a field in its declared type, if it is within the bounds of the field."""
         hint = _hints(type(self))[name]
+        if rules(type(self))[name].each and isinstance(plain(value), list):
+            return [self.checked(name, each) for each in plain(value)]
         value = _converted(self.key(name), value, hint)
         if value is not None:
             _check_value(self.key(name), value, rules(type(self))[name], _base(hint))

@@ -189,7 +189,7 @@ class UavEnv(EnvBase):
             worlds = self.simulation.reset(worlds, mask)
         condition = worlds.integers[:, INITIAL_CONDITION]
         outputs = {k: table.index_select(0, condition) for k, table in self._reset_outputs.items()}
-        if self.simulation.sensors:  # a table cannot hold first readings, which differ in every episode
+        if self.simulation.draws:  # a table cannot hold first readings, which differ in every episode
             state = self.simulation.layout.unpack(worlds)
             features = self.server.features(state.sent, state.steps)
             truth = {keys.STATE: outputs[keys.STATE]} if keys.STATE in outputs else {}

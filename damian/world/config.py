@@ -1,14 +1,28 @@
 """Settings of the simulated world: UAVs, region, motion, signal source, batteries and actions."""
 
+import functools
 import re
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.common.fields import Settings, check_place, constant, setting
+from damian.common.fields import Settings, check_place, constant, rules, setting
 
 RANDOM, GEOJSON, FILES = ("random",), ("geojson",), ("fir", "geojson")
 POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
+
+
+RANDOMISED = (
+    "motion.max_speed",
+    "motion.max_acceleration",
+    "battery.capacity_kwh",
+    "wind.speed",
+    "wind.direction",
+    "wind.gusts",
+    "source.miss",
+    "source.false_alarm",
+)
+"""Settings that may be drawn for each world and episode."""
 
 
 @dataclass
@@ -110,8 +124,15 @@ class MotionConfig(Settings):
         paths=True,
     )
     degree: int = setting(5, "Degree of the time law of each phase.", choices=(3, 5, 7), kinds=POLYNOMIAL)
-    max_speed: float = setting(5.0, "Speed limit.", unit="m/s", low=1e-3, kinds=POLYNOMIAL)
-    max_acceleration: float = setting(2.0, "Acceleration limit.", unit="m/s^2", low=1e-3, kinds=POLYNOMIAL)
+    max_speed: float = setting(
+        5.0, "Largest speed through the air.", unit="m/s", low=1e-3, kinds=POLYNOMIAL, each=True
+    )
+    max_acceleration: float = setting(
+        2.0, "Acceleration limit.", unit="m/s^2", low=1e-3, kinds=POLYNOMIAL, each=True
+    )
+    min_ground_speed: float = setting(
+        1.0, "A flight that wind would make slower is not flown.", unit="m/s", above=0, kinds=POLYNOMIAL
+    )
     sensing_time: float = setting(0.0, "Time that a landed UAV senses before it chooses.", unit="s", low=0)
     min_level: float = setting(1.0, "Flight level of the first UAV.", unit="m", above=0)
     max_level: float = setting(
@@ -125,6 +146,29 @@ class MotionConfig(Settings):
         unread = self.options is not None and ":" not in self.kind
         self.refuse(unread, "options", f"means nothing with motion.kind={self.kind}")
         checks.in_range("motion.max_level", self.max_level, self.min_level, unit="m")
+
+
+@dataclass
+class WindConfig(Settings):
+    """Wind, which flights that take time feel."""
+
+    section: ClassVar[str] = "wind"
+
+    speed: float = setting(0.0, "Mean speed of the wind.", unit="m/s", low=0, high=100)
+    direction: float | None = setting(
+        None,
+        "Whence it blows, clockwise from north; drawn for each episode if not given.",
+        unit="deg",
+        low=-360,
+        high=360,
+    )
+    gusts: float = setting(
+        0.0,
+        "Standard deviation, east and north, of the wind of a flight from the mean.",
+        unit="m/s",
+        low=0,
+        high=30,
+    )
 
 
 @dataclass
@@ -142,6 +186,10 @@ class SourceConfig(Settings):
         "constant",
         "constant, or on and off, drawn at each stop (per_stop) or simulation step (per_step).",
         choices=("constant", "per_stop", "per_step"),
+    )
+    miss: float = setting(0.0, "Probability that a UAV in reach does not detect it.", low=0, high=1)
+    false_alarm: float = setting(
+        0.0, "Probability that a listening UAV which is out of reach reports a detection.", low=0, high=1
     )
     emission_probability: float = setting(0.5, "Probability that it is on, if not constant.", low=0, high=1)
     after_walk: str = setting(
@@ -199,14 +247,23 @@ class BatteryConfig(Settings):
 
     enabled: bool = setting(False, "Whether flights drain the battery.", kinds=CHARGING)
     engine_power_kw: float = setting(
-        10.0, "Power at the reference speed, and in takeoff and landing.", unit="kW", above=0, kinds=CHARGING
+        10.0,
+        "Power at the reference speed, and in takeoff and landing.",
+        unit="kW",
+        above=0,
+        kinds=CHARGING,
+        each=True,
     )
     reference_speed: float = setting(
         20.0, "Cruise speed at which the engine takes its full power.", unit="m/s", above=0, kinds=CHARGING
     )
-    capacity_kwh: float = setting(9.0, "Energy of a full battery.", unit="kWh", low=1e-6, kinds=CHARGING)
+    capacity_kwh: float = setting(
+        9.0, "Energy of a full battery.", unit="kWh", low=1e-6, kinds=CHARGING, each=True
+    )
     efficiency: float = setting(12.0, "Factor that divides the consumption.", above=0, kinds=CHARGING)
-    charging_power_kw: float = setting(4.0, "Power of a charging UAV.", unit="kW", above=0, kinds=CHARGING)
+    charging_power_kw: float = setting(
+        4.0, "Power of a charging UAV.", unit="kW", above=0, kinds=CHARGING, each=True
+    )
     resolution: float = setting(
         5.0, "Observed levels are multiples of this.", unit="%", above=0, high=100, kinds=CHARGING
     )
@@ -269,9 +326,15 @@ class WorldConfig(Settings):
     agents: int = setting(3, "Number of UAVs.", low=1, high=1000)
     region: RegionConfig = setting(RegionConfig)
     motion: MotionConfig = setting(MotionConfig)
+    wind: WindConfig = setting(WindConfig)
     source: SourceConfig = setting(SourceConfig)
     battery: BatteryConfig = setting(BatteryConfig)
     actions: ActionConfig = setting(ActionConfig)
+    randomise: dict[str, Any] = setting(
+        {},
+        "Settings that are drawn for each world and episode, such as {wind.speed: [0, 6]}: from a range, or "
+        "from a list of more than two values.",
+    )
     sensors: list[Any] = setting(
         [], "Sensors of your own: package.module:name, or {sensor: package.module:name, parameter: ...}."
     )
@@ -281,3 +344,29 @@ class WorldConfig(Settings):
         starts = self.region.start_positions
         wrong = starts is not None and len(starts) != self.agents
         self.refuse(wrong, "region.start_positions", f"is not one place for each of the {self.agents} UAVs")
+        for section in (self.motion, self.battery):
+            for name, rule in rules(type(section)).items():
+                values = getattr(section, name)
+                wrong = rule.each and isinstance(values, list) and len(values) != self.agents
+                problem = f"is not one value for each of the {self.agents} UAVs"
+                self.refuse(wrong, f"{section.section}.{name}", problem)
+        self._check_randomise()
+        problem = "needs motion=polynomial: instant flights feel no wind"
+        self.refuse(self.is_windy and self.motion.kind == "instant", "wind", problem)
+
+    @property
+    def is_windy(self) -> bool:
+        """Whether there may be wind."""
+        drawn = {"wind.speed", "wind.gusts"} & {*self.randomise}
+        return bool(self.wind.speed or self.wind.gusts or drawn)
+
+    def _check_randomise(self) -> None:
+        """Refuse what cannot be drawn; each value must be one that the setting may have."""
+        for key, values in self.randomise.items():
+            own = f"randomise.{key}"
+            checks.require(key in RANDOMISED, own, values, f"cannot be drawn, only {', '.join(RANDOMISED)}")
+            good = isinstance(values, list) and 2 <= len(values) <= 8
+            checks.require(good, own, values, "is not a range or a list of at most 8 values")
+            section, _, name = key.rpartition(".")
+            for value in values:
+                functools.reduce(getattr, section.split("."), self).checked(name, value)

@@ -91,6 +91,8 @@ class Candidates:
             for table_of_all, part in zip(self.ranking, ranked, strict=True):
                 table_of_all[region, own] = part.to(table_of_all.dtype)
             self.distance[region, own] = ranked.distance[..., 0].where(within, torch.inf)
+        base = torch.arange(len(counts)).view(-1, 1, 1) * self.airspace.max_points
+        self.nearest = (self.ranking.point[..., 0] + base).flatten(0, 1)  # flat ids, [R*L, A]
         self.ranking = Ranking(*(each.flatten(0, 2) for each in self.ranking))
         self.distance = self.distance.flatten(0, 1)
         holds = table[:, 0] == 0

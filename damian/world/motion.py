@@ -7,6 +7,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.world.config import MotionConfig
+from damian.world.values import Value, times
 
 _TINY = 1e-9
 # Largest first and second derivative of each time law over tau in [0, 1].
@@ -42,13 +43,13 @@ def time_law(tau: Tensor, degree: int) -> Tensor:
     return t.pow(4) * (((70 - 20 * t) * t - 84) * t + 35)
 
 
-def minimum_time(length: Tensor, degree: int, max_speed: float, max_acceleration: float) -> Tensor:
+def minimum_time(length: Tensor, degree: int, max_speed: Value, max_acceleration: Value) -> Tensor:
     """Shortest time [s] of a rest-to-rest phase [m] within limits of speed and acceleration, [*].
 
     Closed form: the time law's largest derivatives are constants, so each limit gives one time.
     """
-    for_speed = length * (_PEAK_SPEED[degree] / max_speed)
-    for_acceleration = (length * (_PEAK_ACCELERATION[degree] / max_acceleration)).sqrt()
+    for_speed = times(length, _PEAK_SPEED[degree] / max_speed)
+    for_acceleration = times(length, _PEAK_ACCELERATION[degree] / max_acceleration).sqrt()
     return torch.maximum(for_speed, for_acceleration)
 
 
@@ -61,6 +62,23 @@ def place_on(way: Tensor, share: Tensor) -> Tensor:
     since = (share * length.sum(-1)).unsqueeze(-1) - (length.cumsum(-1) - length)  # since each leg began [m]
     done = (since / length.clamp_min(_TINY)).clamp(0, 1) * (length > 0)
     return way[..., 0, :] + (done.unsqueeze(-1) * legs).sum(-2)
+
+
+def air_length(way: Tensor, wind: Tensor, airspeed: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Way through the air [*] m of flights over places [*, W, 2] m, and their lowest ground speeds [*] m/s.
+
+    A leg of length L, flown at the ``airspeed`` v [*] m/s, has the ground speed sqrt(v^2 - cross^2) + along,
+    by the wind across and along it; its way through the air is L v over that. ``wind`` [*, 2] m/s: the way in
+    which it blows, east and north; ground speeds below ``least`` count as this.
+    """
+    legs = way.diff(dim=-2)
+    length = torch.linalg.vector_norm(legs, dim=-1)  # [*, W - 1]
+    along = (legs * wind.unsqueeze(-2)).sum(-1) / length.clamp_min(_TINY)
+    cross = (wind.square().sum(-1, keepdim=True) - along.square()).clamp_min(0)
+    speed = airspeed.unsqueeze(-1)
+    ground = (speed.square() - cross).clamp_min(0).sqrt() + along
+    slowest = torch.where(length > 0, ground, torch.inf).amin(-1)
+    return (length * speed / ground.clamp_min(least)).sum(-1), slowest
 
 
 def poses(

@@ -13,7 +13,7 @@ from damian.common.tensors import gather_rows, move_attributes, tree_map
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
-from damian.world.landing import Candidates, assign_landing_points
+from damian.world.landing import Candidates, Ranking, assign_landing_points
 from damian.world.messages import Messages
 from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
@@ -21,6 +21,8 @@ from damian.world.sensors import sensors_of
 from damian.world.signal_source import Walk, draw_walks, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import MOTION_MODELS
+
+_REPORT = counter_rng.number_of("report")
 
 
 class Simulation:
@@ -38,6 +40,9 @@ class Simulation:
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         shortest = self._shortest_flights()
+        source = config.source
+        self.draws = bool(self.sensors or self.vehicles.values.choices or source.miss or source.false_alarm)
+        """Whether first messages differ from episode to episode that begins alike."""
         self.shortest_flight = shortest if config.battery.enabled else None
         self.initial = self._initial_state(region, start, stops, seed)
         self.layout = StateLayout(self.initial)
@@ -71,10 +76,11 @@ class Simulation:
         condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
         fresh = fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
-        if not self.sensors:
+        if not self.draws:
             return fresh
-        state = self.layout.unpack(fresh)  # the first messages get the readings of this episode
-        return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
+        state = self.layout.unpack(fresh)  # the first messages tell what is drawn for this episode
+        drawn = self.vehicles.values.draw(state.seed, state.episode)
+        return self.layout.pack(self._first_messages(state._replace(drawn=drawn)))
 
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
         """Simulate one step; actions of UAVs that are not ready change nothing.
@@ -89,6 +95,10 @@ class Simulation:
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
         distance = gather_rows(self.candidates.distance, state.goal)
+        if self.vehicles.is_windy:
+            nearest = gather_rows(self.candidates.nearest, state.goal)
+            origin = state.goal.unsqueeze(-1).expand_as(nearest)
+            distance = self.vehicles.distance(state, origin, nearest).where(distance.isfinite(), torch.inf)
         reach = self.vehicles.reach(state).unsqueeze(-1)
         valid = distance <= reach
         if not self.candidates.can_hold:
@@ -102,6 +112,8 @@ class Simulation:
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
         ranking, row = self.candidates.rank(state.goal, state.region, action)
+        if self.vehicles.is_windy:
+            ranking, row = self._in_wind(state, ranking, row)
         reach = self.vehicles.reach(state)
         if action_valid is not None:
             reach = torch.where(action_valid, reach, -1.0)
@@ -115,6 +127,14 @@ class Simulation:
         )
         return self.vehicles.take_off(state, goal, ready, departs)
 
+    def _in_wind(self, state: State, ranking: Ranking, row: Tensor) -> tuple[Ranking, Tensor]:
+        """The ranking of each UAV with distances as the wind makes them."""
+        point = gather_rows(ranking.point, row).long()  # [B, N, K]
+        flat = point + (state.region * self.airspace.max_points).view(-1, 1, 1)
+        distance = self.vehicles.distance(state, state.goal.unsqueeze(-1).expand_as(flat), flat)
+        own = torch.arange(row.numel(), device=row.device).view_as(row)
+        return Ranking(point.flatten(0, 1), distance.flatten(0, 1)), own
+
     def _sense(self, state: State, action_valid: Tensor | None = None) -> State:
         """Move the source, let UAVs on the ground detect it, and send messages."""
         now = (state.steps * self.dt).to(state.track.dtype)
@@ -123,7 +143,8 @@ class Simulation:
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
         squared_distance = (position - place.unsqueeze(-2)).square().sum(-1)
-        spotted = on_ground & emits.unsqueeze(-1) & (squared_distance <= self.radius**2)
+        in_reach = on_ground & emits.unsqueeze(-1) & (squared_distance <= self.radius**2)
+        spotted = self._reported(state, in_reach, on_ground)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         trail, landed = self._stops(state, times, on_ground, action_valid)
         messages = Messages(
@@ -143,6 +164,17 @@ class Simulation:
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
+
+    def _reported(self, state: State, in_reach: Tensor, on_ground: Tensor) -> Tensor:
+        """Whether each UAV reports a detection; some in reach miss it, some out of reach raise an alarm."""
+        values = self.vehicles.values
+        miss, alarm = (values.get(f"source.{name}", state.drawn) for name in ("miss", "false_alarm"))
+        if isinstance(miss, float) and isinstance(alarm, float) and miss == alarm == 0:
+            return in_reach
+        uav = torch.arange(on_ground.shape[1], device=on_ground.device)
+        seed, episode, steps = (each.unsqueeze(-1) for each in (state.seed, state.episode, state.steps))
+        share = counter_rng.uniform(seed, torch.full_like(episode, _REPORT), episode, steps, uav)
+        return torch.where(in_reach, share >= miss, on_ground & (share < alarm))
 
     def _stops(
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
@@ -225,6 +257,7 @@ class Simulation:
             elapsed=torch.full_like(goal, math.ceil(self.config.motion.sensing_time / self.dt) + 1),
             vertical=zeros,
             cruise=zeros,
+            air=zeros,
             battery_before=zeros + 100,
             position=torch.cat([place, zeros.unsqueeze(-1)], -1),
             track=zeros,
@@ -232,13 +265,19 @@ class Simulation:
             motions=torch.zeros_like(goal),
             source=self.walk.stop[:, 0],
             source_over=torch.zeros_like(number, dtype=torch.bool),
+            drawn=self.vehicles.values.draw(counter_rng.world_seeds(seed, n), torch.zeros_like(number)),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
             sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, stops), n_readings),
         )
-        state = self._sense(state)
-        landed = torch.full_like(state.sent.landed, -1.0)
-        landed[..., 0] = 0.0  # nothing is known of the time before
+        return self._first_messages(state)
+
+    def _first_messages(self, state: State) -> State:
+        """The state at the beginning of episodes with the messages that the UAVs send then."""
+        blank = Messages.blank(state.sent.trail, state.sent.readings.shape[-1])
+        state = self._sense(state._replace(sent=blank))
+        first = torch.arange(state.sent.landed.shape[-1], device=state.track.device) == 0
+        landed = torch.where(first, 0.0, -1.0).expand_as(state.sent.landed)  # nothing is known of before
         return state._replace(sent=state.sent._replace(landed=landed))
 
 

@@ -31,6 +31,8 @@ class State(NamedTuple):
     """Duration of takeoff, and of landing [s]; 0 if the UAV holds, [B, N]."""
     cruise: Tensor
     """Duration of the cruise [s]; 0 if the UAV holds, [B, N]."""
+    air: Tensor
+    """Way of the cruise through the air [m]; its length if there is no wind, [B, N]."""
     battery_before: Tensor
     """Battery level at the latest decision [%], [B, N]."""
     position: Tensor
@@ -45,6 +47,8 @@ class State(NamedTuple):
     """Position of the source, east, north [m], [B, 2]."""
     source_over: Tensor
     """Whether the source has finished its walk, [B]."""
+    drawn: Tensor
+    """Values of the settings that are drawn for the episode, [B, D]."""
     coverage: Tensor
     """Coverage of each UAV, as an undelayed server computed it last; negative if it has not, [B, N]."""
     message_sent: Tensor

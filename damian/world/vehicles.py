@@ -1,24 +1,35 @@
 """Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
 
+import math
 from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor
 
-from damian.common import checks
+from damian.common import checks, counter_rng
 from damian.common.registry import Registry
 from damian.common.tensors import expand_mask, gather_rows, tree_where
 from damian.world.airspace import Airspace
-from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
+from damian.world.battery import (
+    battery_of,
+    charge_gain,
+    cruise_range,
+    flight_drain,
+    used_so_far,
+    vertical_drain,
+)
 from damian.world.config import WorldConfig
+from damian.world.landing import displacement
 from damian.world.messages import Messages
-from damian.world.motion import flight_levels, minimum_time, poses
+from damian.world.motion import air_length, flight_levels, minimum_time, poses
 from damian.world.regions.region import local_places
 from damian.world.state import State
+from damian.world.values import times, values_of
 
 FLIGHT_LEVEL_M = 30.48
 """Metres per flight level of a published region (one flight level is 100 feet)."""
 
+_GUST = counter_rng.number_of("gust")
 _FLIGHT_ERROR = 1e-6
 """Largest relative error of the duration of a flight, which is computed in float32."""
 _ROUNDING = 1e-12
@@ -33,14 +44,12 @@ class MotionModel(ABC):
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt
+        self.values, self.is_windy = values_of(config), config.is_windy
         self.airspace, self.points = airspace, airspace.points.flatten(0, 1)
         levels = flight_levels(config.motion, config.agents, shared=self.instant)
         if not self.instant:
             check_levels(levels, airspace)
         self.levels = torch.tensor(levels)
-        self.vertical = self.shortest_time(self.levels)
-        self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
-        self.charge = float(charge_gain(torch.tensor(dt), config.battery))
         self.chargers = _charging_points(config, airspace)
 
     @abstractmethod
@@ -81,16 +90,35 @@ class MotionModel(ABC):
         """Longest cruise that each battery allows [m], [B, N]; 0: it allows only holding."""
         if not self.battery.enabled:
             return torch.full_like(state.battery, checks.METRES)
-        return cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
+        battery, vertical = battery_of(self.values, state.drawn), self.vertical(state)
+        return cruise_range(state.battery - vertical_drain(2 * vertical, battery), battery).clamp(min=0)
 
-    def shortest_time(self, length: Tensor) -> Tensor:
-        """Shortest duration [s] of a flight phase of the given length [m], any shape."""
-        motion = self.motion
-        return minimum_time(length, motion.degree, motion.max_speed, motion.max_acceleration)
+    def distance(self, state: State, origin: Tensor, goal: Tensor) -> Tensor:
+        """How long the flights between landing points are for the batteries [m], as far as can be foreseen.
 
-    def battery_after(self, level: Tensor, drain: Tensor, rested: Tensor, goal: Tensor) -> Tensor:
+        ``origin`` and ``goal`` are flat ids, [B, N, ...]; infinite where a UAV cannot fly.
+        """
+        return self.airspace.length(origin, goal)
+
+    def shortest_time(self, length: Tensor, drawn: Tensor | None = None) -> Tensor:
+        """Shortest duration [s] of a flight phase of each UAV of the given length [m], [*, N].
+
+        ``drawn`` are the drawn values of the worlds, if there may be any.
+        """
+        drawn = length.new_zeros(0) if drawn is None else drawn
+        limits = (self.values.get(f"motion.{name}", drawn) for name in ("max_speed", "max_acceleration"))
+        return minimum_time(length, self.motion.degree, *limits)
+
+    def vertical(self, state: State) -> Tensor:
+        """Duration of a takeoff, and of a landing, of each UAV [s], [N], or [B, N] if it is drawn."""
+        return self.shortest_time(self.levels, state.drawn)
+
+    def battery_after(
+        self, state: State, level: Tensor, drain: Tensor, rested: Tensor, goal: Tensor
+    ) -> Tensor:
         """Battery levels [%] after a flight and ``rested`` steps on the landing point ``goal``, [B, N]."""
-        gain = self.charge * (rested * gather_rows(self.chargers, goal))
+        step = charge_gain(level.new_tensor(self.dt), battery_of(self.values, state.drawn))
+        gain = step * (rested * gather_rows(self.chargers, goal))
         return (level - drain + gain).clamp(0, 100)
 
 
@@ -123,8 +151,11 @@ class InstantMotion(MotionModel):
         if not self.battery.enabled:
             return state
         length = self.airspace.length(state.origin, state.goal)
-        drain = flight_drain(self.vertical, length, self.battery) * (length > 0)
-        return state._replace(battery=self.battery_after(state.battery, drain, length == 0, state.goal))
+        battery = battery_of(self.values, state.drawn)
+        drain = flight_drain(self.vertical(state), length, battery) * (length > 0)
+        return state._replace(
+            battery=self.battery_after(state, state.battery, drain, length == 0, state.goal)
+        )
 
     def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
         return on_ground, messages
@@ -147,11 +178,13 @@ class PolynomialFlight(MotionModel):
 
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
         state = state._replace(origin=torch.where(ready, state.goal, state.origin), goal=goal)
-        cruise = self.shortest_time(self.airspace.length(state.origin, state.goal))
+        air = self._air(state)
+        cruise = self.shortest_time(air, state.drawn)
         return state._replace(
             elapsed=torch.where(ready, 0, state.elapsed),
-            vertical=torch.where(ready, self.vertical * departs, state.vertical),
+            vertical=torch.where(ready, self.vertical(state) * departs, state.vertical),
             cruise=torch.where(ready, cruise, state.cruise),
+            air=torch.where(ready, air, state.air),
             battery_before=torch.where(ready, state.battery, state.battery_before),
         )
 
@@ -164,11 +197,46 @@ class PolynomialFlight(MotionModel):
         if not self.battery.enabled:
             return state
         # From the latest decision on, not from step to step, because rounding errors would add up.
-        cruised = crossed * self.airspace.length(state.origin, state.goal)
-        used = used_so_far(elapsed, state.vertical, state.cruise, cruised, self.battery)
+        cruised = crossed * state.air
+        battery = battery_of(self.values, state.drawn)
+        used = used_so_far(elapsed, state.vertical, state.cruise, cruised, battery)
         rested = (state.elapsed - self.steps(state)).clamp(min=0)
-        battery = self.battery_after(state.battery_before, used.to(cruised.dtype), rested, state.goal)
-        return state._replace(battery=battery)
+        level = self.battery_after(state, state.battery_before, used.to(cruised.dtype), rested, state.goal)
+        return state._replace(battery=level)
+
+    def distance(self, state: State, origin: Tensor, goal: Tensor) -> Tensor:
+        if not self.is_windy:
+            return self.airspace.length(origin, goal)
+        wind = self._wind(state).view(-1, *[1] * (origin.dim() - 1), 2)
+        air, slowest = self._through(state, origin, goal, wind)
+        stays = origin == goal
+        return torch.where(stays, 0.0, air.where(slowest >= self.motion.min_ground_speed, torch.inf))
+
+    def _air(self, state: State) -> Tensor:
+        """Way of each flight through the air that begins now [m], gusts included, [B, N]."""
+        if not self.is_windy:
+            return self.airspace.length(state.origin, state.goal)
+        uav = torch.arange(state.goal.shape[1], device=state.goal.device)
+        seed, episode, steps = (each.unsqueeze(-1) for each in (state.seed, state.episode, state.steps))
+        size, turn = (
+            counter_rng.uniform(seed, torch.full_like(episode, _GUST), episode, steps, 2 * uav + i)
+            for i in (0, 1)
+        )
+        size = times((-2 * (1 - size).log()).sqrt(), self.values.get("wind.gusts", state.drawn))
+        gust = displacement(size, 2 * math.pi * turn)  # normal east and north (Box and Muller, 1958)
+        return self._through(state, state.origin, state.goal, self._wind(state).unsqueeze(-2) + gust)[0]
+
+    def _wind(self, state: State) -> Tensor:
+        """Mean wind of each world, the way in which it blows, east and north [m/s], [B, 2]."""
+        calm = state.track.new_zeros(len(state.seed), 1)
+        direction, speed = (self.values.get(f"wind.{name}", state.drawn) for name in ("direction", "speed"))
+        return displacement(calm - speed, (calm + direction).deg2rad()).squeeze(-2)
+
+    def _through(self, state: State, origin: Tensor, goal: Tensor, wind: Tensor) -> tuple[Tensor, Tensor]:
+        """As ``air_length``, of flights between landing points, flat ids [B, N, ...], wind [B, 1, ..., 2]."""
+        speed = torch.as_tensor(self.values.get("motion.max_speed", state.drawn)).to(state.track)
+        speed = speed.expand_as(state.track).view(*state.track.shape, *[1] * (origin.dim() - 2))
+        return air_length(self.airspace.way(origin, goal), wind, speed, self.motion.min_ground_speed)
 
     def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
         """A UAV sends messages while it is on the ground, and one from its takeoff point as it departs."""

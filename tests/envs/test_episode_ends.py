@@ -103,7 +103,7 @@ def test_a_uav_does_not_fly_to_a_landing_point_beyond_the_reach_of_its_battery(m
     length = torch.linalg.vector_norm(
         env.simulation.points[env.state.goal.item()] - env.simulation.points[start.goal.item()]
     )
-    cost = flight_drain(env.simulation.vehicles.vertical[0], length, battery)
+    cost = flight_drain(env.simulation.vehicles.vertical(env.state)[0], length, battery)
     for factor, flies in ((0.99, False), (1.01, True)):
         env.state = start._replace(battery=factor * cost.view(1, 1))
         go(env, EAST)

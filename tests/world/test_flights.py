@@ -49,7 +49,11 @@ def test_masked_actions_hold_and_legal_actions_lead_to_their_nearest_point(energ
         moved = (env.state.goal != state.goal).squeeze(-1)
         assert not moved[~legal].any()
         nearest = env.simulation.candidates.distance[state.goal[0, 0]]
-        drain = flight_drain(env.simulation.vehicles.vertical, nearest, battery) if energy else nearest * 0
+        drain = (
+            flight_drain(env.simulation.vehicles.vertical(env.state), nearest, battery)
+            if energy
+            else nearest * 0
+        )
         assert legal.equal((nearest == 0) | (drain <= level))  # takeoff and landing count as well
         assert moved[legal].equal(nearest[legal] > 0)
         masked, reached = masked + int((~legal).sum()), reached + int(moved.sum())

@@ -1,0 +1,154 @@
+"""Wind, unequal UAVs and drawn settings, against plain loops over flights."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import clock
+
+from damian.common.errors import InputError
+from damian.envs.config import ScenarioConfig
+from damian.envs.uav_env import UavEnv
+from damian.world.config import ActionConfig, BatteryConfig, MotionConfig, RegionConfig, WindConfig
+
+DENTED = [[0, 0], [600, 0], [600, 400], [320, 400], [300, 240], [280, 400], [0, 400]]
+SPEED, HARDEST, LEAST = [8.0, 12.0, 20.0], [1.0, 2.0, 4.0], 2.0
+WORLD = ScenarioConfig(
+    agents=3,
+    region=RegionConfig(kind="vertices", vertices=DENTED, lattice_step=50.0),
+    motion=MotionConfig(kind="polynomial", max_speed=SPEED, max_acceleration=HARDEST, min_ground_speed=LEAST),
+    battery=BatteryConfig(enabled=True, capacity_kwh=[0.5, 1.0, 2.0]),
+    actions=ActionConfig(distances=[0.0, 110.0, 230.0]),
+    clock=clock("2s"),
+)
+
+
+def through_the_air(way, wind, speed):
+    """Way through the air [m] of a flight over places, and its lowest ground speed [m/s]."""
+    total, slowest = 0.0, math.inf
+    for (x, y), (u, v) in itertools.pairwise(way):
+        length = math.hypot(u - x, v - y)
+        if length:
+            along = (wind[0] * (u - x) + wind[1] * (v - y)) / length
+            across = max(wind[0] ** 2 + wind[1] ** 2 - along**2, 0)
+            ground = math.sqrt(max(speed**2 - across, 0)) + along
+            slowest = min(slowest, ground)
+            total += length * speed / max(ground, LEAST)
+    return total, slowest
+
+
+@pytest.mark.parametrize("wind", [(7.0, 250.0), (15.0, 30.0)])
+def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
+    speed, whence = wind
+    env = UavEnv(replace(WORLD, wind=WindConfig(speed=speed, direction=whence)), 12, seed=1)
+    blows = -speed * math.sin(math.radians(whence)), -speed * math.cos(math.radians(whence))
+    env.set_seed(2)
+    td, flown = env.reset(), 0
+    for _ in range(30):
+        mask, stands = td["agents", "action_mask"], env.state
+        points, nearest = env.simulation.points, env.simulation.candidates.nearest
+        ready = env.simulation.vehicles.ready(stands)
+        for world, uav in ready.nonzero().tolist():
+            origin = stands.goal[world, uav]
+            for action in range(0, mask.shape[-1], 5):
+                goal = nearest[origin, action]
+                outside = not env.simulation.candidates.distance[origin, action].isfinite()
+                way = env.simulation.airspace.way(origin, goal).tolist()
+                air, slowest = through_the_air(way, blows, SPEED[uav])
+                drained = 100 * 10 / (12 * [0.5, 1.0, 2.0][uav])
+                vertical = env.simulation.vehicles.vertical(stands)[uav].item()
+                reach = (stands.battery[world, uav].item() - drained * 2 * vertical / 3240) * 72000 / drained
+                good = not outside and (goal == origin or (slowest >= LEAST and air <= reach))
+                assert mask[world, uav, action] == good, (world, uav, action)
+        td = env.rand_step(td)["next"]
+        after = env.state
+        for world, uav in (ready & (after.goal != stands.goal)).nonzero().tolist():
+            way = env.simulation.airspace.way(after.origin[world, uav], after.goal[world, uav]).tolist()
+            air, slowest = through_the_air(way, blows, SPEED[uav])
+            assert slowest >= LEAST
+            fast = 15 / 8 * air / SPEED[uav]
+            hard = math.sqrt(10 * math.sqrt(3) / 3 * air / HARDEST[uav])
+            assert after.cruise[world, uav].item() == pytest.approx(max(fast, hard), rel=1e-5)
+            flown += 1
+    assert points.shape[-1] == 2
+    assert flown > 50
+
+
+def test_equal_values_for_each_uav_are_bit_for_bit_one_value():
+    one = replace(
+        WORLD, motion=replace(WORLD.motion, max_speed=12.3, max_acceleration=1.7), battery=BatteryConfig(True)
+    )
+    motion = replace(one.motion, max_speed=[12.3] * 3, max_acceleration=[1.7] * 3)
+    each = replace(one, motion=motion, battery=BatteryConfig(True, capacity_kwh=[9.0] * 3))
+    flown = [UavEnv(scenario, 6, seed=4) for scenario in (one, each)]
+    torch.manual_seed(0)
+    actions = [torch.randint(24, (6, 3)) for _ in range(60)]
+    for env in flown:
+        td = env.reset()
+        for action in actions:
+            td = env.step(td.set(("agents", "action"), action))["next"]
+    for name, a, b in zip(flown[0].state._fields, flown[0].state, flown[1].state, strict=True):
+        if name != "sent":
+            assert a.equal(b), name
+
+
+def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
+    drawn = {"wind.speed": [0, 6], "motion.max_acceleration": [1, 2, 3], "source.miss": [0.0, 0.5]}
+    scenario = replace(
+        WORLD, motion=MotionConfig(kind="polynomial"), wind=WindConfig(gusts=2.0), randomise=drawn
+    )
+    together, alone = UavEnv(scenario, 5, seed=0), UavEnv(scenario, 1, seed=0)
+    seeds = torch.arange(5) * 17
+    together.seed_worlds(seeds)
+    alone.seed_worlds(seeds[3:4])
+    tds, seen = [together.reset(), alone.reset()], []
+    for step in range(120):
+        action = torch.randint(24, (5, 3), generator=torch.Generator().manual_seed(step))
+        for index, (env, rows) in enumerate(((together, action), (alone, action[3:4]))):
+            tds[index] = env.step_and_maybe_reset(tds[index].set(("agents", "action"), rows))[1]
+        seen.append(together.state.drawn[3])
+        for name, a, b in zip(together.state._fields, together.state, alone.state, strict=True):
+            if name != "sent":
+                assert a[3].equal(b[0]), name
+    seen = torch.stack(seen)
+    assert len(seen.unique(dim=0)) > 1, "each episode has its own"
+    keys = [*drawn, "wind.direction"]
+    for column, (low, high) in enumerate([(0, 6), (1, 3), (0, 0.5), (0, 360)]):
+        assert ((seen[:, column] >= low) & (seen[:, column] <= high)).all(), keys[column]
+    assert set(seen[:, 1].tolist()) <= {1.0, 2.0, 3.0}
+
+
+def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
+    source = replace(WORLD.source, level_db=150.0, miss=0.3, false_alarm=0.1)
+    env = UavEnv(replace(WORLD, motion=MotionConfig(), battery=BatteryConfig(), source=source), 64, seed=0)
+    td, counts = env.reset(), torch.zeros(2, 2)
+    for _ in range(40):
+        state = env.state
+        near = torch.linalg.vector_norm(state.position[..., :2] - state.source.unsqueeze(1), dim=-1)
+        near, spotted = near <= env.simulation.radius, state.sent.spotted
+        for row, mask in enumerate((near, ~near)):
+            counts[row] += torch.tensor([(spotted & mask).sum(), mask.sum()])
+        td = env.rand_step(td)["next"]
+    share = counts[:, 0] / counts[:, 1]
+    spread = 4 * (torch.tensor([0.21, 0.09]) / counts[:, 1]).sqrt()
+    assert ((share - torch.tensor([0.7, 0.1])).abs() < spread).all(), share
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            {"motion": MotionConfig(kind="polynomial", max_speed=[1.0, 2.0])},
+            "motion.max_speed: .* each of the 3",
+        ),
+        ({"motion": MotionConfig(), "wind": WindConfig(speed=3.0)}, "wind: .* needs motion=polynomial"),
+        ({"randomise": {"agents": [1, 2]}}, "randomise.agents: .* cannot be drawn, only motion.max_speed"),
+        ({"randomise": {"wind.speed": [0, 1000]}}, "wind.speed: 1000"),
+        ({"randomise": {"wind.speed": 3}}, "randomise.wind.speed: 3 is not a range"),
+    ],
+)
+def test_values_that_cannot_be_are_refused(changed, message):
+    with pytest.raises(InputError, match=message):
+        replace(WORLD, **changed)
