@@ -35,8 +35,8 @@ def save_recording(episode: Episode, path: Path) -> None:
     points = rr.Points3D(on_ground(episode.landing_points), radii=size / 5)
     recording.log("landing_points", points, static=True)
     if episode.source is not None:
-        emits = np.zeros(len(episode.time)) if episode.emits is None else episode.emits
-        columns = {"positions": on_ground(episode.source), "radii": size * (1 + emits)}
+        emits = np.zeros((len(episode.time), 1)) if episode.emits is None else episode.emits
+        columns = {"positions": on_ground(episode.source[:, 0]), "radii": size * (1 + emits[:, 0])}
         recording.send_columns("source", [time], rr.Points3D.columns(**columns))
     for uav, name in enumerate(episode.names):
         colour, spotted = COLOURS[uav % len(COLOURS)], episode.spotted[:, uav]

@@ -17,10 +17,10 @@ def flight(n_steps: int = 3, **changes) -> Episode:
         "position": np.tile(position, (t, 1, 1)),
         "target": np.tile(position[:, :2], (t, 1, 1)),
         "battery": uavs + 100,
-        "source": np.tile([0.0, -120.0], (t, 1)),
+        "source": np.tile([0.0, -120.0], (t, 1, 1)),
         "believed": np.tile(position[:, :2], (t, 1, 1)),
         **dict.fromkeys(("track", "age", "reward"), uavs),
-        **{"spotted": flags, "sent": flags, "delay": uavs.astype(int), "emits": flags[:, 0]},
+        **{"spotted": flags, "sent": flags, "delay": uavs.astype(int), "emits": flags[:, :1]},
     }
     fixed = {"about": {}, "region": SQUARE, "origin": None, "landing_points": np.array([[150.0, -190.0]])}
     fixed |= {"radius": 50.0, "instant": True, "success": False}

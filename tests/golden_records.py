@@ -100,8 +100,8 @@ def set_state(env: UavEnv, records: list[Transition], places: list) -> None:
         position=torch.cat([place, torch.zeros_like(place[..., :1])], -1),
         motions=torch.tensor([m.motions for m in records]),
         sent=state.sent._replace(
-            detected_time=detected.expand(-1, env.n_agents).contiguous(),
-            detected_position=estimate.expand(-1, env.n_agents, -1).contiguous(),
+            detected_time=detected.expand(-1, env.n_agents).unsqueeze(-1).contiguous(),
+            detected_position=estimate.expand(-1, env.n_agents, -1).unsqueeze(-2).contiguous(),
         ),
     )
 
@@ -139,8 +139,8 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         spotted=torch.tensor(flags),
         empty=torch.zeros_like(place[..., 0], dtype=torch.bool),
         motions=motions,
-        detected_time=zeros + detected[:, None],
-        detected_position=zeros[..., None] + estimate[:, None],
+        detected_time=(zeros + detected[:, None])[..., None],
+        detected_position=(zeros[..., None] + estimate[:, None])[..., None, :],
         trail=torch.zeros(*zeros.shape, 2, dtype=torch.long),
         landed=torch.zeros(*zeros.shape, 2),
         readings=torch.zeros(*zeros.shape, 0),

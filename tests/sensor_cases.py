@@ -28,7 +28,7 @@ def gust(state: State, world: Simulation, *, strength: float = 1.0) -> Tensor:
 @sensor()
 def gap(state: State, world: Simulation) -> Tensor:
     """Distance to the source [m]."""
-    return torch.linalg.vector_norm(state.position[..., :2] - state.source.unsqueeze(-2), dim=-1)
+    return torch.linalg.vector_norm(state.position[..., :2] - state.source[:, :1], dim=-1)
 
 
 @feature("local", width=2, low=-1.0, high=1.0)
@@ -66,5 +66,7 @@ def readings_of(env: UavEnv, strength: float = 2.0) -> Tensor:
         for i in range(env.n_agents):
             draws = [counter_rng.uniform(*counters, torch.tensor(i), torch.tensor(k)).item() for k in (0, 1)]
             gusts = [strength * draw + float(state.steps[b]) * env.simulation.dt for draw in draws]
-            rows[b].append([*gusts, math.dist(state.position[b, i, :2].tolist(), state.source[b].tolist())])
+            rows[b].append(
+                [*gusts, math.dist(state.position[b, i, :2].tolist(), state.source[b, 0].tolist())]
+            )
     return torch.tensor(rows)

@@ -121,9 +121,10 @@ class Greedy:
         two standard deviations. A footprint in which a UAV on the ground hears nothing ``now`` [s] makes it
         less likely there. Also returns whether the latest detection is recent, [B, 1, 1].
         """
-        has_detection = held.detected_time >= 0
-        since = torch.where(has_detection, now - held.detected_time, torch.inf).unsqueeze(-1)
-        outside = (distances(held.detected_position, ground) - self.radius).clamp(min=0)
+        detected = held.detected_time.squeeze(-1)
+        has_detection = detected >= 0
+        since = torch.where(has_detection, now - detected, torch.inf).unsqueeze(-1)
+        outside = (distances(held.detected_position.squeeze(-2), ground) - self.radius).clamp(min=0)
         log_detected = -(outside / (BLUR_M + self.speed * since / 2)).square() / 2
         log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0).sum(1, keepdim=True)
         silent = ~held.spotted & ~held.in_flight & (held.time > now - self.dt / 2)

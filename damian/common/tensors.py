@@ -41,11 +41,13 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
 
 
 def to_device(value: Any, device: torch.device) -> Any:
-    """Copy of a tensor, or of nested named tuples and mappings of tensors and others, on another device."""
+    """Copy of a tensor, or of nested tuples and mappings of tensors and others, on another device."""
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, dict):
         return {key: to_device(each, device) for key, each in value.items()}
+    if type(value) is tuple:
+        return tuple(to_device(each, device) for each in value)
     return value._make(to_device(each, device) for each in value) if hasattr(value, "_make") else value
 
 

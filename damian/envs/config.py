@@ -89,6 +89,8 @@ class ScenarioConfig(WorldConfig):
         self.refuse(observation.own and links == "updown", "observation.own", problem)
         problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
         self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
+        problem = "does not go with several sources: the filter follows one"
+        self.refuse(observation.belief and self.source.count > 1, "observation.belief", problem)
         per_action = "belief_gain" in observation.belief
         problem = "needs discrete actions: it has a value for each of them"
         self.refuse(per_action and self.actions.kind == "continuous", "observation.belief", problem)

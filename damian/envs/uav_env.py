@@ -17,7 +17,7 @@ from damian.common import checks, counter_rng, devices
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.config import ScenarioConfig
 from damian.server.components import checked_features
-from damian.server.features import feature_bounds
+from damian.server.features import feature_bounds, nearest_way
 from damian.server.server import Features, Server
 from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
@@ -192,8 +192,7 @@ class UavEnv(EnvBase):
         if self.simulation.draws:  # a table cannot hold first readings, which differ in every episode
             state = self.simulation.layout.unpack(worlds)
             features = self.server.features(state.sent, state.steps)
-            truth = {keys.STATE: outputs[keys.STATE]} if keys.STATE in outputs else {}
-            outputs = self._outputs_at_reset(state, features) | truth
+            outputs = self._outputs_at_reset(state, features)
         return worlds, outputs
 
     def step_fn(
@@ -228,7 +227,8 @@ class UavEnv(EnvBase):
             outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
         if "state" in self.extras:
             _, emits, _ = self.simulation.source_now(state)
-            outputs[keys.STATE] = Truth(state.position, state.battery, emits, state.source).pack()
+            truth = Truth(state.position, state.battery, emits, state.source, state.drawn)
+            outputs[keys.STATE] = truth.pack()
         return outputs
 
     def _privileged(self, state: State, global_observation: Tensor | None) -> Tensor:
@@ -237,7 +237,8 @@ class UavEnv(EnvBase):
             features = self.server.privileged_features(state.sent, state.steps, state.source)
             _, global_observation = self.server.observations(features)
         scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
-        to_source = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
+        ways = state.source.unsqueeze(-3) - state.position[..., None, :2]
+        to_source = nearest_way(ways) / scale
         return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:

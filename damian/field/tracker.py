@@ -38,8 +38,7 @@ class Tracker:
     def __init__(self, node: Node, uavs: Sequence[str], rows: Rows) -> None:
         self.node, self.uavs = node, [*uavs]
         self.points = node.simulation.airspace.points[0]
-        n_readings = sum(each.width for each in node.simulation.sensors.values())
-        told = node.ground, node.server.observation.stops, n_readings, node.dt
+        told = node.ground, node.server.observation.stops, node.simulation.widths.readings, node.dt
         self._logs = {uav: UavLog(*told) for uav in uavs}
         for where, report in rows:
             with named(where):

@@ -158,3 +158,4 @@ class EpisodeConfig(Settings):
         None, "Share of the UAVs whose empty batteries end the episode; none if not given.", above=0, high=1
     )
     end_with_source: bool = setting(False, "End the episode when the source has stopped for good.")
+    all_sources: bool = setting(False, "Success when each source is spotted, by any UAV, at the same time.")

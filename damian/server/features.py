@@ -241,25 +241,32 @@ def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict
 # Table 2.
 
 
-def _has_detected(v: FeatureCache) -> Tensor:
-    """Whether this UAV has ever detected the source, [*, N]."""
-    return v.messages.detected_time >= 0
-
-
 def _any_has_detected(v: FeatureCache) -> Tensor:
-    """Whether any UAV has ever detected the source, [*, 1]."""
-    return v(_has_detected).any(-1, keepdim=True)
+    """Whether any UAV has ever detected a source, [*, 1]."""
+    return (v.messages.detected_time >= 0).flatten(-2).any(-1, keepdim=True)
 
 
 def _to_source(v: FeatureCache) -> Tensor:
-    """Vector from each UAV to the estimated position of the source [m], [*, N, 2]."""
-    counts, detected_time = v(_has_detected), v.messages.detected_time
+    """Vector from each UAV to the estimated position of the nearest known source [m], [*, N, 2]."""
+    detected_time = v.messages.detected_time
+    counts = detected_time >= 0  # [*, N, K]
     if v.context.observation.estimate == "newest":
-        counts = counts & (detected_time == detected_time.amax(-1, keepdim=True))
+        counts = counts & (detected_time == detected_time.amax(-2, keepdim=True))
     weight = counts.to(v.messages.position.dtype)
-    total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-2, keepdim=True)
-    estimate = total / weight.sum(-1).clamp(min=1)[..., None, None]
-    return estimate - v.messages.position
+    total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-3, keepdim=True)
+    estimate = total / weight.sum(-2).clamp(min=1)[..., None, :, None]
+    ways = estimate - v.messages.position.unsqueeze(-2)  # [*, N, K, 2]
+    return nearest_way(ways, counts.any(-2, keepdim=True))
+
+
+def nearest_way(ways: Tensor, known: Tensor | None = None) -> Tensor:
+    """The shortest of ways [*, K, 2], of those that are ``known`` [*, K] if there are any, [*, 2]."""
+    if ways.shape[-2] == 1:
+        return ways.squeeze(-2)
+    length = ways.square().sum(-1)
+    length = length if known is None else length.masked_fill(~known, torch.inf)
+    best = length.argmin(-1)[..., None, None]
+    return ways.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
 
 
 def _raw_source_distance(v: FeatureCache) -> Tensor:
@@ -317,7 +324,7 @@ def _source_drift(v: FeatureCache) -> Tensor:
 @feature("global")
 def _source_time(v: FeatureCache) -> Tensor:
     """Time since any UAV detected the source, over ``observation.time_scale``; 1 if unknown, [*, N]."""
-    latest = v.messages.detected_time.amax(-1, keepdim=True)
+    latest = v.messages.detected_time.flatten(-2).amax(-1, keepdim=True)
     since = (v.context.now.unsqueeze(-1) - latest) / v.context.time_scale
     return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)
 

@@ -81,7 +81,7 @@ class Server:
         self.names: list[str] = sorted({*observation.actor, *observation.critic, *self.reads})
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
-        self._n_readings = sum(widths.values())
+        self._widths = simulation.widths
         footprints = None
         if "coverage" in self.names:
             polygons = [region.polygon for region in airspace.regions]
@@ -141,7 +141,7 @@ class Server:
 
     def messages(self, rows: Tensor) -> Messages:
         """Messages from their packed rows [*, N, M], with the readings of all sensors."""
-        return Messages.unpack(rows, self._n_readings)
+        return Messages.unpack(rows, self._widths)
 
     def counted(self, messages: Messages) -> Tensor:
         """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
@@ -198,8 +198,8 @@ class Server:
         return observe(messages, context, names or self.names)
 
     def privileged_features(self, messages: Messages, steps: Tensor, source: Tensor) -> Features:
-        """The features of somebody who knows where the source is, [*, 2] metres."""
-        belief = None if self.grid is None else certain_belief(self.grid, source)
+        """The features of somebody who knows where the sources are, [*, K, 2] metres."""
+        belief = None if self.grid is None else certain_belief(self.grid, source[..., 0, :])
         return self.features(messages, steps, belief=belief)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:

@@ -34,6 +34,9 @@ def status(
     success = ended = timed_out = torch.zeros_like(source_over)
     if config.success_share is not None:
         success = messages.spotted.sum(-1) >= share_of(config.success_share, n_agents)
+    if config.all_sources:
+        spotted = messages.detected_time == messages.time.unsqueeze(-1)  # by each UAV now
+        success = success | spotted.any(-2).all(-1)
     if config.discharged_share is not None:
         ended = messages.empty.sum(-1) >= share_of(config.discharged_share, n_agents)
     if config.end_with_source:
@@ -41,7 +44,7 @@ def status(
     if config.max_steps is not None:
         if config.since_detection:
             # Times in messages are float32, so the step of the latest detection is the nearest whole number.
-            latest = messages.detected_time.amax(-1).clamp(min=0).double()
+            latest = messages.detected_time.amax((-2, -1)).clamp(min=0).double()
             steps = steps - (latest / dt).round().long()
         timed_out = steps >= config.max_steps
     return Status(success, success | ended, timed_out & ~(success | ended))

@@ -26,7 +26,7 @@ def plot_beliefs(flight: Episode, path: Path) -> None:
         figure = Figure(figsize=(7.0, 4.6 + 2 * chart + rows), layout="constrained")
         axes = figure.subplots(4, 1, height_ratios=[3.6, chart, chart, rows])
         view = MapView(axes[0], flight)
-        source = [] if flight.source is None else [flight.source]
+        source = [] if flight.source is None else [flight.source.reshape(-1, 2)]
         paths = np.concatenate([flight.true.reshape(-1, 2), flight.believed.reshape(-1, 2), *source])
         region = np.reshape(flight.region.bounds, (2, 2))
         if np.ptp(region, axis=0).max() > _LARGE * (np.ptp(paths, axis=0).max() + 2 * flight.radius):

@@ -27,7 +27,7 @@ from damian.common.text_files import named, one_line, read_text
 from damian.envs.uav_env import UavEnv
 from damian.world.state import Truth
 
-SCHEMA, VERSION = "damian-episode", 2
+SCHEMA, VERSION = "damian-episode", 3
 DIGITS = 5
 """Significant digits of the numbers in a file."""
 TIME_DIGITS = 9
@@ -66,9 +66,9 @@ class Episode:
     battery: Annotated[Floats, "battery levels [%], [T + 1, N]"]
     spotted: Annotated[Flags, "whether the UAV spots the source, [T + 1, N]"]
     source: Annotated[
-        Floats | None, "position of the source: east, north [m]; null if nobody knows it, [T + 1, 2]"
+        Floats | None, "positions of the sources: east, north [m]; null if nobody knows them, [T + 1, K, 2]"
     ]
-    emits: Annotated[Flags | None, "whether the source emits; null if nobody knows it, [T + 1]"]
+    emits: Annotated[Flags | None, "whether each source emits; null if nobody knows it, [T + 1, K]"]
     sent: Annotated[Flags, "whether the UAV sent a message in the step; not at the reset, [T + 1, N]"]
     delay: Annotated[Integers, "delay of that message [steps], negative if it never arrives, [T + 1, N]"]
     believed: Annotated[Floats, "positions in the messages that the server held [m], [T + 1, N, 2]"]
@@ -225,7 +225,7 @@ def at_instant(outputs: TensorDictBase) -> TensorDictBase:
 
 def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> Episode:
     """The episode of one world from ``at_instant`` of the reset and of each step, stacked, [T + 1]."""
-    message, truth = cast(Tensor, instants[keys.MESSAGE]), Truth.unpack(cast(Tensor, instants[keys.STATE]))
+    message, truth = cast(Tensor, instants[keys.MESSAGE]), _truth(env, instants)
     sent = cast(Tensor, instants[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on
     delay = instants.get(keys.DELAY, torch.zeros_like(sent[..., None], dtype=torch.long))
@@ -253,6 +253,14 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         reward_terms={name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()},
         cells=None if belief is None else cells_of(env),
         belief=None if belief is None else np.asarray(belief),
+    )
+
+
+def _truth(env: UavEnv, instants: TensorDictBase) -> Truth:
+    """What the environment's entry ``state`` tells."""
+    simulation = env.simulation
+    return Truth.unpack(
+        instants[keys.STATE], len(simulation.sources), len(simulation.vehicles.values.choices)
     )
 
 

@@ -42,10 +42,8 @@ class Frame:
     time: float
     """Time since the reset [s]."""
     uavs: list[Uav]
-    source: Floats | None
-    """Place of the source: east, north [m], [2]; None if nobody knows it."""
-    emits: bool
-    """Whether the source emits."""
+    sources: list[tuple[Floats, bool]]
+    """Place of each source, east, north [m], [2], and whether it emits; none if nobody knows them."""
     cells: list[tuple[Any, float]]
     """Where the source may well be: polygons or several of them, with their probabilities."""
 
@@ -54,6 +52,7 @@ def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
     """An episode after ``step`` steps; paths reach ``trail`` steps back, or with None to the beginning."""
     trail = CROWDED_TRAIL if episode.is_crowded else trail
     begin = 0 if trail is None else max(step - trail, 0)
+    known, emits = episode.source, episode.emits
     belief = [] if episode.belief is None else episode.belief[step]
     uavs = [
         Uav(
@@ -72,8 +71,7 @@ def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
     return Frame(
         time=float(episode.time[step]),
         uavs=uavs,
-        source=None if episode.source is None else episode.source[step],
-        emits=episode.emits is not None and bool(episode.emits[step]),
+        sources=[] if known is None or emits is None else [*zip(known[step], emits[step], strict=True)],
         cells=[(area, float(p)) for area, p in zip(episode.squares, belief, strict=True) if p > LIKELY],
     )
 

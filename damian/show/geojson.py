@@ -71,8 +71,9 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
         yield footprints[-1], {"kind": "footprint", **label, "spotted": uav.spots}
         yield covered, {"kind": "coverage", **label}
         yield shapely.Point(uav.believed), {"kind": "believed position", **label, "age_s": uav.age}
-    if episode.source is not None:
-        yield _path(episode.source[: step + 1]), {"kind": "source track", **times}
+    known = [] if episode.source is None else np.moveaxis(episode.source, 1, 0)
+    for number, places in enumerate(known):
+        yield _path(places[: step + 1]), {"kind": "source track", "source": number, **times}
     for area, probability in frame.cells:
         yield area, {"kind": "belief", "probability": round(probability, 5)}
 

@@ -214,11 +214,12 @@ def legend_marks(episode: Episode) -> list[Any]:
 
 
 def _draw_source(axis: Any, frame: Frame, height: tuple[float, ...], style: dict[str, Any]) -> list[Any]:
-    """Draw the source, filled while it emits, if anybody knows it."""
-    if frame.source is None:
-        return []
-    fill = INK if frame.emits else "white"
-    return axis.plot(*frame.source, *height, "*", color=INK, markerfacecolor=fill, **style)
+    """Draw the sources, filled while they emit, if anybody knows them."""
+    drawn = []
+    for place, emits in frame.sources:
+        fill = INK if emits else "white"
+        drawn += axis.plot(*place, *height, "*", color=INK, markerfacecolor=fill, **style)
+    return drawn
 
 
 def _draw_names(axis: Axes, frame: Frame, flat: Any) -> list[Any]:

@@ -2,7 +2,8 @@
 
 import functools
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from damian.common import checks
@@ -177,6 +178,10 @@ class SourceConfig(Settings):
 
     section: ClassVar[str] = "source"
 
+    count: int = setting(1, "Number of sources.", low=1, high=32)
+    each: list[Any] = setting(
+        [], "What differs of each source, as {level_db: 130, motion: dynamic}; all are alike if empty."
+    )
     level_db: float = setting(140.0, "Sound level at 1 m, re 1e-12 W/m^2.", unit="dB", low=-300, high=300)
     microphone_db: float = constant(
         105.0, "Lowest level that is heard; only its distance from ``level_db`` counts.", unit="dB", low=0
@@ -221,12 +226,22 @@ class SourceConfig(Settings):
         return self.motion
 
     @property
+    def all(self) -> list["SourceConfig"]:
+        """The settings of each source, K."""
+        return [replace(self, count=1, each=[], **each) for each in self.each or [{}] * self.count]
+
+    @property
     def emits(self) -> float:
         """Probability that the source emits in a step, if nothing else is known of it."""
         return 1.0 if self.emission == "constant" else self.emission_probability
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        wrong = self.each and len(self.each) != self.count
+        self.refuse(wrong, "each", f"is not one mapping for each of the source.count={self.count} sources")
+        for each in self.each:
+            wrong = not isinstance(each, Mapping) or not {*each} <= {*rules(SourceConfig)} - {"count", "each"}
+            self.refuse(wrong, "each", "has something else than settings of a source: {level_db: 130}")
         heard, least = self.microphone_db < self.level_db, f"microphone_db={self.microphone_db:g} dB"
         self.refuse(not heard, "level_db", f"is not above {least}: not heard even at 1 m")
         static = self.motion != "dynamic"

@@ -18,6 +18,18 @@ class Column(NamedTuple):
     """Type of the unpacked field."""
 
 
+class Widths(NamedTuple):
+    """How many columns the settings give to a message's fields that have no fixed number."""
+
+    sources: int = 1
+    """Number of signal sources, K."""
+    readings: int = 0
+    """Number of values that the user's sensors read."""
+
+
+ONE_SOURCE = Widths()
+
+
 class Messages(NamedTuple):
     """One message of each UAV, with any leading dimensions; each field [*, N] or [*, N, width].
 
@@ -35,15 +47,15 @@ class Messages(NamedTuple):
     battery: Annotated[Tensor, Column()]
     """Battery level, not rounded [%]."""
     spotted: Annotated[Tensor, Column(dtype=torch.bool)]
-    """Whether the UAV spots the source."""
+    """Whether the UAV spots any source."""
     empty: Annotated[Tensor, Column(dtype=torch.bool)]
     """Whether the observed battery level is 0, or the battery allows nothing but holding."""
     motions: Annotated[Tensor, Column(dtype=torch.long)]
     """Motions (holding included) since the latest detection before this message."""
-    detected_time: Annotated[Tensor, Column()]
-    """Time of the latest detection [s]; -1 if there was none."""
-    detected_position: Annotated[Tensor, Column(2)]
-    """Position of the UAV at its latest detection, east, north [m]."""
+    detected_time: Annotated[Tensor, Column(None)]
+    """Time of the latest detection of each source [s], [*, N, K]; -1 if there was none."""
+    detected_position: Annotated[Tensor, Column(None)]
+    """Position of the UAV at its latest detection of each source, east, north [m], [*, N, K, 2]."""
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a stop."""
     landed: Annotated[Tensor, Column(None)]
@@ -52,26 +64,31 @@ class Messages(NamedTuple):
     """Readings of the user's sensors, beside each other in the order of the settings, [*, N, K]."""
 
     @classmethod
-    def blank(cls, trail: Tensor, n_readings: int = 0) -> "Messages":
+    def blank(cls, trail: Tensor, widths: Widths = ONE_SOURCE) -> "Messages":
         """Messages of zeros, without a detection, of UAVs with the landing points ``trail`` [*, N, S]."""
-        width = _FIXED + 2 * trail.shape[-1] + n_readings
-        blank = cls.unpack(torch.zeros(*trail.shape[:-1], width), n_readings)
+        width = _FIXED + 3 * widths.sources + 2 * trail.shape[-1] + widths.readings
+        blank = cls.unpack(torch.zeros(*trail.shape[:-1], width, device=trail.device), widths)
         return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
 
     def pack(self) -> Tensor:
         """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through exactly."""
-        fields = zip(self, _COLUMNS, strict=True)
+        fields = zip(
+            self._replace(detected_position=self.detected_position.flatten(-2)), _COLUMNS, strict=True
+        )
         parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
         return torch.cat(parts, -1)
 
     @classmethod
-    def unpack(cls, rows: Tensor, n_readings: int = 0) -> "Messages":
-        """Messages from rows [*, N, M] with K = ``n_readings`` columns of readings; floats are views.
+    def unpack(cls, rows: Tensor, widths: Widths = ONE_SOURCE) -> "Messages":
+        """Messages from rows [*, N, M]; floats are views.
 
-        ``Server.messages``, which knows how many there are, is the way to unpack messages of an environment.
+        ``Server.messages``, which knows the widths, is the way to unpack messages of an environment.
         """
-        stops = (rows.shape[-1] - _FIXED - n_readings) // 2
-        parts = rows.split([*(column.width for column in _COLUMNS[:-3]), stops, stops, n_readings], -1)
+        n, readings = widths
+        stops = (rows.shape[-1] - _FIXED - 3 * n - readings) // 2
+        fixed = [column.width for column in _COLUMNS[:-5]]
+        parts = [*rows.split([*fixed, n, 2 * n, stops, stops, readings], -1)]
+        parts[-4] = parts[-4].unflatten(-1, (n, 2))
         fields = []
         for part, (width, dtype) in zip(parts, _COLUMNS, strict=True):
             field = part.squeeze(-1) if width == 1 else part
@@ -95,4 +112,4 @@ class Messages(NamedTuple):
 _HINTS = get_type_hints(Messages, include_extras=True)
 _COLUMNS: list[Column] = [hint.__metadata__[0] for hint in _HINTS.values()]
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
-"""Number of columns of all fields but the last three, those of the stops and the readings."""
+"""Number of columns of all fields but the last five, those of detections, stops and readings."""

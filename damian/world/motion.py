@@ -61,7 +61,8 @@ def place_on(way: Tensor, share: Tensor) -> Tensor:
     length = torch.linalg.vector_norm(legs, dim=-1)
     since = (share * length.sum(-1)).unsqueeze(-1) - (length.cumsum(-1) - length)  # since each leg began [m]
     done = (since / length.clamp_min(_TINY)).clamp(0, 1) * (length > 0)
-    return way[..., 0, :] + (done.unsqueeze(-1) * legs).sum(-2)
+    place = way[..., 0, :] + (done.unsqueeze(-1) * legs).sum(-2)
+    return torch.where(share.unsqueeze(-1) < 1, place, way[..., -1, :])  # there, to the bit
 
 
 def air_length(way: Tensor, wind: Tensor, airspeed: Tensor, least: float) -> tuple[Tensor, Tensor]:

@@ -46,7 +46,7 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
         >>> # in lab.py, used as sensors=[{sensor: lab:loudness, reach: 50}]
         >>> @sensor()
         ... def loudness(state, world, *, reach=100.0):
-        ...     to_source = state.position[..., :2] - state.source.unsqueeze(-2)
+        ...     to_source = state.position[..., :2] - state.source[:, :1]  # the first one
         ...     return (-torch.linalg.vector_norm(to_source, dim=-1) / reach).exp()
     """
     checks.whole("width of a sensor", width, 1)

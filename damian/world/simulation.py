@@ -14,7 +14,7 @@ from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
 from damian.world.landing import Candidates, Ranking, assign_landing_points
-from damian.world.messages import Messages
+from damian.world.messages import Messages, Widths
 from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
 from damian.world.sensors import sensors_of
@@ -22,7 +22,7 @@ from damian.world.signal_source import Walk, draw_walks, footprint_radius, locat
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import MOTION_MODELS
 
-_REPORT = counter_rng.number_of("report")
+_REPORT, _SOURCE = counter_rng.number_of("report"), counter_rng.number_of("source")
 
 
 class Simulation:
@@ -32,16 +32,21 @@ class Simulation:
         rng = np.random.default_rng(seed)
         self.config, self.dt = config, dt
         self.sensors = sensors_of(config.sensors)
+        self.sources = config.source.all
+        self.reach = torch.tensor([footprint_radius(source) for source in self.sources])
+        """Largest distance at which UAVs detect each source [m], [K]."""
         self.radius = footprint_radius(config.source)
+        """Radius of a footprint [m]."""
+        self.widths = Widths(len(self.sources), sum(each.width for each in self.sensors.values()))
         regions, longest = regions_of(config.region, rng), max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
-        region, start, self.walk = _draw_initial_conditions(config, self.airspace, rng)
+        region, start, self.walks = _draw_initial_conditions(config, self.airspace, rng)
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         shortest = self._shortest_flights()
-        source = config.source
-        self.draws = bool(self.sensors or self.vehicles.values.choices or source.miss or source.false_alarm)
+        unsure = any(each.miss or each.false_alarm for each in self.sources)
+        self.draws = bool(self.sensors or self.vehicles.values.choices or unsure)
         """Whether first messages differ from episode to episode that begins alike."""
         self.shortest_flight = shortest if config.battery.enabled else None
         self.initial = self._initial_state(region, start, stops, seed)
@@ -139,12 +144,15 @@ class Simulation:
         """Move the source, let UAVs on the ground detect it, and send messages."""
         now = (state.steps * self.dt).to(state.track.dtype)
         place, emits, over = self.source_now(state)
-        state = state._replace(source=place, source_over=over)
+        state = state._replace(source=place, source_over=over.all(-1))
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
-        squared_distance = (position - place.unsqueeze(-2)).square().sum(-1)
-        in_reach = on_ground & emits.unsqueeze(-1) & (squared_distance <= self.radius**2)
-        spotted = self._reported(state, in_reach, on_ground)
+        # Of each UAV and source, [B, N, K].
+        squared_distance = (position.unsqueeze(-2) - place.unsqueeze(-3)).square().sum(-1)
+        listens = on_ground.unsqueeze(-1)
+        in_reach = listens & emits.unsqueeze(-2) & (squared_distance <= self.reach.square())
+        detected = self._reported(state, in_reach, listens)
+        spotted = detected.any(-1)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         trail, landed = self._stops(state, times, on_ground, action_valid)
         messages = Messages(
@@ -156,8 +164,10 @@ class Simulation:
             spotted=spotted,
             empty=self._empty(state, on_ground),
             motions=state.motions,
-            detected_time=torch.where(spotted, times, state.sent.detected_time),
-            detected_position=torch.where(spotted.unsqueeze(-1), position, state.sent.detected_position),
+            detected_time=torch.where(detected, times.unsqueeze(-1), state.sent.detected_time),
+            detected_position=torch.where(
+                detected.unsqueeze(-1), position.unsqueeze(-2), state.sent.detected_position
+            ),
             trail=trail,
             landed=landed,
             readings=self._readings(state),
@@ -165,16 +175,24 @@ class Simulation:
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
 
-    def _reported(self, state: State, in_reach: Tensor, on_ground: Tensor) -> Tensor:
-        """Whether each UAV reports a detection; some in reach miss it, some out of reach raise an alarm."""
-        values = self.vehicles.values
-        miss, alarm = (values.get(f"source.{name}", state.drawn) for name in ("miss", "false_alarm"))
-        if isinstance(miss, float) and isinstance(alarm, float) and miss == alarm == 0:
+    def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
+        """What each UAV reports of each source; some in reach miss it, some out of reach raise an alarm."""
+        chances = [self._chances(state, name) for name in ("miss", "false_alarm")]
+        if not any(isinstance(chance, Tensor) or chance for chance in chances):
             return in_reach
-        uav = torch.arange(on_ground.shape[1], device=on_ground.device)
-        seed, episode, steps = (each.unsqueeze(-1) for each in (state.seed, state.episode, state.steps))
-        share = counter_rng.uniform(seed, torch.full_like(episode, _REPORT), episode, steps, uav)
-        return torch.where(in_reach, share >= miss, on_ground & (share < alarm))
+        number = torch.arange(in_reach[0].numel(), device=in_reach.device).view(in_reach.shape[1:])
+        counters = torch.full_like(state.episode, _REPORT), state.episode, state.steps
+        seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
+        share = counter_rng.uniform(seed, *counters, number)
+        return torch.where(in_reach, share >= chances[0], listens & (share < chances[1]))
+
+    def _chances(self, state: State, name: str) -> float | Tensor:
+        """A probability of the reports about each source: of all, [K], or drawn, [B, 1, 1]."""
+        value = self.vehicles.values.get(f"source.{name}", state.drawn)
+        if isinstance(value, Tensor):
+            return value.unsqueeze(-1)
+        each = [getattr(source, name) for source in self.sources]
+        return each[0] if len({*each}) == 1 else state.track.new_tensor(each)
 
     def _stops(
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
@@ -221,21 +239,30 @@ class Simulation:
         return torch.cat([sensor.read(state, self) for sensor in self.sensors.values()], -1)
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
-        """Position of the source [B, 2], whether it emits [B], and whether its walk is over [B]."""
-        config = self.config.source
+        """Positions of the sources [B, K, 2], whether they emit and whether their walks are over, [B, K]."""
+        found = [self._source_now(state, number) for number in range(len(self.sources))]
+        place, emits, over = (torch.stack([each[i] for each in found], 1) for i in range(3))
+        return place, emits, over
+
+    def _source_now(self, state: State, number: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The same of one source, [B, 2] and [B]."""
+        config, seed = self.sources[number], state.seed
+        if number:
+            source = torch.full_like(seed, _SOURCE)
+            seed = counter_rng.bits64(seed, source, torch.full_like(seed, number))
         emits = torch.ones_like(state.source_over)
         if config.motion == "static":
-            place, over = state.source, state.source_over
+            place, over = state.source[:, number], torch.zeros_like(state.source_over)
         else:
-            walk = tree_map(lambda t: t.index_select(0, state.initial_condition), self.walk)
+            walk = tree_map(lambda t: t.index_select(0, state.initial_condition), self.walks[number])
             time = state.steps.double() * self.dt
             place, stop, tour, over = locate(walk, time, config.after_walk == "loop")
             if config.emission == "per_stop":
                 first = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
-                draw = counter_rng.uniform(state.seed, state.episode, tour, stop)
+                draw = counter_rng.uniform(seed, state.episode, tour, stop)
                 emits = torch.where(tour == 0, first, draw < config.emission_probability)
         if config.emission == "per_step":
-            draw = counter_rng.uniform(state.seed, state.episode, state.steps)
+            draw = counter_rng.uniform(seed, state.episode, state.steps)
             emits = draw < config.emission_probability
         return place, emits & ~over, over
 
@@ -245,7 +272,7 @@ class Simulation:
         goal = start + region.unsqueeze(-1) * self.airspace.max_points
         number = torch.arange(n)
         zeros = torch.zeros(goal.shape)
-        place, n_readings = gather_rows(self.points, goal), sum(each.width for each in self.sensors.values())
+        place = gather_rows(self.points, goal)
         state = State(
             seed=counter_rng.world_seeds(seed, n),
             episode=torch.zeros_like(number),
@@ -263,18 +290,18 @@ class Simulation:
             track=zeros,
             battery=zeros + 100,
             motions=torch.zeros_like(goal),
-            source=self.walk.stop[:, 0],
+            source=torch.stack([walk.stop[:, 0] for walk in self.walks], 1),
             source_over=torch.zeros_like(number, dtype=torch.bool),
             drawn=self.vehicles.values.draw(counter_rng.world_seeds(seed, n), torch.zeros_like(number)),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
-            sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, stops), n_readings),
+            sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, stops), self.widths),
         )
         return self._first_messages(state)
 
     def _first_messages(self, state: State) -> State:
         """The state at the beginning of episodes with the messages that the UAVs send then."""
-        blank = Messages.blank(state.sent.trail, state.sent.readings.shape[-1])
+        blank = Messages.blank(state.sent.trail, self.widths)
         state = self._sense(state._replace(sent=blank))
         first = torch.arange(state.sent.landed.shape[-1], device=state.track.device) == 0
         landed = torch.where(first, 0.0, -1.0).expand_as(state.sent.landed)  # nothing is known of before
@@ -283,21 +310,28 @@ class Simulation:
 
 def _draw_initial_conditions(
     config: WorldConfig, airspace: Airspace, rng: np.random.Generator
-) -> tuple[Tensor, Tensor, Walk]:
+) -> tuple[Tensor, Tensor, tuple[Walk, ...]]:
     """Draw Q initial conditions, the same number for each region, on the CPU.
 
-    Returns the index of the region, [Q], the landing point of each UAV within it, [Q, N], and the walk of the
-    source over at most K stops, [Q, K].
+    Returns the index of the region, [Q], the landing point of each UAV within it, [Q, N], and the walk of
+    each source over at most S stops, [Q, S].
     """
-    per_region = config.region.initial_conditions // len(airspace.regions)
-    place, walks, starts = config.source.position, [], []
+    per_region, sources = config.region.initial_conditions // len(airspace.regions), config.source.all
+    walks, starts = [[] for _ in sources], []
     for index, region in enumerate(airspace.regions):
-        start = None if place is None else local_places("source.position", [place], region)[0]
-        walks.append(draw_walks(region.polygon, config.source, per_region, rng, start))
+        for source, drawn in zip(sources, walks, strict=True):
+            place = source.position
+            start = None if place is None else local_places("source.position", [place], region)[0]
+            drawn.append(draw_walks(region.polygon, source, per_region, rng, start))
         starts.append(_draw_starts(config, airspace, index, per_region, rng))
+    indices = torch.arange(len(airspace.regions)).repeat_interleave(per_region)
+    return indices, torch.cat(starts), tuple(map(_joined, walks))
+
+
+def _joined(walks: list[Walk]) -> Walk:
+    """The walks of one source in all regions."""
     stops = max(walk.arrive.shape[1] for walk in walks)
-    walk = tree_map(lambda *parts: torch.cat(parts), *(_pad(walk, stops) for walk in walks))
-    return torch.arange(len(airspace.regions)).repeat_interleave(per_region), torch.cat(starts), walk
+    return tree_map(lambda *parts: torch.cat(parts), *(_pad(walk, stops) for walk in walks))
 
 
 def _pad(walk: Walk, stops: int) -> Walk:

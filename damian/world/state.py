@@ -44,9 +44,9 @@ class State(NamedTuple):
     motions: Tensor
     """Motions (holding included) since the UAV last spotted the source, [B, N]."""
     source: Tensor
-    """Position of the source, east, north [m], [B, 2]."""
+    """Positions of the sources, east, north [m], [B, K, 2]."""
     source_over: Tensor
-    """Whether the source has finished its walk, [B]."""
+    """Whether all sources have finished their walks, [B]."""
     drawn: Tensor
     """Values of the settings that are drawn for the episode, [B, D]."""
     coverage: Tensor
@@ -65,20 +65,25 @@ class Truth(NamedTuple):
     battery: Tensor
     """Their battery levels [%], [*, N]."""
     emits: Tensor
-    """Whether the source emits, [*] bool."""
+    """Whether each source emits, [*, K] bool."""
     source: Tensor
-    """Its position, east, north [m], [*, 2]."""
+    """Their positions, east, north [m], [*, K, 2]."""
+    drawn: Tensor
+    """Values of the settings that are drawn for the episode (``randomise``), [*, D]."""
 
     def pack(self) -> Tensor:
-        """One row for each world, [*, 4 N + 3]."""
-        return torch.cat([self.position.flatten(-2), self.battery, self.emits.unsqueeze(-1), self.source], -1)
+        """One row for each world, [*, 4 N + 3 K + D]."""
+        parts = self.position.flatten(-2), self.battery, self.emits, self.source.flatten(-2), self.drawn
+        return torch.cat(parts, -1)
 
     @classmethod
-    def unpack(cls, rows: Tensor) -> "Truth":
-        """The truth in rows [*, 4 N + 3]."""
-        n = (rows.shape[-1] - 3) // 4
-        position, battery, emits, source = rows.split([3 * n, n, 1, 2], -1)
-        return cls(position.unflatten(-1, (n, 3)), battery, emits.squeeze(-1) > 0, source)
+    def unpack(cls, rows: Tensor, n_sources: int = 1, n_drawn: int = 0) -> "Truth":
+        """The truth in rows [*, 4 N + 3 K + D]."""
+        n = (rows.shape[-1] - 3 * n_sources - n_drawn) // 4
+        position, battery, emits, source, drawn = rows.split(
+            [3 * n, n, n_sources, 2 * n_sources, n_drawn], -1
+        )
+        return cls(position.unflatten(-1, (n, 3)), battery, emits > 0, source.unflatten(-1, (-1, 2)), drawn)
 
 
 SEED, EPISODE, INITIAL_CONDITION = 0, 1, 2

@@ -117,7 +117,7 @@ class MotionModel(ABC):
         self, state: State, level: Tensor, drain: Tensor, rested: Tensor, goal: Tensor
     ) -> Tensor:
         """Battery levels [%] after a flight and ``rested`` steps on the landing point ``goal``, [B, N]."""
-        step = charge_gain(level.new_tensor(self.dt), battery_of(self.values, state.drawn))
+        step = charge_gain(level.new_full((), self.dt), battery_of(self.values, state.drawn))
         gain = step * (rested * gather_rows(self.chargers, goal))
         return (level - drain + gain).clamp(0, 100)
 

@@ -123,7 +123,7 @@ def flown(scenario: ScenarioConfig, build: GridBuilder, worlds: int, seed: int) 
     assert env.server.grid
     rollout = env.rollout(limit, greedy_policy(env), break_when_any_done=False)
     cells = len(env.server.grid.centres.unique(dim=0))
-    place = Truth.unpack(rollout[next_key(keys.STATE)]).source.float()
+    place = Truth.unpack(rollout[next_key(keys.STATE)]).source[..., 0, :].float()
     true = torch.cdist(place, env.server.grid.centres[:cells]).argmin(-1, keepdim=True)
     probable = rollout[next_key(keys.BELIEF)].unflatten(-1, (-1, cells)).sum(-2).gather(-1, true)
     return evaluation(rollout, env.server).return_, probable.clamp(min=1e-9).log().mean().item()

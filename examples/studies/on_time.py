@@ -61,7 +61,7 @@ def true_belief(env: DelayedEnv) -> TensorDictModule:
 
     def know(state: Tensor, message: Tensor) -> Tensor:
         inside = grid.prior[server.region_of(server.messages(message))] > 0
-        distance = torch.cdist(Truth.unpack(state).source.to(grid.centres), grid.centres)
+        distance = torch.cdist(Truth.unpack(state).source[..., 0, :].to(grid.centres), grid.centres)
         return one_hot(distance.where(inside, torch.inf).argmin(-1), distance.shape[-1]).to(distance)
 
     return TensorDictModule(know, in_keys=[keys.STATE, keys.MESSAGE], out_keys=[keys.BELIEF])

@@ -67,7 +67,9 @@ def detection(env: DelayedEnv, place: list[float], ago: float = 0.0, now: float 
     detected = torch.where(second.unsqueeze(-1), local, 0.0).expand_as(held.position)
     times = torch.where(second, now - ago, -1.0).expand_as(held.time)
     held = held._replace(
-        time=torch.full_like(held.time, now), detected_time=times, detected_position=detected
+        time=torch.full_like(held.time, now),
+        detected_time=times.unsqueeze(-1),
+        detected_position=detected.unsqueeze(-2),
     )
     held = held._replace(spotted=(second & (ago == 0)).expand_as(held.spotted))
     return td.set(("agents", "message"), held.pack())
@@ -108,7 +110,9 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
     held = sent_messages(env.reset())._replace(time=times, position=places[0], spotted=detected == times)
     in_flight = torch.rand(2, 3) < 0.3
     target = places[0] + 30 * in_flight.unsqueeze(-1)
-    held = held._replace(detected_time=detected, detected_position=places[1], target=target)
+    held = held._replace(
+        detected_time=detected.unsqueeze(-1), detected_position=places[1].unsqueeze(-2), target=target
+    )
     ground = policy.points[[0, 0]]
     likely, recent = policy.believe(held, ground, torch.full((2, 1), 9.0))
     for world, spots in enumerate(held.spotted.tolist()):

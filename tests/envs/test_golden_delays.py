@@ -110,8 +110,8 @@ def sent_messages(case: int, run: dict[str, Any]) -> Messages:
         position=position,
         spotted=spotted,
         battery=blank.battery + 100,
-        detected_time=time,
-        detected_position=place,
+        detected_time=time.unsqueeze(-1),
+        detected_position=place.unsqueeze(-2),
     )
 
 

@@ -31,8 +31,8 @@ def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
         track=draw(0, 6.28),
         battery=draw(0, 100),
         spotted=draw(0, 1) < 0.4,
-        detected_time=draw(-10, 20).round().clamp(min=-1),
-        detected_position=draw(-100, 100, 2),
+        detected_time=draw(-10, 20, 2).round().clamp(min=-1),
+        detected_position=draw(-100, 100, 2, 2),
     )
     server, steps = env.server, torch.tensor([20, 30, 40])
     found = server.observe_each(known, steps)

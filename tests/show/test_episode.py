@@ -72,14 +72,14 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
         assert again.region.equals_exact(episode.region, 1e-9)
         assert (again.about, again.success, again.origin) == (episode.about, episode.success, episode.origin)
     stored = json.loads((tmp_path / "episode.json").read_text())
-    assert (stored["schema"], stored["version"]) == ("damian-episode", 2)
+    assert (stored["schema"], stored["version"]) == ("damian-episode", 3)
     assert set(stored["meaning"]) == set(COLUMNS) <= set(stored)
 
 
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        ({"version": 3}, "it is damian-episode of version 3"),
+        ({"version": 2}, "it is damian-episode of version 2"),
         ({"age": [[0.0, 0.0]]}, "age has 1 instants, and time has 4"),
         ({"time": [0.0, 1.0, 1.0, 2.0]}, "time does not increase"),
     ],
@@ -88,6 +88,6 @@ def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, changes, 
     path = tmp_path / "episode.json"
     path.write_text(json.dumps({**flight().document(), **changes}))
     with pytest.raises(
-        InputError, match=rf"episode\.json: it is not an episode of version 2: .*{problem}.*$"
+        InputError, match=rf"episode\.json: it is not an episode of version 3: .*{problem}.*$"
     ):
         Episode.load(path)

@@ -38,7 +38,7 @@ def late_flight():
         "battery": 100 - 4.0 * np.tile(steps[:, None], 2),
         "believed": position[held, :, :2],
         "age": 2.0 * np.tile((steps - held)[:, None], 2),
-        "emits": steps % 3 == 0,
+        "emits": (steps % 3 == 0)[:, None],
         "spotted": rng.uniform(size=(t, 2)) > 0.5,
         "reward": reward,
         "reward_terms": {"near": 0.75 * reward, "far": 0.25 * reward},

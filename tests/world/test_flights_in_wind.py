@@ -126,7 +126,7 @@ def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
     td, counts = env.reset(), torch.zeros(2, 2)
     for _ in range(40):
         state = env.state
-        near = torch.linalg.vector_norm(state.position[..., :2] - state.source.unsqueeze(1), dim=-1)
+        near = torch.linalg.vector_norm(state.position[..., :2] - state.source, dim=-1)
         near, spotted = near <= env.simulation.radius, state.sent.spotted
         for row, mask in enumerate((near, ~near)):
             counts[row] += torch.tensor([(spotted & mask).sum(), mask.sum()])

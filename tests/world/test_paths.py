@@ -68,6 +68,8 @@ def test_no_uav_leaves_the_region_or_enters_a_zone(kind):
     places = flown[..., : 3 * 4].unflatten(-1, (4, 3))[..., :2].flatten(0, -2).double()
     outside = ~shapely.covers(shapely.buffer(polygon, 1e-2), shapely.points(places.numpy()))
     assert not outside.any()
+    stands = env.simulation.vehicles.on_ground(env.state)
+    assert env.state.position[stands][:, :2].equal(env.simulation.points[env.state.goal[stands]])
     flights = env.simulation.airspace.detours.row(env.state.origin, env.state.goal)
     assert (flights < len(env.simulation.airspace.detours.pair)).any(), "some fly around"
 

@@ -9,7 +9,7 @@ from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
-from damian.world.messages import Messages
+from damian.world.messages import Messages, Widths
 
 
 def sensing(motion: str = "instant", **changed) -> ScenarioConfig:
@@ -40,11 +40,12 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
     seed=st.integers(0, 2**32 - 1),
     window=st.integers(1, 5),
     n_readings=st.integers(0, 5),
+    n_sources=st.integers(1, 3),
     shape=st.lists(st.integers(1, 3), min_size=1, max_size=3),
 )
-def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, shape):
-    generator = torch.Generator().manual_seed(seed)
-    blank = Messages.blank(torch.randint(2**24, (*shape, window), generator=generator), n_readings)
+def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, n_sources, shape):
+    generator, widths = torch.Generator().manual_seed(seed), Widths(n_sources, n_readings)
+    blank = Messages.blank(torch.randint(2**24, (*shape, window), generator=generator), widths)
     assert blank.readings.shape == (*shape, n_readings)
 
     def fill(field: torch.Tensor) -> torch.Tensor:
@@ -53,7 +54,7 @@ def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, shape
 
     messages = Messages._make(map(fill, blank))
     rows = messages.pack()
-    again = Messages.unpack(rows, n_readings)
+    again = Messages.unpack(rows, widths)
     for name, field in messages._asdict().items():
         assert getattr(again, name).equal(field), name
     assert rows[..., rows.shape[-1] - n_readings :].equal(messages.readings)

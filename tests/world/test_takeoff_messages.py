@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 import torch
 from helpers import KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
@@ -61,8 +62,8 @@ class FlyingUav:
             "target": self.place,
             "spotted": spotted,
             "motions": self.motions,
-            "detected_time": self.heard_at,
-            "detected_position": self.heard_from,
+            "detected_time": [self.heard_at],
+            "detected_position": [self.heard_from],
         }
         self.told = list(self.stops)
         self.motions = 0 if spotted else self.motions
@@ -73,7 +74,7 @@ def twins(env: UavEnv) -> list[list[FlyingUav]]:
     """The UAVs of all worlds as they begin an episode."""
     levels, places = env.simulation.vehicles.levels.tolist(), env.state.position[..., :2].tolist()
     worlds = [[FlyingUav(*uav) for uav in zip(levels, map(tuple, row), strict=True)] for row in places]
-    for world, source in zip(worlds, env.state.source.tolist(), strict=True):
+    for world, source in zip(worlds, env.state.source[:, 0].tolist(), strict=True):
         for uav in world:
             uav.listen(0.0, env.simulation.dt, source, env.simulation.radius)
     return worlds
@@ -99,13 +100,15 @@ def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
         goals = env.simulation.points[env.state.goal].tolist()
         sent, told = sent_messages(output), output["agents", "message_sent"].tolist()
         for b, world in enumerate(worlds):
-            source = env.state.source[b].tolist()
+            source = env.state.source[b, 0].tolist()
             for n, uav in enumerate(world):
                 if ready[b][n]:
                     uav.choose(tuple(goals[b][n]), motion)
                 assert uav.listen(float(step), 1.0, source, env.simulation.radius) == told[b][n]
                 for name, value in uav.message.items():
-                    assert getattr(sent, name)[b, n].tolist() == pytest.approx(value, abs=1e-4), name
+                    np.testing.assert_allclose(
+                        getattr(sent, name)[b, n].tolist(), value, atol=1e-4, err_msg=name
+                    )
                 told_stops = zip(sent.landed[b, n].tolist(), sent.trail[b, n].tolist(), strict=True)
                 for (time, point), stop in zip(told_stops, uav.told, strict=False):
                     assert (time, env.simulation.points[point].tolist()) == (stop[0], pytest.approx(stop[1]))

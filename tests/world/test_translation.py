@@ -31,7 +31,7 @@ def simulation(vertices, offset):
 def test_moving_the_region_and_all_places_changes_no_bit_of_what_a_step_reads(vertices, offset):
     worlds = before, after = simulation(vertices, (0.0, 0.0)), simulation(vertices, offset)
     trees = zip(
-        *((w.packed_initial, w.walk, w.candidates.ranking, w.airspace.cells) for w in worlds), strict=True
+        *((w.packed_initial, w.walks[0], w.candidates.ranking, w.airspace.cells) for w in worlds), strict=True
     )
     assert all(one.equal(other) for pair in trees for one, other in zip(*pair, strict=True))
     assert before.vehicles.chargers.equal(after.vehicles.chargers)

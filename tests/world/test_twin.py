@@ -56,7 +56,7 @@ def twins(env: UavEnv) -> list[twin.World]:
         world = twin.World(
             polygon=airspace.regions[region].polygon,
             points=points,
-            source=tuple(state.source[b].tolist()),
+            source=tuple(state.source[b, 0].tolist()),
             radius=10 ** ((138.0 - 105.0) / 20),
             scale=airspace.scale[region].item(),
             time_scale=9.0,

@@ -70,9 +70,9 @@ export class Episode {
     return between(this.position, step, share, uav);
   }
 
-  /** Where the source is, if it is known: east, north [m]. */
-  sourcePlace({ step, share }) {
-    return between(this.source, step, share);
+  /** Where a source is, if it is known: east, north [m]. */
+  sourcePlace(number, { step, share }) {
+    return between(this.source, step, share, number);
   }
 
   /** Heading of a UAV, clockwise from north [rad]. */

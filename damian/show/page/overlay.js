@@ -31,11 +31,12 @@ export function drawMarks(scene) {
     (one, other) => (one === theme.chosen) - (other === theme.chosen),
   );
   if (layers.has("messages")) drawMessages(scene);
-  const source = layers.has("truth") && episode.source ? [drawSource(scene)] : [];
+  const sources = layers.has("truth") && episode.source ? [...episode.source[0].keys()] : [];
+  const stars = sources.map((number) => drawSource(scene, number));
   const rings = layers.has("believed") ? uavs.map((uav) => drawBelieved(scene, uav)) : [];
   const darts = layers.has("truth") ? uavs.map((uav) => drawUav(scene, uav)) : [];
   const shown = [...darts, ...rings.filter(Boolean)].reverse(); // the chosen one is named first
-  marks.names(context, shown, source, scene.places, theme);
+  marks.names(context, shown, stars, scene.places, theme);
   return shown;
 }
 
@@ -58,17 +59,18 @@ function drawBelieved({ context, episode, now, layers, theme, pixel }, uav) {
   return { uav, at, key: `ring ${uav}`, text, colour: theme.text(uav) };
 }
 
-/** The source, with a wave that spreads over the step while it emits. */
-function drawSource({ context, episode, now, theme, pixel }) {
-  const at = pixel([...episode.sourcePlace(now), 0]);
-  if (episode.emits[now.step]) {
+/** A source, with a wave that spreads over the step while it emits. */
+function drawSource({ context, episode, now, theme, pixel }, number) {
+  const at = pixel([...episode.sourcePlace(number, now), 0]);
+  const emits = episode.emits[now.step][number];
+  if (emits) {
     context.strokeStyle = faint(theme.ink, 0.45 * (1 - now.share));
     context.lineWidth = 1.5;
     context.beginPath();
     context.arc(...at, 12 + 16 * now.share, 0, 2 * Math.PI);
     context.stroke();
   }
-  marks.star(context, at, episode.emits[now.step], theme);
+  marks.star(context, at, emits, theme);
   return at;
 }
 

@@ -132,7 +132,7 @@ class Fleet:
         self._forget_history()
 
     def _new_log(self) -> UavLog:
-        n_readings = sum(each.width for each in self.node.simulation.sensors.values())
+        n_readings = self.node.simulation.widths.readings
         kept = 2 * max(self.node.law_longest, REMEMBERED_STEPS)
         return UavLog(self.ground, self.node.server.observation.stops, n_readings, kept, self.node.dt)
 

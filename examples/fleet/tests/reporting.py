@@ -79,9 +79,9 @@ class Reporter:
             "sequence": self.n_sent[uav],
             "landed": [self.time_of(round(t / self.dt)) for t in messages.landed[uav].tolist() if t >= 0],
         }
-        seen = float(messages.detected_time[uav])
+        seen = float(messages.detected_time[uav, 0])
         if seen >= 0:
-            there = place(messages.detected_position[uav])
+            there = place(messages.detected_position[uav, 0])
             row |= {"source time": self.time_of(round(seen / self.dt))}
             row |= {f"source {first}": there[0], f"source {second}": there[1]}
         return row
