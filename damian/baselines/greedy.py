@@ -12,10 +12,11 @@ from torch import Tensor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import distances, gather_rows, tree_map
+from damian.common.tensors import distances, expand_mask, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import chance_of_staying, detection_chance, report_rows
+from damian.server.surroundings import known_requests
 from damian.world.messages import Messages
 
 BLUR_M = 5.0
@@ -47,6 +48,10 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
     own_messages = keys.OWN_BELIEF in available if believes else scenario.observation.own
     script = Searcher if believes else Greedy if scenario.seeks_source else Coverer
+    if scenario.source.count > 1 and scenario.seeks_source:
+        script = Rescuer
+    if scenario.requests.slots:
+        script = Dispatcher
     arguments: dict[str, NestedKey] = {"message": message, "mask": keys.ACTION_MASK}
     if script is Searcher:
         arguments |= {"belief": keys.BELIEF, "own_belief": keys.OWN_BELIEF}
@@ -254,6 +259,61 @@ class Coverer(Greedy):
         latest = self.counted(alone)[:, 0, :-1] % self.points.shape[1]
         covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
         return self.choose_landing(alone, (1 - covered) @ near, self.region_of(known), mask)
+
+
+class Rescuer(Coverer):
+    """UAVs are assigned to known sources, the nearest pair first; the others search new ground."""
+
+    def choose_new(
+        self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        searched = super().choose_new(known, uav, claimed, near, mask)
+        heard = known.detected_time >= 0  # [B, N, K]
+        place = (known.detected_position * heard.unsqueeze(-1)).sum(1) / heard.sum(1).clamp(min=1).unsqueeze(
+            -1
+        )
+        goal, assigned = _assigned(known.target, place, heard.any(1), uav)
+        region = self.region_of(known)
+        close = (-distances(goal.unsqueeze(1), self.points[region]) / self.radius).exp()
+        alone = tree_map(lambda field: field[:, uav : uav + 1], known)
+        followed = self.choose_landing(alone, close, region, mask)
+        return tuple(
+            torch.where(expand_mask(assigned, a), a, b) for a, b in zip(followed, searched, strict=True)
+        )
+
+
+class Dispatcher(Coverer):
+    """UAVs are assigned to the open requests that are known, the nearest pair first; the others wait."""
+
+    def choose_new(
+        self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        requests, unserved = known_requests(known)
+        goal, assigned = _assigned(known.target, requests[..., :2], unserved, uav)
+        alone = tree_map(lambda field: field[:, uav : uav + 1], known)
+        goal = torch.where(assigned.unsqueeze(-1), goal, alone.target[:, 0])
+        region = self.region_of(known)
+        inside = distances(goal.unsqueeze(1), self.points[region]) <= self.radius
+        return self.choose_landing(alone, inside.float(), region, mask)
+
+
+def _assigned(uavs: Tensor, places: Tensor, wanted: Tensor, uav: int) -> tuple[Tensor, Tensor]:
+    """The place [B, 2] of those wanted [B, K] to which a UAV is assigned, and whether it is to any, [B].
+
+    UAVs are at ``uavs`` [B, N, 2], places at [B, K, 2] m; of those left, the nearest pair is assigned first.
+    """
+    cost = distances(uavs, places).masked_fill(~wanted.unsqueeze(1), torch.inf)
+    goal, assigned = places[:, 0].clone(), torch.zeros(len(uavs), dtype=torch.bool, device=uavs.device)
+    for _ in range(min(cost.shape[1:])):
+        least, pair = cost.flatten(1).min(-1)
+        one, place = pair // cost.shape[2], pair % cost.shape[2]
+        own = (one == uav) & least.isfinite()
+        goal = torch.where(own.unsqueeze(-1), _places_at(places, place.unsqueeze(1)).squeeze(1), goal)
+        assigned = assigned | own
+        rows = torch.arange(cost.shape[1], device=uavs.device) == one.unsqueeze(-1)
+        columns = torch.arange(cost.shape[2], device=uavs.device) == place.unsqueeze(-1)
+        cost = cost.masked_fill(rows.unsqueeze(-1) | columns.unsqueeze(1), torch.inf)
+    return goal, assigned
 
 
 def _footprints_of(point: Tensor, near: Tensor) -> Tensor:

@@ -101,6 +101,8 @@ class ScenarioConfig(WorldConfig):
         self.refuse(self.delay.messages and links != "server", "delay.messages", problem)
         problem = "does not go with delay.order=arrival: a slot would change with when a message arrived"
         self.refuse(observation.timeline and self.delay.order == "arrival", "observation.timeline", problem)
+        asked = "requests" in observation.global_features or self.reward.served
+        self.refuse(asked and not self.requests.slots, "requests.rate", "is 0, so that no request appears")
         never = episode.discharged_share is not None and not self.battery.enabled
         self.refuse(never, "episode.discharged_share", "needs battery.enabled=true")
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
@@ -117,7 +119,7 @@ class ScenarioConfig(WorldConfig):
     @property
     def seeks_source(self) -> bool:
         """Whether anything is won by finding the source."""
-        terms = {*self.reward.terms} - {"coverage", "battery", "mean_distance"}
+        terms = {*self.reward.terms} - {"coverage", "battery", "mean_distance", "served"}
         return bool(terms) or self.episode.success_share is not None
 
     @property

@@ -20,6 +20,7 @@ from damian.server.components import checked_features
 from damian.server.features import feature_bounds, nearest_way
 from damian.server.server import Features, Server
 from damian.world.coverage import KnownCoverage
+from damian.world.requests import is_open
 from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State, Truth
 
@@ -227,7 +228,9 @@ class UavEnv(EnvBase):
             outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
         if "state" in self.extras:
             _, emits, _ = self.simulation.source_now(state)
-            truth = Truth(state.position, state.battery, emits, state.source, state.drawn)
+            unserved = is_open(state.requests, state.sent.served).unsqueeze(-1)
+            requests = torch.cat([state.requests[..., :2], unserved], -1)
+            truth = Truth(state.position, state.battery, emits, state.source, requests, state.drawn)
             outputs[keys.STATE] = truth.pack()
         return outputs
 

@@ -100,7 +100,7 @@ def _episode(tracker: Tracker, rows: Rows, steps: Sequence[int], about: Mapping[
         rewards[0] = 0  # of a step before
     unknown = torch.zeros(len(steps), 1, 2)
     true = (torch.as_tensor(columns[name]) for name in ("position", "battery"))
-    instants[keys.STATE] = Truth(*true, unknown[..., 0], unknown, unknown[:, 0, :0]).pack()
+    instants[keys.STATE] = Truth(*true, unknown[..., 0], unknown, unknown[:, :0], unknown[:, 0, :0]).pack()
     told = {**about, "uavs": tracker.uavs, "began": written(tracker.start + steps[0] * node.dt)}
     episode = episode_of(instants, node.worlds, told)
     return replace(episode, **columns, instant=False, source=None, emits=None)

@@ -18,13 +18,13 @@ class ObservationConfig(Settings):
     section: ClassVar[str] = "observation"
 
     local_features: list[str] = setting(
-        ["spotted"], "Features of the UAV itself: battery, spotted, place, time_left, number."
+        ["spotted"], "Features of the UAV itself: battery, spotted, served, place, time_left, number."
     )
     global_features: list[str] = setting(
         ["source_distance", "source_bearing", "source_time"],
         "Features from the messages of all UAVs: source_distance, source_bearing, source_drift, source_time, "
         "agent_distances, coverage, mean_distance, mean_distance_not_spotting, mean_distance_spotting, "
-        "spotting_agents, others, ages, coverage_map.",
+        "spotting_agents, others, ages, coverage_map, requests.",
     )
     ctde: bool = setting(False, "Whether the actor observes only the local features.")
     time_scale: float | None = setting(
@@ -93,6 +93,7 @@ class RewardWeights(Settings):
     coverage: float = setting(0.0, "Weight of newly covered area that no other UAV covers (R1^a, eq. 7).")
     spotted: float = setting(1.0, "Weight of spotting the source, over the motions since (R2^a, eq. 7).")
     battery: float = setting(0.0, "Weight of the battery level (R3^a, eq. 7).")
+    served: float = setting(0.0, "Weight of serving a request.")
     source_distance: float = setting(
         0.0, "Weight of being near the source, over the motions since it was spotted (R1^s, eq. 6)."
     )

@@ -154,6 +154,7 @@ def _add(name: str, scope: str, compute: Callable[..., Tensor]) -> None:
 _add("coverage", "individual", lambda x, counters: x)
 _add("spotted", "individual", _per_motion)
 _add("battery", "individual", lambda x, counters: x)
+_add("served", "individual", lambda x, counters: x)
 _add("source_distance", "system", lambda x, counters: _per_motion(1 - x, counters))
 _add("source_time", "system", lambda x, counters: 1 - x)
 _add("source_bearing", "system", lambda x, counters: 1 - x)

@@ -15,6 +15,8 @@ from torch.nn import functional as F
 from damian.common.tensors import distances, gather_rows
 from damian.server.features import FEATURES, FeatureCache, feature, of_others
 from damian.world.airspace import Airspace
+from damian.world.messages import Messages
+from damian.world.requests import is_open
 
 RINGS = (0.6, 1.25, 2.5)
 """Distances of the places of ``coverage_map`` from the UAV, in footprint radii."""
@@ -22,6 +24,8 @@ SECTORS = 8
 """Number of places on each ring; the first one lies north, the others follow clockwise."""
 OTHERS = 4
 """Number of other UAVs that ``others`` describes, the nearest ones."""
+REQUESTS = 4
+"""Number of open requests that ``requests`` describes, the nearest ones."""
 _OLDEST = 0.5
 """How new ground in the oldest footprint of the window nearly is, in [0, 1]; in the newest one it is 0."""
 
@@ -112,6 +116,40 @@ def _timeline(v: FeatureCache) -> Tensor:
     flies = messages.in_flight.to(stops.dtype).unsqueeze(-1)
     table = torch.cat([table, torch.cat([messages.target, flies], -1).unsqueeze(-2)], -2)
     return _four(_ways_to_nearest(v, table).flatten(-2))
+
+
+def known_requests(messages: Messages) -> tuple[Tensor, Tensor]:
+    """The latest known request of each slot, [*, M, 3], and which of them nobody is known to have served."""
+    newest = messages.requests[..., 2].argmax(-2)[..., None, :, None]  # who knows it, [*, 1, M, 1]
+    requests = messages.requests.gather(-3, newest.expand(*newest.shape[:-1], 3)).squeeze(-3)
+    return requests, is_open(requests, messages.served)
+
+
+@FEATURES.register("requests")
+@feature("global", width=4 * REQUESTS, low=-1.0)
+def _requests(v: FeatureCache) -> Tensor:
+    """The open requests that are nearest to where the UAV stands or will land, the nearest first, [*, N, 16].
+
+    Of each of four: the way to it, east and north, over half the largest vertex distance of the region, its
+    age over ``observation.time_scale``, and 1; zeros stand for those that do not exist.
+    """
+    requests, unserved = known_requests(v.messages)
+    own, half = v.wanted(v.messages.target), (v.context.scale / 2)[..., None, None, None]
+    ways = (requests[..., :2].unsqueeze(-3) - own.unsqueeze(-2)) / half  # [*, N, M, 2]
+    age = (v.context.now.unsqueeze(-1) - requests[..., 2]) / v.context.time_scale
+    age = age.clamp(0, 1)[..., None, :, None].expand(*ways.shape[:-1], 1)
+    rows = torch.cat([ways.clamp(-1, 1), age, torch.ones_like(age)], -1) * unserved[..., None, :, None]
+    distance = ways.square().sum(-1).masked_fill(~unserved.unsqueeze(-2), torch.inf)
+    nearest = distance.argsort(dim=-1, stable=True)[..., :REQUESTS].unsqueeze(-1)
+    found = rows.gather(-2, nearest.expand(*nearest.shape[:-1], 4))
+    return F.pad(found, (0, 0, 0, REQUESTS - found.shape[-2])).flatten(-2)
+
+
+@FEATURES.register("served")
+@feature("local")
+def _served(v: FeatureCache) -> Tensor:
+    """Whether the UAV serves a request with this message, 0 or 1, [*, N]."""
+    return v.messages.serves.sum(-1)
 
 
 def _nearest(v: FeatureCache) -> Tensor:

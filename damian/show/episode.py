@@ -259,9 +259,8 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
 def _truth(env: UavEnv, instants: TensorDictBase) -> Truth:
     """What the environment's entry ``state`` tells."""
     simulation = env.simulation
-    return Truth.unpack(
-        instants[keys.STATE], len(simulation.sources), len(simulation.vehicles.values.choices)
-    )
+    rows = cast(Tensor, instants[keys.STATE])
+    return Truth.unpack(rows, simulation.widths, len(simulation.vehicles.values.choices))
 
 
 def fixed_of(env: UavEnv, about: Mapping[str, Any], region: int) -> dict[str, Any]:

@@ -255,6 +255,23 @@ class SourceConfig(Settings):
 
 
 @dataclass
+class RequestConfig(Settings):
+    """Requests that appear at random places, to be served by landing near them."""
+
+    section: ClassVar[str] = "requests"
+
+    rate: float = setting(
+        0.0, "Mean number that appears in a minute, at most one in a step.", unit="1/min", low=0, high=6000
+    )
+    most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
+
+    @property
+    def slots(self) -> int:
+        """Number of requests that a world holds; 0 if none appears."""
+        return self.most if self.rate > 0 else 0
+
+
+@dataclass
 class BatteryConfig(Settings):
     """Batteries of the UAVs, and the places where they charge."""
 
@@ -343,6 +360,7 @@ class WorldConfig(Settings):
     motion: MotionConfig = setting(MotionConfig)
     wind: WindConfig = setting(WindConfig)
     source: SourceConfig = setting(SourceConfig)
+    requests: RequestConfig = setting(RequestConfig)
     battery: BatteryConfig = setting(BatteryConfig)
     actions: ActionConfig = setting(ActionConfig)
     randomise: dict[str, Any] = setting(

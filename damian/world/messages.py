@@ -25,6 +25,8 @@ class Widths(NamedTuple):
     """Number of signal sources, K."""
     readings: int = 0
     """Number of values that the user's sensors read."""
+    requests: int = 0
+    """Number of requests that can be open at once, M."""
 
 
 ONE_SOURCE = Widths()
@@ -56,6 +58,12 @@ class Messages(NamedTuple):
     """Time of the latest detection of each source [s], [*, N, K]; -1 if there was none."""
     detected_position: Annotated[Tensor, Column(None)]
     """Position of the UAV at its latest detection of each source, east, north [m], [*, N, K, 2]."""
+    requests: Annotated[Tensor, Column(None)]
+    """The latest request of each slot (``damian.world.requests``), [*, N, M, 3]."""
+    served: Annotated[Tensor, Column(None)]
+    """When the latest request of each slot that the UAV has served appeared [s], [*, N, M]; -1 if none."""
+    serves: Annotated[Tensor, Column(None)]
+    """Whether it serves one now, 0 or 1, [*, N, 1]; [*, N, 0] if there are no requests."""
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a stop."""
     landed: Annotated[Tensor, Column(None)]
@@ -66,15 +74,15 @@ class Messages(NamedTuple):
     @classmethod
     def blank(cls, trail: Tensor, widths: Widths = ONE_SOURCE) -> "Messages":
         """Messages of zeros, without a detection, of UAVs with the landing points ``trail`` [*, N, S]."""
-        width = _FIXED + 3 * widths.sources + 2 * trail.shape[-1] + widths.readings
+        width = _FIXED + sum(_variable(widths)) + 2 * trail.shape[-1]
         blank = cls.unpack(torch.zeros(*trail.shape[:-1], width, device=trail.device), widths)
-        return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
+        never = {name: getattr(blank, name) - 1 for name in ("detected_time", "requests", "served")}
+        return blank._replace(**never, trail=trail)
 
     def pack(self) -> Tensor:
         """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through exactly."""
-        fields = zip(
-            self._replace(detected_position=self.detected_position.flatten(-2)), _COLUMNS, strict=True
-        )
+        flat = {name: getattr(self, name).flatten(-2) for name in ("detected_position", "requests")}
+        fields = zip(self._replace(**flat), _COLUMNS, strict=True)
         parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
         return torch.cat(parts, -1)
 
@@ -84,16 +92,20 @@ class Messages(NamedTuple):
 
         ``Server.messages``, which knows the widths, is the way to unpack messages of an environment.
         """
-        n, readings = widths
-        stops = (rows.shape[-1] - _FIXED - 3 * n - readings) // 2
-        fixed = [column.width for column in _COLUMNS[:-5]]
-        parts = [*rows.split([*fixed, n, 2 * n, stops, stops, readings], -1)]
-        parts[-4] = parts[-4].unflatten(-1, (n, 2))
+        *variable, readings = _variable(widths)
+        stops = (rows.shape[-1] - _FIXED - sum(variable) - readings) // 2
+        fixed = [column.width for column in _COLUMNS if column.width]
+        parts = [*rows.split([*fixed, *variable, stops, stops, readings], -1)]
         fields = []
         for part, (width, dtype) in zip(parts, _COLUMNS, strict=True):
             field = part.squeeze(-1) if width == 1 else part
             fields.append(field > 0.5 if dtype == torch.bool else field.to(dtype))
-        return cls._make(fields)
+        found = cls._make(fields)
+        at, requests = found.detected_position, found.requests
+        return found._replace(
+            detected_position=at.unflatten(-1, (widths.sources, 2)),
+            requests=requests.unflatten(-1, (widths.requests, 3)),
+        )
 
     @property
     def in_flight(self) -> Tensor:
@@ -112,4 +124,10 @@ class Messages(NamedTuple):
 _HINTS = get_type_hints(Messages, include_extras=True)
 _COLUMNS: list[Column] = [hint.__metadata__[0] for hint in _HINTS.values()]
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
-"""Number of columns of all fields but the last five, those of detections, stops and readings."""
+"""Number of columns of all fields whose number does not depend on the settings; they come first."""
+
+
+def _variable(widths: Widths) -> list[int]:
+    """Numbers of columns of the other fields, but those of the stops."""
+    n, m = widths.sources, widths.requests
+    return [n, 2 * n, 3 * m, m, min(m, 1), widths.readings]

@@ -17,6 +17,7 @@ from damian.world.landing import Candidates, Ranking, assign_landing_points
 from damian.world.messages import Messages, Widths
 from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
+from damian.world.requests import appear, request_places, serve
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import Walk, draw_walks, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
@@ -37,13 +38,16 @@ class Simulation:
         """Largest distance at which UAVs detect each source [m], [K]."""
         self.radius = footprint_radius(config.source)
         """Radius of a footprint [m]."""
-        self.widths = Widths(len(self.sources), sum(each.width for each in self.sensors.values()))
+        n_readings = sum(each.width for each in self.sensors.values())
+        self.widths = Widths(len(self.sources), n_readings, config.requests.slots)
         regions, longest = regions_of(config.region, rng), max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         region, start, self.walks = _draw_initial_conditions(config, self.airspace, rng)
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
+        if self.widths.requests:
+            self.request_places = request_places(regions, rng)
         shortest = self._shortest_flights()
         unsure = any(each.miss or each.false_alarm for each in self.sources)
         self.draws = bool(self.sensors or self.vehicles.values.choices or unsure)
@@ -155,6 +159,7 @@ class Simulation:
         spotted = detected.any(-1)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         trail, landed = self._stops(state, times, on_ground, action_valid)
+        state, served, serves = self._serve(state, now, on_ground, action_valid)
         messages = Messages(
             time=times,
             position=position,
@@ -168,6 +173,9 @@ class Simulation:
             detected_position=torch.where(
                 detected.unsqueeze(-1), position.unsqueeze(-2), state.sent.detected_position
             ),
+            requests=state.requests.unsqueeze(-3).expand(-1, times.shape[-1], -1, -1),
+            served=served,
+            serves=serves,
             trail=trail,
             landed=landed,
             readings=self._readings(state),
@@ -206,6 +214,21 @@ class Simulation:
             return trail, landed
         added = added.unsqueeze(-1)
         return torch.where(added, trail, before[0]), torch.where(added, landed, before[1])
+
+    def _serve(
+        self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
+    ) -> tuple[State, Tensor, Tensor]:
+        """Let a request appear, and the UAVs that land serve some, as in ``Messages``."""
+        served, serves = state.sent.served, state.sent.serves
+        if not self.widths.requests:
+            return state, served, serves
+        probability = -math.expm1(-self.config.requests.rate * self.dt / 60)
+        counters = state.seed, state.episode, state.steps, state.region
+        requests = appear(state.requests, served, probability, self.request_places, counters, now)
+        lands = self.vehicles.new_stop(state, on_ground, action_valid)
+        lands = on_ground if lands is None else lands
+        served, serves = serve(requests, served, state.position[..., :2], lands, self.radius)
+        return state._replace(requests=requests), served, serves.unsqueeze(-1).to(now.dtype)
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:
         """Whether each UAV's observed battery level is 0, or allows nothing but holding, [B, N]."""
@@ -292,6 +315,7 @@ class Simulation:
             motions=torch.zeros_like(goal),
             source=torch.stack([walk.stop[:, 0] for walk in self.walks], 1),
             source_over=torch.zeros_like(number, dtype=torch.bool),
+            requests=torch.full((n, self.widths.requests, 3), -1.0),
             drawn=self.vehicles.values.draw(counter_rng.world_seeds(seed, n), torch.zeros_like(number)),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),

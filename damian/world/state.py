@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.world.messages import Messages
+from damian.world.messages import ONE_SOURCE, Messages, Widths
 
 
 class State(NamedTuple):
@@ -47,6 +47,8 @@ class State(NamedTuple):
     """Positions of the sources, east, north [m], [B, K, 2]."""
     source_over: Tensor
     """Whether all sources have finished their walks, [B]."""
+    requests: Tensor
+    """The latest request of each slot, east, north [m], and when it appeared [s], [B, M, 3]."""
     drawn: Tensor
     """Values of the settings that are drawn for the episode, [B, D]."""
     coverage: Tensor
@@ -68,22 +70,25 @@ class Truth(NamedTuple):
     """Whether each source emits, [*, K] bool."""
     source: Tensor
     """Their positions, east, north [m], [*, K, 2]."""
+    requests: Tensor
+    """The latest request of each slot, east, north [m], and 1 while nobody has served it, [*, M, 3]."""
     drawn: Tensor
     """Values of the settings that are drawn for the episode (``randomise``), [*, D]."""
 
     def pack(self) -> Tensor:
-        """One row for each world, [*, 4 N + 3 K + D]."""
-        parts = self.position.flatten(-2), self.battery, self.emits, self.source.flatten(-2), self.drawn
-        return torch.cat(parts, -1)
+        """One row for each world, [*, 4 N + 3 K + 3 M + D]."""
+        parts = self.position.flatten(-2), self.battery, self.emits, self.source.flatten(-2)
+        return torch.cat([*parts, self.requests.flatten(-2), self.drawn], -1)
 
     @classmethod
-    def unpack(cls, rows: Tensor, n_sources: int = 1, n_drawn: int = 0) -> "Truth":
-        """The truth in rows [*, 4 N + 3 K + D]."""
-        n = (rows.shape[-1] - 3 * n_sources - n_drawn) // 4
-        position, battery, emits, source, drawn = rows.split(
-            [3 * n, n, n_sources, 2 * n_sources, n_drawn], -1
-        )
-        return cls(position.unflatten(-1, (n, 3)), battery, emits > 0, source.unflatten(-1, (-1, 2)), drawn)
+    def unpack(cls, rows: Tensor, widths: Widths = ONE_SOURCE, n_drawn: int = 0) -> "Truth":
+        """The truth in rows [*, 4 N + 3 K + 3 M + D], with K sources and M requests as messages have."""
+        k, m = widths.sources, widths.requests
+        n = (rows.shape[-1] - 3 * k - 3 * m - n_drawn) // 4
+        parts = rows.split([3 * n, n, k, 2 * k, 3 * m, n_drawn], -1)
+        position, battery, emits, source, requests, drawn = parts
+        place, at = position.unflatten(-1, (n, 3)), source.unflatten(-1, (k, 2))
+        return cls(place, battery, emits > 0, at, requests.unflatten(-1, (m, 3)), drawn)
 
 
 SEED, EPISODE, INITIAL_CONDITION = 0, 1, 2
