@@ -18,7 +18,7 @@ class ObservationConfig(Settings):
     section: ClassVar[str] = "observation"
 
     local_features: list[str] = setting(
-        ["spotted"], "Features of the UAV itself: battery, spotted, served, place, time_left, number."
+        ["spotted"], "Features of the UAV itself: battery, spotted, served, place, time_left, number, kind."
     )
     global_features: list[str] = setting(
         ["source_distance", "source_bearing", "source_time"],

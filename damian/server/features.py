@@ -55,6 +55,8 @@ class ServerContext(NamedTuple):
     """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
     radius: float = 0.0
     """Radius of a UAV's footprint [m]."""
+    kinds: Tensor | None = None
+    """Speed limit and battery capacity of each UAV, over the largest ones, [N, 2]."""
     n_points: int = 0
     """Largest number of landing points in a region, L."""
     goals: Tensor | None = None

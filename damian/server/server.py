@@ -102,6 +102,7 @@ class Server:
             dt=simulation.dt,
             readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
             radius=simulation.radius,
+            kinds=simulation.vehicles.kinds(simulation.config.agents),
             n_points=airspace.max_points,
             goals=simulation.candidates.goals() if gains else None,
             places_inside=places_inside(airspace, simulation.radius) if surrounded else None,

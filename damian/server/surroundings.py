@@ -67,6 +67,14 @@ def _number(v: FeatureCache) -> Tensor:
     return F.one_hot(columns, OTHERS + 1).float().expand(*known.shape, OTHERS + 1)
 
 
+@FEATURES.register("kind")
+@feature("local", width=2)
+def _kind(v: FeatureCache) -> Tensor:
+    """Largest speed and battery capacity of the UAV, over the largest of all UAVs, [*, N, 2]."""
+    assert v.context.kinds is not None
+    return v.context.kinds.expand(*v.messages.time.shape, 2)
+
+
 @FEATURES.register("time_left")
 @feature("local")
 def _time_left(v: FeatureCache) -> Tensor:

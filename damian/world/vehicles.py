@@ -109,6 +109,12 @@ class MotionModel(ABC):
         limits = (self.values.get(f"motion.{name}", drawn) for name in ("max_speed", "max_acceleration"))
         return minimum_time(length, self.motion.degree, *limits)
 
+    def kinds(self, n_agents: int) -> Tensor:
+        """Speed limit and battery capacity of each UAV, over the largest ones, [N, 2]."""
+        each = [self.values.settings[name] for name in ("motion.max_speed", "battery.capacity_kwh")]
+        kinds = torch.stack([torch.as_tensor(value).float().expand(n_agents) for value in each], -1)
+        return kinds / kinds.amax(0)
+
     def vertical(self, state: State) -> Tensor:
         """Duration of a takeoff, and of a landing, of each UAV [s], [N], or [B, N] if it is drawn."""
         return self.shortest_time(self.levels, state.drawn)
