@@ -233,6 +233,7 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
     dt = env.scenario.clock.dt
     time = torch.arange(len(sent), dtype=torch.float64) * dt
     belief = instants.get(keys.BELIEF, None)
+    about = {**about, **_drawn(env, truth.drawn[:1])}
     return Episode(
         **fixed_of(env, about, int(env.server.region_of(own)[0])),
         instant=env.simulation.vehicles.instant,
@@ -261,6 +262,16 @@ def _truth(env: UavEnv, instants: TensorDictBase) -> Truth:
     simulation = env.simulation
     rows = cast(Tensor, instants[keys.STATE])
     return Truth.unpack(rows, simulation.widths, len(simulation.vehicles.values.choices))
+
+
+def _drawn(env: UavEnv, drawn: Tensor) -> dict[str, Any]:
+    """What was drawn for the episode, [1, D], by keys of settings, and its wind: speed [m/s], direction [deg]."""
+    values, about = env.simulation.vehicles.values, {}
+    if values.choices:
+        about["drawn"] = dict(zip(values.choices, drawn[0].tolist(), strict=True))
+    if env.simulation.vehicles.is_windy:
+        about["wind"] = [float(values.get(f"wind.{name}", drawn)) for name in ("speed", "direction")]
+    return about
 
 
 def fixed_of(env: UavEnv, about: Mapping[str, Any], region: int) -> dict[str, Any]:

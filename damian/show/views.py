@@ -9,6 +9,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
 from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Circle, PathPatch
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
@@ -25,6 +26,8 @@ TURN = 0.7
 HEAT = LinearSegmentedColormap.from_list("belief", [(0.45, 0.2, 0.6, 0.0), (0.45, 0.2, 0.6, 0.75)])
 """Colours of the belief about the source."""
 _NORM = LogNorm(LIKELY, 1.0)
+_BLOWS = Path([[0.0, 1.0], [0.0, -1.0], [-0.4, -0.4], [0.0, -1.0], [0.4, -0.4]], [1, 2, 2, 1, 2])
+"""Arrow of a wind from the north."""
 DART = Path([[0.0, 1.0], [0.62, -0.8], [0.0, -0.42], [-0.62, -0.8], [0.0, 1.0]])
 """Outline of a UAV that flies to the north."""
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
@@ -210,6 +213,10 @@ def legend_marks(episode: Episode) -> list[Any]:
     if episode.source is not None:
         for does, style in (("emits", {}), ("silent", {"markerfacecolor": "white"})):
             marks.append(_mark(f"source, {does}", marker="*", color=INK, markersize=11, **style))
+    if "wind" in episode.about:
+        speed, whence = episode.about["wind"]
+        blows = MarkerStyle(_BLOWS, transform=Affine2D().rotate_deg(-whence))
+        marks.append(_mark(f"wind, {speed:.2g} m/s", marker=blows, color=INK, markersize=14))
     return marks
 
 
