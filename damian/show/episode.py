@@ -79,6 +79,10 @@ class Episode:
     )
     cells: Annotated[Floats | None, "centres of the belief's cells: east, north [m], [K, 2]"] = None
     belief: Annotated[Floats | None, "probability that the source is in a cell, [T + 1, K]"] = None
+    requests: Annotated[
+        Floats | None,
+        "latest requests: east, north [m], 1 while it is open; null if there are none, [T + 1, M, 3]",
+    ] = None
 
     @property
     def n_agents(self) -> int:
@@ -254,6 +258,7 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         reward_terms={name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()},
         cells=None if belief is None else cells_of(env),
         belief=None if belief is None else np.asarray(belief),
+        requests=np.asarray(truth.requests) if env.simulation.widths.requests else None,
     )
 
 
@@ -265,7 +270,7 @@ def _truth(env: UavEnv, instants: TensorDictBase) -> Truth:
 
 
 def _drawn(env: UavEnv, drawn: Tensor) -> dict[str, Any]:
-    """What was drawn for the episode, [1, D], by keys of settings, and its wind: speed [m/s], direction [deg]."""
+    """What was drawn for the episode, [1, D], by key, and its wind: speed [m/s], direction [deg]."""
     values, about = env.simulation.vehicles.values, {}
     if values.choices:
         about["drawn"] = dict(zip(values.choices, drawn[0].tolist(), strict=True))

@@ -44,6 +44,8 @@ class Frame:
     uavs: list[Uav]
     sources: list[tuple[Floats, bool]]
     """Place of each source, east, north [m], [2], and whether it emits; none if nobody knows them."""
+    requests: Floats
+    """Places of open requests, east, north [m], [M, 2]."""
     cells: list[tuple[Any, float]]
     """Where the source may well be: polygons or several of them, with their probabilities."""
 
@@ -52,7 +54,7 @@ def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
     """An episode after ``step`` steps; paths reach ``trail`` steps back, or with None to the beginning."""
     trail = CROWDED_TRAIL if episode.is_crowded else trail
     begin = 0 if trail is None else max(step - trail, 0)
-    known, emits = episode.source, episode.emits
+    known, emits, asked = episode.source, episode.emits, episode.requests
     belief = [] if episode.belief is None else episode.belief[step]
     uavs = [
         Uav(
@@ -72,6 +74,7 @@ def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
         time=float(episode.time[step]),
         uavs=uavs,
         sources=[] if known is None or emits is None else [*zip(known[step], emits[step], strict=True)],
+        requests=np.zeros((0, 2)) if asked is None else asked[step][asked[step][:, 2] > 0, :2],
         cells=[(area, float(p)) for area, p in zip(episode.squares, belief, strict=True) if p > LIKELY],
     )
 

@@ -213,6 +213,8 @@ def legend_marks(episode: Episode) -> list[Any]:
     if episode.source is not None:
         for does, style in (("emits", {}), ("silent", {"markerfacecolor": "white"})):
             marks.append(_mark(f"source, {does}", marker="*", color=INK, markersize=11, **style))
+    if episode.requests is not None:
+        marks.append(_mark("open request", marker="s", color=INK, markerfacecolor="none"))
     if "wind" in episode.about:
         speed, whence = episode.about["wind"]
         blows = MarkerStyle(_BLOWS, transform=Affine2D().rotate_deg(-whence))
@@ -221,8 +223,12 @@ def legend_marks(episode: Episode) -> list[Any]:
 
 
 def _draw_source(axis: Any, frame: Frame, height: tuple[float, ...], style: dict[str, Any]) -> list[Any]:
-    """Draw the sources, filled while they emit, if anybody knows them."""
+    """Draw the sources, filled while they emit, if anybody knows them, and the open requests."""
     drawn = []
+    for place in frame.requests:
+        drawn += axis.plot(
+            *place, *height, "s", color=INK, markerfacecolor="none", **style | {"markersize": 7}
+        )
     for place, emits in frame.sources:
         fill = INK if emits else "white"
         drawn += axis.plot(*place, *height, "*", color=INK, markerfacecolor=fill, **style)

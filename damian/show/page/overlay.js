@@ -32,6 +32,7 @@ export function drawMarks(scene) {
   );
   if (layers.has("messages")) drawMessages(scene);
   const sources = layers.has("truth") && episode.source ? [...episode.source[0].keys()] : [];
+  if (layers.has("truth") && episode.requests) drawRequests(scene);
   const stars = sources.map((number) => drawSource(scene, number));
   const rings = layers.has("believed") ? uavs.map((uav) => drawBelieved(scene, uav)) : [];
   const darts = layers.has("truth") ? uavs.map((uav) => drawUav(scene, uav)) : [];
@@ -57,6 +58,16 @@ function drawBelieved({ context, episode, now, layers, theme, pixel }, uav) {
   marks.ghost(context, at, colour);
   const text = age > 0 ? `${episode.ids[uav]}, ${marks.plain(age)} s` : episode.ids[uav];
   return { uav, at, key: `ring ${uav}`, text, colour: theme.text(uav) };
+}
+
+/** Open requests: squares. */
+function drawRequests({ context, episode, now, theme, pixel }) {
+  context.strokeStyle = theme.ink;
+  context.lineWidth = 1.5;
+  for (const [east, north, open] of episode.requests[now.step]) {
+    const [x, y] = pixel([east, north, 0]);
+    if (open) context.strokeRect(x - 5, y - 5, 10, 10);
+  }
 }
 
 /** A source, with a wave that spreads over the step while it emits. */
