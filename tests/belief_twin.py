@@ -48,7 +48,8 @@ def _weighed(grid: SourceGrid, probable: list[float], rows: list[int]) -> list[f
         heard, silent = 1.0, 1.0
         for row in rows:
             heard *= math.exp(float(grid.log_reports[row, cell]))
-            silent *= 0.0 if row % 2 == 1 else 1.0
+            alarm = grid.false_alarm
+            silent *= alarm if row % 2 == 1 else 1.0 if row == grid.no_report else 1 - alarm
         weighed.append(chance * (grid.emits * heard + (1 - grid.emits) * silent))
     return [each / sum(weighed) for each in weighed]
 
@@ -69,4 +70,4 @@ def chance_at(grid: SourceGrid, region: int, probable: Tensor, point: int) -> fl
         }
         if chance:
             total += sum(chance * w / sum(inside.values()) * float(detects[b]) for b, w in inside.items())
-    return grid.emits * total
+    return grid.emits * total + (1 - grid.emits) * grid.false_alarm

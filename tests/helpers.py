@@ -101,7 +101,7 @@ def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) 
         "battery": BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=20.0),
         "actions": ActionConfig(kind=kind),
         "observation": ObservationConfig(LOCAL, GLOBAL, timeline=3 * in_order),
-        "reward": RewardConfig(**dict.fromkeys(BUILT_IN, 0.5), bonus=1.0, penalty=0.25),
+        "reward": RewardConfig(**dict.fromkeys(BUILT_IN, 0.5) | {"served": 0.0}, bonus=1.0, penalty=0.25),
         "episode": EpisodeConfig(max_steps=8, success_share=1.0, discharged_share=1.0),
     }
     return ScenarioConfig(**(sections | changed))

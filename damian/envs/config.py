@@ -91,6 +91,9 @@ class ScenarioConfig(WorldConfig):
         self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
         problem = "does not go with several sources: the filter follows one"
         self.refuse(observation.belief and self.source.count > 1, "observation.belief", problem)
+        drawn = any(key.startswith("source.") for key in self.randomise)
+        problem = "does not go with randomise of the source: the filter knows its settings"
+        self.refuse(observation.belief and drawn, "observation.belief", problem)
         per_action = "belief_gain" in observation.belief
         problem = "needs discrete actions: it has a value for each of them"
         self.refuse(per_action and self.actions.kind == "continuous", "observation.belief", problem)

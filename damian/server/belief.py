@@ -66,6 +66,8 @@ class SourceGrid(NamedTuple):
     2*R*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
     emits: float
     """Probability that the source emits in a step."""
+    false_alarm: float
+    """Probability of a report from out of reach."""
 
     @property
     def no_report(self) -> int:
@@ -102,10 +104,12 @@ def build_source_grid(
         _detected_shares(*each, columns * edge, edge, radius)
         for each in zip(polygons, airspace.points, strict=True)
     ]
-    detects = LEAST_REPORT_PROBABILITY + (1 - 2 * LEAST_REPORT_PROBABILITY) * torch.cat(shares)
-    log_reports = _log_reports(detects, source.emits, _renewed(centres, moves, edge))
-    grid = SourceGrid(centres, prior, moves, staying, detects, detects, log_reports, source.emits)
-    return grid._replace(next_detection=_one_step_before(grid, detects), next_staying=_staying(grid))
+    covered = LEAST_REPORT_PROBABILITY + (1 - 2 * LEAST_REPORT_PROBABILITY) * torch.cat(shares)
+    log_reports = _log_reports(covered, source, _renewed(centres, moves, edge))
+    chances = source.emits, source.false_alarm
+    reports = source.false_alarm + covered * (1 - source.miss - source.false_alarm)
+    grid = SourceGrid(centres, prior, moves, staying, reports, reports, log_reports, *chances)
+    return grid._replace(next_detection=_one_step_before(grid, reports), next_staying=_staying(grid))
 
 
 def _columns(polygons: list, edge: float) -> np.ndarray:
@@ -161,29 +165,39 @@ def _renewed(centres: Tensor, moves: Tensor | None, edge: float) -> float:
     return min(float(mean) / edge, 1.0)
 
 
-def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
-    """The table ``SourceGrid.log_reports``, from the probability of a detection if it emits, [P, K].
+def _log_reports(covered: Tensor, source: SourceConfig, renewed: float) -> Tensor:
+    """The table ``SourceGrid.log_reports``, from the share of each cell that a footprint covers, [P, K].
 
     A source that stays may be in the part of its cell that a footprint does not cover. So a repeated report
-    counts only as far as it may have moved: with probability ``renewed`` it is anywhere in its cell.
+    counts only as far as it may have moved: with probability ``renewed`` it is anywhere in its cell. Where it
+    stays, reports in and out of reach are independent.
     """
-    silent = 1 - detects
-    again = renewed * silent + (1 - renewed) * silent / (1 - emits * detects)
-    fresh = torch.stack([silent, detects], 1).flatten(0, 1)
-    repeated = torch.stack([again, renewed * detects + 1 - renewed], 1).flatten(0, 1)
+    emits, miss, alarm = source.emits, source.miss, source.false_alarm
+    known = 1 - miss - alarm
+    reports = alarm + covered * known
+    silent = 1 - reports
+    # Probabilities of silence and of a report one step before in reach; out of reach only alarms are heard.
+    was_silent, reported = emits * miss + (1 - emits) * (1 - alarm), emits * (1 - miss) + (1 - emits) * alarm
+    both = covered * (miss * was_silent) + (1 - covered) * (1 - alarm) ** 2
+    again = renewed * silent + (1 - renewed) * both / (1 - alarm - emits * covered * known)
+    twice = covered * ((1 - miss) * reported) + (1 - covered) * alarm**2
+    twice = twice / (covered * reported + (1 - covered) * alarm)
+    fresh = torch.stack([silent, reports], 1).flatten(0, 1)
+    repeated = torch.stack([again, renewed * reports + twice - renewed * twice], 1).flatten(0, 1)
     return torch.cat([fresh, repeated, torch.ones_like(fresh[:1])]).log()
 
 
 def _one_step_before(grid: SourceGrid, chances: Tensor) -> Tensor:
     """Probability of a detection by the cell of the source one step before, from that by its cell, [P, K]."""
+    alarm = (1 - grid.emits) * grid.false_alarm
     if grid.moves is None:
-        return grid.emits * chances
+        return grid.emits * chances + alarm
     if len(grid.prior) == 1:
-        return grid.emits * chances @ grid.moves.T
+        return grid.emits * chances @ grid.moves.T + alarm
     inside = (grid.prior > 0).unsqueeze(1)
     by_region = chances.view(len(grid.prior), -1, chances.shape[-1]) * inside
     before = (by_region @ grid.moves.T) / grid.staying.unsqueeze(1)
-    return grid.emits * before.view_as(chances)
+    return grid.emits * before.view_as(chances) + alarm
 
 
 def _staying(grid: SourceGrid) -> Tensor:
@@ -231,7 +245,11 @@ def likelihood(grid: SourceGrid, rows: Tensor) -> Tensor:
     log = embedding_bag(rows.flatten(0, -2), grid.log_reports, mode="sum")  # gathers and sums at once
     match = log.exp_().view(*rows.shape[:-1], log.shape[-1])
     if grid.emits < 1:
-        silent = ~(rows % 2 == 1).any(-1, keepdim=True)  # the row of no report is even
+        reported = rows % 2 == 1  # the row of no report is even
+        silent = ~reported.any(-1, keepdim=True)
+        if grid.false_alarm:
+            alarms, reports = reported.sum(-1, True), (rows != grid.no_report).sum(-1, True)
+            silent = grid.false_alarm**alarms * (1 - grid.false_alarm) ** (reports - alarms)
         match = grid.emits * match + (1 - grid.emits) * silent
     return match.add_(_LEAST)
 
@@ -360,21 +378,27 @@ def latest(window: Window, slot: Tensor) -> Beliefs:
 
 # Custom operators, because the number of worlds to work on depends on data, which no compiler can trace. An
 # operator takes no named tuples, so grid and window come in parts: all tensors of the grid, the number
-# ``emits``, the tensors of the window that change, and its slot.
+# ``chances``, the tensors of the window that change, and its slot.
 
 _Tables = list[Tensor | None]
 _Ring = list[Tensor]
 
 
-def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, float, _Ring, Tensor]:
-    return list(grid[:-1]), grid.emits, list(window[:-1]), window.slot
+def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, list[float], _Ring, Tensor]:
+    return list(grid[:-2]), list(grid[-2:]), list(window[:-1]), window.slot
 
 
 @torch.library.custom_op("damian::begin_belief", mutates_args=["ring"])
 def _begin(
-    tables: _Tables, emits: float, ring: _Ring, slot: Tensor, first: Tensor, region: Tensor, mask: Tensor
+    tables: _Tables,
+    chances: list[float],
+    ring: _Ring,
+    slot: Tensor,
+    first: Tensor,
+    region: Tensor,
+    mask: Tensor,
 ) -> None:
-    grid, window = SourceGrid._make([*tables, emits]), Window._make([*ring, slot])
+    grid, window = SourceGrid._make([*tables, *chances]), Window._make([*ring, slot])
     (world,) = _chosen(mask)
     if not len(world):
         return
@@ -387,14 +411,14 @@ def _begin(
 
 
 @_begin.register_fake
-def _(tables, emits, ring, slot, first, region, mask):
+def _(tables, chances, ring, slot, first, region, mask):
     pass
 
 
 @torch.library.custom_op("damian::advance_belief", mutates_args=["ring"])
 def _advance(
     tables: _Tables,
-    emits: float,
+    chances: list[float],
     ring: _Ring,
     slot: Tensor,
     sent: Tensor,
@@ -402,7 +426,7 @@ def _advance(
     region: Tensor,
     stepped: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    grid, window = SourceGrid._make([*tables, emits]), Window._make([*ring, slot])
+    grid, window = SourceGrid._make([*tables, *chances]), Window._make([*ring, slot])
     n_slots = len(window.belief)
     slot = torch.where(stepped, (slot + 1) % n_slots, slot)
     _write_step(window.report, slot, sent.T, stepped)
@@ -418,7 +442,7 @@ def _advance(
 
 
 @_advance.register_fake
-def _(tables, emits, ring, slot, sent, sent_delay, region, stepped):
+def _(tables, chances, ring, slot, sent, sent_delay, region, stepped):
     _, n_viewers, n_worlds, n_cells = ring[0].shape
     server, own = (n_worlds, n_cells), (n_worlds, n_viewers - 1, n_cells)
     return torch.empty_like(slot), ring[0].new_empty(server), ring[0].new_empty(own)

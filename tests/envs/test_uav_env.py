@@ -74,7 +74,7 @@ def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_t
         assert (observation.abs() <= 1).all()
         assert (observation[..., :-ways] >= 0).all()
     terms = td["next", "agents", "reward_terms"]
-    assert set(terms.keys()) == {*BUILT_IN}
+    assert set(terms.keys()) == {*BUILT_IN} - {"served"}
     rest = td["next", "agents", "reward"].squeeze(-1) - sum(terms.values())
     final = 1.0 * td["next", "success"] - 0.25 * (td["next", "done"] & ~td["next", "success"])
     torch.testing.assert_close(rest, final.expand_as(rest), atol=1e-5, rtol=0)

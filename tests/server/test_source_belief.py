@@ -1,5 +1,7 @@
 """The Bayes filter of the source against its slow twin, and whether its probabilities are frequencies."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -23,9 +25,9 @@ from damian.world.signal_source import SourceConfig
 LONGEST = 4
 
 
-def make_grid(emission: float = 0.6, moves: bool = True, regions: int = 1) -> SourceGrid:
+def make_grid(emission: float = 0.6, moves: bool = True, regions: int = 1, **detection: float) -> SourceGrid:
     """A small grid, over one or several regions."""
-    emits = {"emission": "per_step", "emission_probability": emission}
+    emits = {"emission": "per_step", "emission_probability": emission, **detection}
     airspace = UavEnv(square() if regions == 1 else everything()).simulation.airspace
     source = walking(**emits) if moves else SourceConfig(**emits)
     return build_source_grid(airspace, source, radius=50.0, dt=1.0, cell=45.0)
@@ -36,7 +38,36 @@ grids = {
     "always emitting": make_grid(1.0),
     "static": make_grid(1.0, moves=False),
     "several regions": make_grid(regions=3),
+    "misses and false alarms": make_grid(miss=0.3, false_alarm=0.1),
 }
+
+
+@pytest.mark.parametrize(("miss", "alarm"), [(0.0, 0.0), (0.3, 0.1), (0.5, 0.0)])
+def test_reports_of_a_source_that_stays_have_the_probabilities_of_all_cases(miss, alarm):
+    emission = 0.6
+    grid = make_grid(emission, moves=False, miss=miss, false_alarm=alarm)
+    plain = make_grid(emission, moves=False)
+    half = grid.no_report // 2
+    for row in range(0, half, 17):
+        for cell in range(0, grid.prior.shape[1], 5):
+            share = math.exp(float(plain.log_reports[row // 2 * 2 + 1, cell]))
+            now, both, before = 0.0, 0.0, 0.0
+            for covered, weight in ((True, share), (False, 1 - share)):
+                heard = 1 - miss if covered else alarm
+                fits = (
+                    heard if row % 2 else 1 - heard
+                )  # while it emits, and before, when it may have been silent
+                quiet = alarm if row % 2 else 1 - alarm
+                earlier = emission * fits + (1 - emission) * quiet
+                now, both, before = (
+                    now + weight * fits,
+                    both + weight * fits * earlier,
+                    before + weight * earlier,
+                )
+            assert grid.log_reports[row, cell].exp().item() == pytest.approx(now, rel=1e-4)
+            assert grid.log_reports[row + half, cell].exp().item() == pytest.approx(both / before, rel=1e-4)
+
+
 every_grid = pytest.mark.parametrize("grid", grids.values(), ids=grids)
 
 

@@ -26,7 +26,7 @@ OBSERVED = [*TWIN_FEATURES, *LOCAL]
 
 def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> ScenarioConfig:
     """Every reward term and feature except the coverage; uneven distances, so that no two points tie."""
-    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0, "individual": 0.8, "system": 1.5}
+    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0, "served": 0.0, "individual": 0.8, "system": 1.5}
     task |= {"drift": "printed" if since else "smooth", "desired_spotting": 0.7, "desired_distance": 0.4}
     task |= {"desired_distance_not_spotting": 0.6, "desired_distance_spotting": 0.2}
     return ScenarioConfig(
