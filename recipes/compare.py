@@ -146,7 +146,7 @@ def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) ->
         f"`{cli.command()}`",
         f"{seeds.nunique()} seeds ({seeds.min()} to {seeds.max()}), "
         f"{' or '.join(map(str, episodes))} episodes each",
-        "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
+        "Mean over seeds [95 % interval: bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
         "else as it truly was; age in steps; back-updated: share of the rewards in training; n: seeds",
         "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (R0, or R1 "

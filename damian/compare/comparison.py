@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import trim_mean
 
 from damian.compare.config import LESS_IS_BETTER, Arm
 from damian.compare.statistics import (
@@ -85,21 +84,21 @@ def shown(line: Mapping[Any, Any], name: str) -> str:
 def _estimates(
     names: Sequence[str], statistic: Callable[[Floats], Floats], scores: Floats
 ) -> dict[str, float]:
-    """Columns (``ENDS``) of a statistic from ``scores`` [strata, ..., seeds] to a number for each name."""
+    """Columns (``ENDS``) of a statistic from ``scores`` [arms, seeds] to a number for each name."""
     triples = zip(names, *(np.ravel(x).tolist() for x in bootstrap(statistic, scores)), strict=True)
     return {name + end: x for name, *triple in triples for end, x in zip(ENDS, triple, strict=True)}
 
 
 def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
     """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for each seed."""
-    found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1)[..., 0, :], _scores(runs))
+    found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1), _scores(runs))
     shares = [name + end for name in SHARES for end in ENDS if name in runs]
     return found | {name: float(np.clip(found[name], 0, 1)) for name in shares}
 
 
 def _scores(runs: pd.DataFrame) -> Floats:
-    """Columns of a table with a row for each seed, as one stratum [1, columns, seeds]."""
-    return np.ascontiguousarray(runs.to_numpy(dtype=float).T)[None]
+    """Columns of a table with a row for each seed, [columns, seeds]."""
+    return np.ascontiguousarray(runs.to_numpy(dtype=float).T)
 
 
 @dataclass(frozen=True)
@@ -196,44 +195,16 @@ class Comparison:
         array = _scores(paired)
         found = {"compared_seeds": len(paired), **_estimates(["J_norm"], _norms, array)}
         if naive and arm not in naive:
-            _, _, *of_naive, own = array[0]
+            _, _, *of_naive, own = array
             probability = float(probability_of_improvement(own, max(of_naive, key=np.mean)))
             ends = (probability, *improvement_interval(probability, len(paired)))
             found |= {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
-            if not np.isnan(recovery(array[0])):
-                found |= _estimates(["recovery"], lambda drawn: recovery(drawn[..., 0, :, :], 0.0), array)
-        return found
-
-    def overall(self) -> dict[str, dict[str, float]]:
-        """Number of ``seeds`` and interquartile mean of ``J_norm`` by delayed arm, over all tasks and delays.
-
-        Held-out tasks do not count, nor do arms and delays that a task lacks, or seeds that are not finished
-        everywhere; there must be two combinations of task and delay. Seeds are resampled within each task,
-        because its delays share the undelayed arm. As many values are left out at each end as in rliable.
-        """
-        by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT_MARK not in task}
-        delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
-        cells = [self.scores(task, delay) for task in by_task for delay in delays]
-        if len(cells) < 2:
-            return {}
-        found, (undelayed, random, *arms) = {}, cells[0].columns
-        for arm in [arm for arm in arms if all(arm in cell for cell in cells)]:
-            runs = pd.concat([cell[[undelayed, random, arm]] for cell in cells], axis=1).dropna().sort_index()
-            if len(runs):
-                by_cell = _scores(runs).reshape(len(by_task), len(delays), 3, len(runs))
-                found[arm] = {"seeds": len(runs), **_estimates(["J_norm"], _interquartile_norms, by_cell)}
+            if not np.isnan(recovery(array)):
+                found |= _estimates(["recovery"], lambda drawn: recovery(drawn, 0.0), array)
         return found
 
 
 def _norms(scores: Floats) -> Floats:
-    """J_norm of the last arm's mean score, [*, 1, arms, seeds] to [*]; first come undelayed and random."""
-    means = scores.mean(-1)[..., 0, :]
+    """J_norm of the last arm's mean score, [*, arms, seeds] to [*]; first come undelayed and random."""
+    means = scores.mean(-1)
     return normalised(means[..., -1], means[..., 0], means[..., 1])
-
-
-def _interquartile_norms(scores: Floats) -> Floats:
-    """Interquartile mean of J_norm, [*, tasks, delays, 3, seeds] to [*]: undelayed, random and an arm."""
-    means = scores.mean(-1, keepdims=True)
-    norms = normalised(scores[..., 2, :], means[..., 0, :], means[..., 1, :])
-    norms = norms.reshape(*norms.shape[:-3], -1)
-    return np.where(np.isnan(norms).any(-1), np.nan, trim_mean(norms, 0.25, axis=-1))

@@ -42,10 +42,6 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
             parts += [f"## {task}, delay {delay}", trained, _table(lines)]
             if delay != NOT_LATE:
                 parts += _steps(comparison, task, delay)
-    overall = [(arm, found["seeds"], shown(found, "J_norm")) for arm, found in comparison.overall().items()]
-    if overall:
-        head = ("method", "n", "interquartile mean of J_norm")
-        parts += ["## All tasks and delays", markdown_table(head, overall)]
     return "\n\n".join(parts) + "\n"
 
 

@@ -5,12 +5,11 @@ mean that the value is not known.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
-import pandas as pd
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import from_json
 
@@ -230,18 +229,6 @@ def validated(model: type[Model], value: Any, where: str = "") -> Model:
         field, shown = ".".join(map(str, first["loc"])), show(first["input"])
         parts = [where, field, shown if field and first["type"] != "missing" else "", first["msg"]]
         raise InputError(": ".join(filter(None, parts))) from None
-
-
-def as_rows(answers: Sequence[BaseModel]) -> list[dict[str, Any]]:
-    """Answers as rows of JSON; only the columns of places that were not given are left out."""
-    return [answer.model_dump(exclude_unset=True) for answer in answers]
-
-
-def as_csv(answers: Sequence[BaseModel]) -> str:
-    """A CSV table of answers with the same columns; what is not known is ``NA``."""
-    rows = as_rows(answers)
-    table = pd.DataFrame(rows, columns=list(rows[0]) if rows else ["ID"], dtype=object)
-    return table.to_csv(index=False, na_rep="NA", lineterminator="\n")
 
 
 def written(time: float) -> float | str:
