@@ -25,9 +25,8 @@ from damian.common import checks
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
-from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
-from damian.show.film import save_film
+from damian.show.film import save_film, save_picture
 from damian.show.geojson import origin_of, save_geojson
 from damian.show.replay_page import save_page
 
@@ -87,7 +86,7 @@ def show(config: FlyConfig, folder: Path) -> None:
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
         episode.save(folder / f"{name}.json")
         if "png" in config.formats:
-            plot_beliefs(episode, folder / f"{name}.png")
+            save_picture(episode, folder / f"{name}.png")
         if "html" in config.formats:
             save_page([episode], folder / f"{name}.html")
         if "geojson" in config.formats:

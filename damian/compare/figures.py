@@ -31,7 +31,7 @@ ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", 
 _POINTS = 200
 """Number of points of a learning curve."""
 _DELAY, _FLOWN = "@delay_", 4
-"""What a held-out delay's task has after its name; least number of them under which a policy flew, to be drawn."""
+"""Mark of the tasks of held-out delays; least number of them under which a policy flew, to be drawn."""
 _SPECIALISTS = ", trained at each delay"
 """End of the label of a line of policies that fly under the delay at which they were trained."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
@@ -94,7 +94,7 @@ def plot_matrix(comparison: Comparison, path: Path) -> None:
 
 
 def _matrix(comparison: Comparison, task: str) -> pd.DataFrame:
-    """Lines of the table with the delay under which they were ``flown``, and a ``label`` for each training."""
+    """Lines of the table with the delay in which they were ``flown``, and a ``label`` for each training."""
     table = comparison.table[comparison.table["policy"] == comparison.policy]
     away = table[table["task"].str.startswith(f"{task}{_DELAY}")]
     flown, label = (

@@ -162,19 +162,14 @@ def draw_messages(axis: Axes, episode: Episode, colours: list[str]) -> None:
         axis.plot(at_once, np.full(len(at_once), uav), ".", color=colour, markersize=3)
         axis.plot(ends[:, 1], np.full(len(ends), uav), ">", color=colour, markersize=3.5)
         axis.plot(begin[lost], np.full(lost.sum(), uav), "x", color=INK, markersize=4.5)
-    name_rows(axis, episode)
-    axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
-    marks = "dots arrive at once, bars are late, crosses are lost"
-    shares = "the stronger the colour, the more are late, the higher the bar, the more are lost"
-    axis.set_xlabel(f"messages over time [s]: {shares if many else marks}")
-
-
-def name_rows(axis: Axes, episode: Episode) -> None:
-    """Name the UAVs at the rows of an axis."""
     size = min(8.0, 50 * height_of_rows(episode.n_agents) / episode.n_agents)
     axis.set_yticks(range(episode.n_agents), [_short(name) for name in episode.names], fontsize=size)
     axis.spines["left"].set_visible(False)
     axis.tick_params(left=False)
+    axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
+    marks = "dots arrive at once, bars are late, crosses are lost"
+    shares = "the stronger the colour, the more are late, the higher the bar, the more are lost"
+    axis.set_xlabel(f"messages over time [s]: {shares if many else marks}")
 
 
 def height_of_rows(n_agents: int) -> float:

@@ -80,7 +80,7 @@ from dataclasses import dataclass
 
 from tensordict.nn import TensorDictModule
 from torch import distributions, nn
-from torchrl.modules import IndependentNormal, Ordinal, ProbabilisticActor, TruncatedNormal
+from torchrl.modules import IndependentNormal, Ordinal, ProbabilisticActor
 
 from damian import LearnerConfig, keys
 
@@ -110,17 +110,15 @@ class StillConfig(LearnerConfig):
         spec = env.full_action_spec_unbatched[keys.ACTION]
         width = env.observation_spec[keys.OBSERVATION].shape[-1]
         kind = globals()[self.law if self.law != "Branches" else "Beta"]
-        discrete, truncated = kind is Ordinal, kind is TruncatedNormal
+        discrete = kind is Ordinal
         split = Branches if self.law == "Branches" else Split
         network = nn.Linear(width, spec.n) if discrete else split(width, 4)
         names = ["scores"] if discrete else ["loc", "scale"]
-        bounds = {"low": spec.space.low[0] - 0.25, "high": spec.space.high[0]} if truncated else {}
         return ProbabilisticActor(
             TensorDictModule(network, [keys.OBSERVATION], [("agents", name) for name in names]),
             in_keys=dict(zip(names, [("agents", name) for name in names])),
             out_keys=[keys.ACTION],
             distribution_class=kind,
-            distribution_kwargs=bounds,
             return_log_prob=True,
             log_prob_key=keys.ACTION_LOG_PROB,
         )
@@ -152,7 +150,7 @@ def trained(tmp_path, monkeypatch) -> Callable[[str], Path]:
     return train
 
 
-@pytest.mark.parametrize("law", ["TruncatedNormal", "Beta", "IndependentNormal", "Ordinal"])
+@pytest.mark.parametrize("law", ["Beta", "IndependentNormal", "Ordinal"])
 def test_the_own_action_of_an_actor_from_outside_is_exported_exactly_whatever_its_distribution(law, trained):
     run = trained(law)
     main(["export", str(run), "trust=true"])
@@ -170,8 +168,7 @@ def test_the_own_action_of_an_actor_from_outside_is_exported_exactly_whatever_it
         assert list(described["outputs"]) == ["action", "loc", "scale"]
         assert described["actions"]["low"] == spec.space.low[0].tolist() == [0.0, 0.0]
         assert described["actions"]["high"] == spec.space.high[0].tolist() == [1.0, 1.0]
-    low = {"low": [-0.25, -0.25], "high": [1.0, 1.0]} if law == "TruncatedNormal" else {}
-    assert described["distribution"] == {"class": law, **low}
+    assert described["distribution"] == {"class": law}
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_a_run_folder_holds_configuration_episode_film_and_figure(run, capsys):
     assert {path.name for path in folder.iterdir()} == files
     assert "4 steps" in printed_line(capsys)
     picture = imread(folder / "episode_0.png")
-    assert picture.shape[1] == 1400
+    assert picture.shape[1] == 1440
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 10
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == 5
