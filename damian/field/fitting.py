@@ -12,7 +12,7 @@ from damian.common.text_files import named
 from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers, LawFit
 from damian.delays.laws import LOST, in_steps
 from damian.field.journal import SUFFIX, read_journal
-from damian.field.rows import Report, TimedReport, read_file
+from damian.field.rows import Report, read_file
 
 LATEST_MEDIAN = 1800.0
 """Longest median delay of a UAV [s]; a longer one is a clock of another time zone, or one since the start."""
@@ -27,7 +27,7 @@ def read_log(path: Path) -> list[Report]:
         reports = [report for _, line in lines for report in line.reports]
     else:
         with named(path):
-            rows = read_file(path, TimedReport)
+            rows = read_file(path)
             for where, report in rows:
                 said = report.model_fields_set
                 if "time" not in said or not {"received", "aoi"} & said:

@@ -175,6 +175,7 @@ def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
     [
         ({"uav": "d"}, "ID: 'd' is not a UAV of this fleet: a, b, c"),
         ({"time": START + 60}, "time: 1700000060 s is 59.9 s after it came in"),
+        ({"source_lat": 52.8}, "places are pairs lat, lon [deg], or all of them x, y [m]"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
         ({"time": START + 2e6, "receive_time": START + 2e6}, "time: the first reports are more than 1e+06 s"),
     ],
