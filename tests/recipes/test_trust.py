@@ -184,7 +184,7 @@ def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(stor
     def imported(start) -> bool:
         """Is the module imported, as if it never was before?"""
         sys.modules.pop("mine", None)
-        LOGGERS._imported.pop("mine:X", None)
+        LOGGERS._components.pop("mine:X", None)
         Path("imported").unlink(missing_ok=True)
         start()
         return Path("imported").exists()
