@@ -148,7 +148,7 @@ def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) ->
         f"{' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
-        "else as it truly was; age in steps; back-updated: share of the rewards in training; n: seeds",
+        "else as it truly was; age in steps; backupdated: share of the rewards in training; n: seeds",
         "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (R0, or R1 "
         "and R2), 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "

@@ -28,24 +28,22 @@ HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed arm."""
-MEASURED = {
-    "return": "return",
-    "success_rate": "success",
-    "steps": "steps",
-    "perceived_return": "perceived return",
-    "perceived_success_rate": "perceived success",
-    "perceived_steps": "perceived steps",
-    "age": "age",
-    "late": "late",
-    "lost": "lost",
-    "backupdated": "back-updated",
-}
-"""Means over seeds, by measure, and their headings in Markdown: most are of an ``Evaluation``."""
+MEASURED = (
+    "return",
+    "success_rate",
+    "steps",
+    "perceived_return",
+    "perceived_success_rate",
+    "perceived_steps",
+)
+MEASURED += ("age", "late", "lost", "backupdated")
+"""Measures whose means over seeds are shown: most are of an ``Evaluation``."""
 SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
 """Measures whose intervals end at 0 and at 1."""
-COMPARED = {"J_norm": "J_norm", "recovery": "recovery", "improvement": "P > naive"}
-"""What is found of an arm beside others under the same delay, and its headings (``normalised``, ``recovery``,
-``probability_of_improvement``), the naive arm being the strongest one of the same track."""
+COMPARED = ("J_norm", "recovery", "improvement")
+"""What is found of an arm beside others under the same delay (``normalised``, ``recovery``,
+``probability_of_improvement``), the naive arm being the strongest one of the same track: arms that learn from
+late data only (R0), or those that had a simulator."""
 RUN = ["task", "delay", "arm", "seed"]
 """Columns of results that name a run."""
 ENDS = ("", "_low", "_high")
@@ -58,18 +56,11 @@ COLUMNS += [name + end for name in (*MEASURED, *COMPARED) for end in ENDS]
 def regime(arms: Mapping[str, Arm], name: str) -> str:
     """The regime of an arm: its own, or R3 without delay, R2 if it needs a policy without, or else R0."""
     arm = arms[name]
-    if arm.regime:
-        return arm.regime
-    if not arm.delayed:
-        return "R3"
+    if arm.regime or not arm.delayed:
+        return arm.regime or "R3"
     if arm.source is None:
         return "R0"
     return "R2" if not arms[arm.source].delayed else regime(arms, arm.source)
-
-
-def track(arms: Mapping[str, Arm], name: str) -> str:
-    """The track of an arm; no recovery mixes arms that learn from late data and arms that had a simulator."""
-    return "late data only" if regime(arms, name) == "R0" else "simulator allowed"
 
 
 def shown(line: Mapping[Any, Any], name: str) -> str:
@@ -94,6 +85,13 @@ def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
     found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1), _scores(runs))
     shares = [name + end for name in SHARES for end in ENDS if name in runs]
     return found | {name: float(np.clip(found[name], 0, 1)) for name in shares}
+
+
+def improvement(scores: Floats, others: Floats) -> dict[str, float]:
+    """Columns (``ENDS``) of the probability that a run beats another, from scores by seed, [seeds] each."""
+    probability = float(probability_of_improvement(scores, others))
+    ends = (probability, *improvement_interval(probability, len(scores)))
+    return {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
 
 
 def _scores(runs: pd.DataFrame) -> Floats:
@@ -187,7 +185,8 @@ class Comparison:
     def _compared(self, scores: pd.DataFrame, arm: str) -> dict[str, Any]:
         """``COMPARED`` of a delayed arm, over the seeds that it and all it is compared with have finished."""
         undelayed, random, *delayed = scores.columns
-        others = [name for name in delayed if track(self.arms, name) == track(self.arms, arm)]
+        tracks = {name: regime(self.arms, name) == "R0" for name in (*delayed, arm)}
+        others = [name for name in delayed if tracks[name] == tracks[arm]]
         naive = [name for name in others if self.arms[name].naive]
         paired = scores[[undelayed, random, *(name for name in naive if name != arm), arm]].dropna()
         if paired.empty:
@@ -196,9 +195,7 @@ class Comparison:
         found = {"compared_seeds": len(paired), **_estimates(["J_norm"], _norms, array)}
         if naive and arm not in naive:
             _, _, *of_naive, own = array
-            probability = float(probability_of_improvement(own, max(of_naive, key=np.mean)))
-            ends = (probability, *improvement_interval(probability, len(paired)))
-            found |= {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
+            found |= improvement(own, max(of_naive, key=np.mean))
             if not np.isnan(recovery(array)):
                 found |= _estimates(["recovery"], lambda drawn: recovery(drawn, 0.0), array)
         return found

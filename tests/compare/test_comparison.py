@@ -1,11 +1,8 @@
 """Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables of them."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from matplotlib.figure import Figure
 
 from damian.compare.comparison import (
@@ -18,7 +15,7 @@ from damian.compare.comparison import (
     Comparison,
     shown,
 )
-from damian.compare.figures import look, plot_matrix
+from damian.compare.figures import plot_matrix
 from damian.compare.report import markdown
 
 ARMS = {
@@ -170,11 +167,3 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     assert aware["compared_seeds"] == 0  # only the trained policy of an arm is compared with others
     assert prior["J_norm"] == pytest.approx(2.5 / 10)
     assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
-
-
-def test_methods_of_an_experiment_look_different():
-    for path in Path("conf/experiment").glob("*.yaml"):
-        arms = {name: Arm(**given) for name, given in yaml.safe_load(path.read_text())["arms"].items()}
-        looks = [look(arms, name) for name in arms]
-        for style in ("linewidth", "marker"):
-            assert len({(each["color"], each[style]) for each in looks}) == len(arms)
