@@ -146,25 +146,22 @@ class UavLog:
             filled.point = filled.target = before.point if filled.origin is None else filled.origin
         if target is not None:
             filled.target = near(target)
-        track, battery, readings = 0.0, 100.0, (0.0,) * self.n_readings
-        if before:
-            track, battery, readings = before.track, before.battery, before.readings
-        filled.track = track if report.track is None else math.radians(report.track) % (2 * math.pi)
-        filled.battery = battery if report.battery is None else report.battery
-        filled.battery_known = report.battery is not None or (before is not None and before.battery_known)
-        filled.readings = readings if report.readings is None else report.readings
-        filled.spotted = report.source_spotted and not report.flies
-        place = report.place("source_")
+        known = before or FilledReport(report, filled.step, readings=(0.0,) * self.n_readings)
+        filled.track = known.track
+        if report.track is not None:
+            filled.track = math.radians(report.track) % (2 * math.pi)
+        filled.battery = known.battery if report.battery is None else report.battery
+        filled.battery_known = known.battery_known or report.battery is not None
+        filled.readings = known.readings if report.readings is None else report.readings
+        filled.spotted, place = report.source_spotted and not report.flies, report.place("source_")
         if filled.spotted:
             filled.detected, filled.detected_at = filled.step, filled.point
         elif report.source_time is None:
-            if before:
-                filled.detected, filled.detected_at = before.detected, before.detected_at
+            filled.detected, filled.detected_at = known.detected, known.detected_at
         elif place is not None:
             filled.detected_at = near(place)
         else:
-            held = before and before.detected_at
-            filled.detected_at = filled.point if held is None else held
+            filled.detected_at = filled.point if known.detected_at is None else known.detected_at
         filled.motions = 0 if before is None else 1 if before.spotted else before.motions + 1
         if report.motions is not None:
             filled.motions = report.motions

@@ -1,4 +1,4 @@
-"""Rows of tables as pydantic models: reports that come in, and answers that go out, as CSV and JSON.
+"""Rows of tables as pydantic models: reports that come in, as CSV and JSON.
 
 Columns of a report may be written in any case, and with ``_`` for a space. ``NA``, an empty cell and null
 mean that the value is not known.
