@@ -4,6 +4,7 @@ from typing import Any
 
 import pandas as pd
 import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -36,9 +37,10 @@ def next_landings(
     hidden = torch.zeros(1, len(tracker.uavs), sizes[0]) if sizes else None
     kind = ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
-        for outputs in tracker.steps(latest):
-            read = outputs if hidden is None else outputs.set(keys.HIDDEN, hidden)
+        read: TensorDictBase = TensorDict()
+        for read in tracker.steps(latest):
             if hidden is not None:
+                read[keys.HIDDEN] = hidden
                 hidden = policy(read.clone(False))[keys.HIDDEN]
         asking = [uav for uav in tracker.uavs if not tracker.held[uav].report.flies]
         if keys.ACTION_MASK in read.keys(True):

@@ -141,9 +141,8 @@ class UavLog:
         report, near = filled.report, self.ground.landing_point
         here, target = report.place(), report.place("target_")
         assert here is not None  # every report has it
-        filled.point = filled.target = near(here)
-        if report.flies and (before or filled.origin is not None):
-            filled.point = filled.target = before.point if filled.origin is None else filled.origin
+        took_off = before.point if before and filled.origin is None else filled.origin
+        filled.point = filled.target = took_off if report.flies and took_off is not None else near(here)
         if target is not None:
             filled.target = near(target)
         known = before or FilledReport(report, filled.step, readings=(0.0,) * self.n_readings)

@@ -45,10 +45,9 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         return instant.observation[0], self._info
 
     def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
-        observation, (reward,), *ends, (self._info,) = self.flight.step(
-            actions_in(self.action_space, "action", action)[None]
-        )
-        return observation[0], reward, *ends, self._info
+        chosen = actions_in(self.action_space, "action", action)[None]
+        observation, (reward,), terminated, truncated, (self._info,) = self.flight.step(chosen)
+        return observation[0], reward, terminated, truncated, self._info
 
     def render(self) -> Any:
         return self.flight.render()
