@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from damian.interop.delay_wrapper import DelayWrapper
-from damian.interop.gym import UavGymEnv
+from damian.interop.gym import UavGymEnv, UavVectorEnv
 
 if TYPE_CHECKING:
     from damian.interop.pettingzoo import UavParallelEnv
 
-__all__ = ["DelayWrapper", "UavGymEnv", "UavParallelEnv"]
+__all__ = ["DelayWrapper", "UavGymEnv", "UavParallelEnv", "UavVectorEnv"]
 
 TASKS = ("spotting", "tracking", "coverage", "energy", "mixed")
 """Scenarios of conf/scenario that are registered, each as ``damian/NAME-v0``."""
@@ -19,6 +19,7 @@ for _task in TASKS:
     gymnasium.register(
         f"damian/{_task.capitalize()}-v0",
         entry_point="damian.recipes.shared.environments:gymnasium_env",
+        vector_entry_point="damian.recipes.shared.environments:gymnasium_vector_env",
         kwargs={"task": _task},
     )
 

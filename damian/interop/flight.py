@@ -25,18 +25,18 @@ Array = NDArray[Any]
 
 
 class Instant(NamedTuple):
-    """What N UAVs get after a step or a reset; rewards and flags are 0 after a reset."""
+    """What B worlds with N UAVs output after a step or a reset; rewards and flags are 0 after a reset."""
 
     observation: Array
-    """What the actors observe, float32, [N, F]."""
-    reward: list[float]
-    """Rewards as the server perceives them, [N]."""
-    terminated: bool
-    """Whether the episode has ended by its task."""
-    truncated: bool
-    """Whether it has reached its time limit."""
-    infos: list[dict[str, Any]]
-    """Of each UAV ``ready`` and ``is_success``, and if masked ``action_mask`` [A] int8."""
+    """What the actors observe, float32, [B, N, F]."""
+    reward: Array
+    """Rewards as the server perceives them, float32, [B, N]."""
+    terminated: Array
+    """Whether the episode has ended by its task, [B] bool."""
+    truncated: Array
+    """Whether it has reached its time limit, [B] bool."""
+    infos: dict[str, Array]
+    """``ready`` [B, N] and ``is_success`` [B] bool, and if masked ``action_mask`` [B, N, A] int8."""
 
 
 class Flight:
@@ -46,11 +46,16 @@ class Flight:
     """What the environment has output last, with which its next step begins; there after a reset."""
 
     def __init__(
-        self, scenario: ScenarioConfig, seed: int, render_mode: str | None = None, view: str = "2d"
+        self,
+        scenario: ScenarioConfig,
+        num_worlds: int,
+        seed: int,
+        render_mode: str | None = None,
+        view: str = "2d",
     ) -> None:
         if render_mode is not None:
             checks.one_of("render_mode", render_mode, RENDER_MODES)
-        self.env = make_env(scenario, 1, seed, extras=EXTRAS if render_mode else ())
+        self.env = make_env(scenario, num_worlds, seed, extras=EXTRAS if render_mode else ())
         self.film = LiveFilm(self.env.uav_env, view) if render_mode else None
 
     def observation_space(self, agent: int) -> Box:
@@ -64,31 +69,34 @@ class Flight:
 
     @torch.no_grad()
     def reset(self, seed: int | None) -> Instant:
-        """Begin a new episode; with a seed, it decides all that is drawn from now on."""
+        """Begin a new episode in every world; with a seed, world number i draws from ``seed + i``."""
         if seed is not None:
-            self.env.seed_worlds(torch.tensor([seed]))
+            self.env.seed_worlds(seed + torch.arange(self.env.batch_size[0]))
         self._now = self.env.reset()
         if self.film:
             self.film.reset(self._now)
         return _instant(self._now)
 
     @torch.no_grad()
-    def step(self, action: Array) -> Instant:
-        """Take a step with the actions of all UAVs, [N, ...]."""
-        self._now[keys.ACTION] = torch.as_tensor(action).unsqueeze(0)
-        stepped = self.env.step(self._now)
-        self._now = cast(TensorDictBase, step_mdp(stepped))
+    def step(self, action: Array, *, reset: bool = False) -> tuple[Instant, Instant]:
+        """Take a step, and if ``reset`` begin new episodes; its outputs, and those that come next."""
+        self._now[keys.ACTION] = torch.as_tensor(action)
+        if reset:
+            stepped, self._now = self.env.step_and_maybe_reset(self._now)
+        else:
+            stepped = self.env.step(self._now)
+            self._now = cast(TensorDictBase, step_mdp(stepped))
         after = cast(TensorDictBase, stepped["next"])
         if self.film:
             self.film.add(after)
-        return _instant(after)
+        return _instant(after), _instant(self._now)
 
     def render(self) -> Array | None:
         """A picture of this instant, [height, width, 3] uint8; None without a render mode."""
         return self.film.picture() if self.film else None
 
     def state(self) -> Array:
-        """What a central critic observes, from the messages at the server, [N G]."""
+        """What a central critic observes of the first world, from the messages at the server, [N G]."""
         return cast(Tensor, self._now[keys.GLOBAL_OBSERVATION])[0].flatten().numpy().copy()
 
     def state_space(self) -> Box:
@@ -106,17 +114,15 @@ def _instant(outputs: TensorDictBase) -> Instant:
     """The outputs of a step or a reset as arrays of their own."""
 
     def array(key: NestedKey) -> Array:
-        return cast(Tensor, outputs[key])[0].numpy().copy()
+        return cast(Tensor, outputs[key]).numpy().copy()
 
-    observation, success = array(keys.OBSERVATION), bool(array(keys.SUCCESS))
-    infos: list[dict[str, Any]] = [{"ready": bool(r), "is_success": success} for r in array(keys.READY)]
+    observation = array(keys.OBSERVATION)
+    infos = {"ready": array(keys.READY), "is_success": array(keys.SUCCESS)[:, 0]}
     if keys.ACTION_MASK in outputs.keys(True, True):
-        for info, mask in zip(infos, array(keys.ACTION_MASK).astype(np.int8), strict=True):
-            info["action_mask"] = mask
-    rewards = (
-        array(keys.REWARD)[:, 0].tolist() if keys.REWARD in outputs.keys(True, True) else [0.0] * len(infos)
-    )
-    return Instant(observation, rewards, bool(array(keys.TERMINATED)), bool(array(keys.TRUNCATED)), infos)
+        infos["action_mask"] = array(keys.ACTION_MASK).astype(np.int8)
+    reward = outputs.get(keys.REWARD, None)
+    rewards = np.zeros(observation.shape[:2], np.float32) if reward is None else reward[..., 0].numpy().copy()
+    return Instant(observation, rewards, array(keys.TERMINATED)[:, 0], array(keys.TRUNCATED)[:, 0], infos)
 
 
 def actions_in(space: Space[Any], key: str, given: Any) -> Array:
@@ -125,3 +131,9 @@ def actions_in(space: Space[Any], key: str, given: Any) -> Array:
     if not space.contains(found):
         raise InputError(f"{key}: {given} is not in {space}")
     return found
+
+
+def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:
+    """The infos of one UAV; flags are Python's, because Gymnasium's vector environments know no others."""
+    found = {n: each[world] if n == "is_success" else each[world, agent] for n, each in infos.items()}
+    return {name: each if each.ndim else each.item() for name, each in found.items()}

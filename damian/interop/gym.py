@@ -1,13 +1,15 @@
-"""A Gymnasium environment of one UAV."""
+"""Gymnasium environments of one UAV: a single world, and many worlds that step as one batch."""
 
 from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from damian.common import checks
 from damian.envs.config import ScenarioConfig
-from damian.interop.flight import METADATA, Array, Flight, actions_in
+from damian.interop.flight import METADATA, Array, Flight, actions_in, row
 
 
 class UavGymEnv(gymnasium.Env[Array, Any]):
@@ -29,9 +31,8 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
     def __init__(
         self, scenario: ScenarioConfig, seed: int = 0, render_mode: str | None = None, view: str = "2d"
     ) -> None:
-        should = "is not 1: a Gymnasium environment has one agent; take damian.interop.UavParallelEnv"
-        checks.require(scenario.agents == 1, "agents", scenario.agents, should)
-        self.flight, self.render_mode = Flight(scenario, seed, render_mode, view), render_mode
+        one_uav(scenario)
+        self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
         self.observation_space = self.flight.observation_space(0)
         self.action_space = self.flight.action_space()
         self._info: dict[str, Any] = {}
@@ -41,13 +42,14 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
     ) -> tuple[Array, dict[str, Any]]:
         super().reset(seed=seed)
         instant = self.flight.reset(seed)
-        self._info = instant.infos[0]
-        return instant.observation[0], self._info
+        self._info = row(instant.infos, 0, 0)
+        return instant.observation[0, 0], self._info
 
     def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
-        chosen = actions_in(self.action_space, "action", action)[None]
-        observation, (reward,), terminated, truncated, (self._info,) = self.flight.step(chosen)
-        return observation[0], reward, terminated, truncated, self._info
+        instant, _ = self.flight.step(actions_in(self.action_space, "action", action)[None, None])
+        self._info = row(instant.infos, 0, 0)
+        ends = bool(instant.terminated[0]), bool(instant.truncated[0])
+        return instant.observation[0, 0], float(instant.reward[0, 0]), *ends, self._info
 
     def render(self) -> Any:
         return self.flight.render()
@@ -56,3 +58,54 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         """Which discrete actions are legal now, [A] bool; all of them if nothing is masked."""
         space = cast(gymnasium.spaces.Discrete, self.action_space)
         return self._info.get("action_mask", np.ones(space.n)).astype(bool)
+
+
+class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
+    """B = ``num_envs`` worlds of one UAV as a Gymnasium vector environment.
+
+    A world whose episode ends begins a new one in the same step (``AutoresetMode.SAME_STEP``); ``infos`` then
+    has its last observation as ``final_obs``, and its last infos as ``final_info``. World number i equals a
+    ``UavGymEnv`` that is reset with ``seed + i``.
+    """
+
+    def __init__(self, scenario: ScenarioConfig, num_envs: int = 1, seed: int = 0) -> None:
+        one_uav(scenario)
+        checks.in_range("num_envs", num_envs, 1, checks.WORLDS)
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.num_envs, self.flight = num_envs, Flight(scenario, num_envs, seed)
+        self.single_observation_space = self.flight.observation_space(0)
+        self.single_action_space = self.flight.action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        checks.require(not isinstance(seed, list), "seed", seed, "is a list: world i draws from seed + i")
+        instant = self.flight.reset(seed)  # type: ignore[arg-type]
+        return instant.observation[:, 0], _infos(instant.infos)
+
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        chosen = actions_in(self.action_space, "actions", actions)
+        last, instant = self.flight.step(chosen[:, None], reset=True)
+        infos, done = _infos(instant.infos), last.terminated | last.truncated
+        if done.any():
+            final = np.full(self.num_envs, None, object)
+            for world in done.nonzero()[0]:
+                final[world] = last.observation[world, 0]
+            infos |= {"final_obs": final, "_final_obs": done}
+            infos |= {"final_info": _infos(last.infos, done), "_final_info": done}
+        return instant.observation[:, 0], last.reward[:, 0], last.terminated, last.truncated, infos
+
+
+def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, Any]:
+    """Infos of the worlds [B, ...] by name, each with a mask of the worlds [B] that have it (all)."""
+    found = {name: each if name == "is_success" else each[:, 0] for name, each in infos.items()}
+    mask = np.ones(len(infos["ready"]), bool) if worlds is None else worlds
+    return found | {f"_{name}": mask.copy() for name in found}
+
+
+def one_uav(scenario: ScenarioConfig) -> None:
+    """Refuse a scenario of several UAVs, because a Gymnasium environment has one agent."""
+    should = "is not 1: a Gymnasium environment has one agent; take damian.interop.UavParallelEnv"
+    checks.require(scenario.agents == 1, "agents", scenario.agents, should)

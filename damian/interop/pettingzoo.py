@@ -7,7 +7,7 @@ from gymnasium.spaces import Space
 
 from damian.common.errors import InputError
 from damian.envs.config import ScenarioConfig
-from damian.interop.flight import METADATA, Array, Flight, actions_in
+from damian.interop.flight import METADATA, Array, Flight, actions_in, row
 
 try:
     from pettingzoo import ParallelEnv
@@ -28,7 +28,7 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
         self, scenario: ScenarioConfig, seed: int = 0, render_mode: str | None = None, view: str = "2d"
     ) -> None:
         self.metadata = {**METADATA, "name": "damian_v0", "is_parallelizable": True}
-        self.flight, self.render_mode = Flight(scenario, seed, render_mode, view), render_mode
+        self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
         self.possible_agents = [f"uav_{number}" for number in range(scenario.agents)]
         self.agents: list[str] = []
         self.observation_spaces = {
@@ -48,7 +48,7 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
     ) -> tuple[ByAgent, ByAgent]:
         instant = self.flight.reset(seed)
         self.agents = [*self.possible_agents]
-        return self._by_agent(instant.observation), self._by_agent(instant.infos)
+        return self._by_agent(instant.observation[0]), self._infos(instant.infos)
 
     def step(self, actions: ByAgent) -> tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]:
         if not self.agents:
@@ -56,13 +56,18 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
         chosen = [
             actions_in(self.action_spaces[name], f"action of {name}", actions[name]) for name in self.agents
         ]
-        observation, reward, terminated, truncated, infos = self.flight.step(np.stack(chosen))
-        n_agents = len(self.agents)
+        instant, _ = self.flight.step(np.stack(chosen)[None])
+        n_agents, infos = len(self.agents), self._infos(instant.infos)
+        terminated, truncated = bool(instant.terminated[0]), bool(instant.truncated[0])
+        results = (
+            self._by_agent(instant.observation[0]),
+            self._by_agent(instant.reward[0].tolist()),
+            self._by_agent([terminated] * n_agents),
+            self._by_agent([truncated] * n_agents),
+        )
         if terminated or truncated:
             self.agents = []
-        values = observation, reward, [terminated] * n_agents, [truncated] * n_agents, infos
-        observations, rewards, ends, limits, told = map(self._by_agent, values)
-        return observations, rewards, ends, limits, told
+        return *results, infos
 
     def render(self) -> Any:
         return self.flight.render()
@@ -73,3 +78,6 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
     def _by_agent(self, values: Any) -> ByAgent:
         """Values [N] by agent."""
         return dict(zip(self.possible_agents, values, strict=True))
+
+    def _infos(self, infos: dict[str, Array]) -> ByAgent:
+        return {name: row(infos, 0, number) for number, name in enumerate(self.possible_agents)}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from damian.envs.config import ScenarioConfig
-from damian.interop.gym import UavGymEnv
+from damian.interop.gym import UavGymEnv, UavVectorEnv
 
 from ..cli import settings
 
@@ -23,3 +23,11 @@ def gymnasium_env(task: str, overrides: Sequence[str] = (), **options: Any) -> U
     ``options`` are ``seed``, ``render_mode`` and ``view`` of ``UavGymEnv``.
     """
     return UavGymEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)
+
+
+def gymnasium_vector_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavVectorEnv:
+    """Many worlds of a task with one UAV, for ``gymnasium.make_vec("damian/Spotting-v0", num_envs=1024)``.
+
+    ``options`` are ``num_envs`` and ``seed`` of ``UavVectorEnv``.
+    """
+    return UavVectorEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)

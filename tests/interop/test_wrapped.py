@@ -15,7 +15,7 @@ from torchrl.envs.utils import check_env_specs
 from damian import ObservationDelay, compose_scenario, keys
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
-from damian.interop import TASKS, UavGymEnv, UavParallelEnv
+from damian.interop import TASKS, UavGymEnv, UavParallelEnv, UavVectorEnv
 
 DELAYS = ["delay=none", "delay=paper", "delay.act=2", "delay.rew=1", "delay.history=3"]
 KINDS = product(TASKS, ("discrete", "continuous"), ("instant", "polynomial"))
@@ -84,6 +84,30 @@ def test_pettingzoos_environment_does_what_torchrls_does():
     assert env.step({}) == ({}, {}, {}, {}, {})
 
 
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+def test_every_world_of_the_vector_environment_equals_a_single_one(actions):
+    options = {"overrides": [f"actions={actions}", "delay=paper", "episode.max_steps=5"]}
+    vector = gymnasium.make_vec("damian/Spotting-v0", num_envs=3, **options)
+    singles = [gymnasium.make("damian/Spotting-v0", **options) for _ in range(3)]
+    observations, infos = vector.reset(seed=11)
+    for world, env in enumerate(singles):
+        observation, info = env.reset(seed=11 + world)
+        assert np.array_equal(observations[world], observation)
+    vector.action_space.seed(0)
+    for _ in range(12):
+        chosen = vector.action_space.sample()
+        observations, rewards, terminated, truncated, infos = vector.step(chosen)
+        for world, env in enumerate(singles):
+            observation, reward, *ends, info = env.step(chosen[world])
+            assert [rewards[world], terminated[world], truncated[world]] == [reward, *ends]
+            if any(ends):
+                assert np.array_equal(infos["final_obs"][world], observation)
+                assert infos["final_info"]["is_success"][world] == info["is_success"]
+                observation, info = env.reset()
+            assert np.array_equal(observations[world], observation)
+            assert infos["ready"][world] == info["ready"]
+
+
 def test_torchrl_reads_the_environment_and_our_transforms_delay_it_further():
     env = PettingZooWrapper(made("episode.max_steps=5"), use_mask=True)
     check_env_specs(env, break_when_any_done="both")
@@ -110,6 +134,12 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
         compose_scenario("scenari=tracking")
     with pytest.raises(InputError, match="render_mode: human is not one of rgb_array"):
         UavGymEnv(compose_scenario("agents=1"), render_mode="human")
+    vector = UavVectorEnv(compose_scenario("agents=1"), 2)
+    with pytest.raises(InputError, match="seed"):
+        vector.reset(seed=[1, 2])
+    vector.reset()
+    with pytest.raises(InputError, match="actions"):
+        vector.step([0])
     env = made()
     env.reset()
     with pytest.raises(InputError, match="action of uav_1: -1 is not in Discrete"):
