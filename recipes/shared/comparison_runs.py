@@ -242,9 +242,7 @@ def _of_run(run: Run, arms: Mapping[str, Arm]) -> Results:
     spread = np.linspace(0, len(metrics) - 1, min(len(metrics), MOST_POINTS)).round().astype(int)
     points = metrics.iloc[spread].reindex(columns=CURVE[len(RUN) :])
     points = points.map(lambda number: float(f"{number:.5g}")).assign(**label)[CURVE]
-    if (
-        run.config.episode.success_share is None
-    ):  # where nothing can succeed, a share of successes means nothing
+    if run.config.episode.success_share is None:  # nothing can succeed, and a share of it means nothing
         for table in (rows, points):
             table[table.filter(like="success_rate").columns] = math.nan
     return Results(rows, points)

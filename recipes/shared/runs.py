@@ -272,10 +272,8 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
     observation, learner, settings = config.observation, config.learner, dict(leaves(config))
     own_actor = type(learner).make_actor is not LearnerConfig.make_actor
-    sees_all, discrete = (
-        learner.actor_follows_critic or not observation.ctde,
-        config.actions.kind == "discrete",
-    )
+    sees_all = learner.actor_follows_critic or not observation.ctde
+    discrete = config.actions.kind == "discrete"
     keys = ["observation.ctde", "observation.local_features", "observation.belief", "observation.age"]
     keys += ["observation.timeline", "delay.history", "delay.messages", "actions.kind"]
     return {
