@@ -13,6 +13,7 @@ import hydra
 from omegaconf import DictConfig
 
 from damian.baselines.greedy import greedy_policy
+from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import write_csv
@@ -40,7 +41,9 @@ from .shared.runs import run_folder, save_config, start, stored_values
 
 def advise(config: AdviseConfig, folder: Path) -> None:
     """Answer a table of reports, or write the delays of a log."""
-    config.check_source()
+    given = [name for name in ("table", "fit") if getattr(config, name) is not None]
+    problem = "is not the only one of table=FILE, fit=FILE: give one"
+    checks.require(len(given) == 1, "table", " and ".join(given) or "nothing", problem)
     if config.fit is not None:
         fit_delays(config, folder)
     else:

@@ -19,7 +19,7 @@ for _task in TASKS:
     gymnasium.register(
         f"damian/{_task.capitalize()}-v0",
         entry_point="damian.recipes.shared.environments:gymnasium_env",
-        vector_entry_point="damian.recipes.shared.environments:gymnasium_vector_env",
+        vector_entry_point="damian.recipes.shared.environments:gymnasium_env",
         kwargs={"task": _task},
     )
 
