@@ -31,7 +31,6 @@ if TYPE_CHECKING:
         ObservationTimeline,
         RewardDelay,
         SampleAndHold,
-        delay_trajectories,
         set_seed,
     )
     from damian.world.sensors import sensor
@@ -73,7 +72,6 @@ _MODULES = {
         "ObservationDelay",
         "RewardDelay",
         "SampleAndHold",
-        "delay_trajectories",
         "set_seed",
     ],
     "damian.envs.nodes": ["ServerNode"],
@@ -112,7 +110,6 @@ __all__ = [
     "UavEnv",
     "Uniform",
     "compose_scenario",
-    "delay_trajectories",
     "feature",
     "load",
     "make_env",

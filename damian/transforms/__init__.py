@@ -7,7 +7,6 @@ from damian.transforms.history import ActionHistory
 from damian.transforms.hold import SampleAndHold
 from damian.transforms.observation import ObservationDelay
 from damian.transforms.reward import CumulativeReward, RewardDelay
-from damian.transforms.stored import delay_trajectories
 from damian.transforms.timeline import ObservationTimeline
 
 __all__ = [
@@ -21,6 +20,5 @@ __all__ = [
     "SampleAndHold",
     "StatefulTransform",
     "check_order",
-    "delay_trajectories",
     "set_seed",
 ]

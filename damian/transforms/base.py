@@ -342,7 +342,7 @@ class StatefulTransform(Transform):
         name = type(self).__name__
         raise RuntimeError(
             f"{name} remembers earlier steps, so it works only in an environment, after a reset: "
-            f"TransformedEnv(env, {name}(...)); for stored steps, call damian.delay_trajectories(data, ...)"
+            f"TransformedEnv(env, {name}(...)); for stored steps: examples/transforms/late_replay_buffer.py"
         )
 
     # Copies and checkpoints.

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from delay_twin import Counting
-from environments import ACTION, LATE, OBSERVATION, Drift, uavs
+from environments import LATE, OBSERVATION, Drift, uavs
 from tensordict import TensorDict
 from torchrl.envs import Compose, ConditionalSkip, GymEnv, StepCounter, Transform, TransformedEnv
 
@@ -15,7 +14,6 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    delay_trajectories,
 )
 
 MISSING = {
@@ -56,21 +54,9 @@ def test_a_wrong_argument_is_one_line(line):
         MISTAKES[line]()
 
 
-CHANGES = {
-    "ActionDelay changes which actions": lambda: ActionDelay(3, ACTION),
-    "SampleAndHold changes which actions": lambda: SampleAndHold(3, [], ACTION),
-}
-
-
-@pytest.mark.parametrize("text", CHANGES)
-def test_stored_steps_refuse_what_would_have_changed_what_happened(text):
-    with pytest.raises(InputError, match=f"transform: {text}"):
-        delay_trajectories(Counting([3, 5]).rollout(8, break_when_any_done=False), CHANGES[text]())
-
-
 @pytest.mark.parametrize("use", [lambda t: t, Compose])
 def test_outside_an_environment_the_error_says_what_to_do(use):
-    with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*delay_trajectories"):
+    with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*late_replay_buffer"):
         use(ObservationDelay(2))(TensorDict({"observation": torch.zeros(3, 1)}, [3]))
 
 
