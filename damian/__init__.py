@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from damian.delays.config import DelayConfig
-    from damian.delays.laws import Burst, Constant, Distance, Function, Geometric, Lag, Law, Trace, Uniform
+    from damian.delays.laws import Burst, Constant, Distance, Geometric, Lag, Law, Trace, Uniform
     from damian.delays.samplers import ContextSampler, MessageContext, Sampler, TableSampler
     from damian.envs.config import ClockConfig, ScenarioConfig
     from damian.envs.nodes import ServerNode
@@ -44,7 +44,6 @@ _MODULES = {
         "Burst",
         "Constant",
         "Distance",
-        "Function",
         "Geometric",
         "Lag",
         "Law",
@@ -91,7 +90,6 @@ __all__ = [
     "CumulativeReward",
     "DelayConfig",
     "Distance",
-    "Function",
     "Geometric",
     "Lag",
     "Law",

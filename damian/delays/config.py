@@ -79,16 +79,6 @@ class LinkConfig(Settings):
         both = self.range is not None and self.hears is not None
         self.refuse(both, "range", "does not go with links.hears: leave out one of them")
 
-    def check_pairs(self, n_agents: int) -> None:
-        """Check the shape of what is given for each pair of UAVs."""
-        for name in ("delay", "loss", "hears"):
-            rows = getattr(self, name)
-            if is_matrix(rows) or (name == "hears" and rows is not None):
-                lists = [rows, *rows] if is_matrix(rows) else [rows]
-                square = all(is_matrix(each) and len(each) == n_agents for each in lists)
-                problem = f"is not {n_agents} lists (receivers) of {n_agents} entries (senders)"
-                self.refuse(not square, name, problem)
-
 
 def is_matrix(written: Any) -> bool:
     """Is a setting of the links given for each pair of UAVs, as a list or a tensor?"""

@@ -113,11 +113,11 @@ class Channel(StatefulTransform):
         self.out_keys += existing([self.age_key, self.mask_key, self.delay_key])
         self.message_size, self.known_at_reset, self.dt = message_size, known_at_reset, dt
         self.comm_range = comm_range
-        self.hears = None if hears is None else torch.as_tensor(hears, dtype=torch.bool).flatten().tolist()
         self.sampler = link_sampler(delay, loss, dt)
-        links = {"delay": delay, "loss": loss} | ({} if hears is None else {"hears": hears})
-        self.n_agents = same_size(links) or getattr(self.sampler, "n_agents", None)
+        by_pair = same_size({"delay": delay, "loss": loss, "hears": hears})
+        self.n_agents = by_pair or getattr(self.sampler, "n_agents", None)
         """The number of agents for which links are given one by one, if any are."""
+        self.hears = None if hears is None else torch.as_tensor(hears, dtype=torch.bool).flatten().tolist()
         for name in self.sampler.reads:
             given = placed and name in ("position", "receiver_position")
             checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
