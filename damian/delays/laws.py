@@ -123,11 +123,7 @@ LAWS = Registry[type[Law]](
 @LAWS.register("constant")
 @dataclass(frozen=True)
 class Constant(Law):
-    """Every message has the same delay.
-
-    A worked timeline of ``Constant(3)``: a message sent at t = 0 arrives at t = 3, one sent at t = 1 at
-    t = 4.
-    """
+    """Every message has the same delay."""
 
     delay: Delay = 0
     """Delay: steps, or a time."""
@@ -143,9 +139,6 @@ class Uniform(Law):
 
     Delays in steps are equally likely whole numbers, both ends included. Delays in time are continuous and
     rounded up to whole steps, so that 3 to 7 s are 4, 5, 6 or 7 steps of 1 s.
-
-    A worked timeline of ``Uniform(1, 3)``: a message sent at t = 0 arrives at t = 1, 2 or 3. If it draws 3
-    and the next message draws 1, that one arrives at t = 2 and overtakes it.
     """
 
     low: Delay = 0
@@ -173,11 +166,7 @@ class Uniform(Law):
 @LAWS.register("geometric")
 @dataclass(frozen=True)
 class Geometric(Law):
-    """A message arrives in each step with the same probability, as if it were retransmitted until received.
-
-    A worked timeline of ``Geometric(mean=1)``: half of the messages sent at t = 0 arrive at t = 0, a quarter
-    at t = 1, an eighth at t = 2, and a sixteenth at t = 3.
-    """
+    """A message arrives in each step with the same probability, as if retransmitted until received."""
 
     mean: Delay = 1
     """Mean delay before the cut at ``longest``: steps, which may be a fraction, or a time."""
@@ -228,11 +217,7 @@ class Burst(Law):
 @LAWS.register("trace")
 @dataclass(frozen=True)
 class Trace(Law):
-    """Recorded delays of a file, one per step in its order; each sender starts at a random row.
-
-    A worked timeline of a file with the rows 3, 0 and lost: a sender that starts at its first row sends at
-    t = 0 what arrives at t = 3, at t = 1 what arrives at t = 1, and at t = 2 what never arrives.
-    """
+    """Recorded delays of a file, one per step in its order; each sender starts at a random row."""
 
     path: str = ""
     """CSV table with a column ``delay``: steps, times with their unit, or ``lost``. That of the package is
@@ -294,9 +279,6 @@ class Distance(Law):
     normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002, section 4.9).
 
     The law reads the sender's ``position``, and ``receiver_position`` where it is given, [m], [M, 2].
-
-    A worked timeline of ``Distance(base=1, speed=10)`` and steps of 1 s: a message sent at t = 0 from a place
-    20 m away arrives at t = 3; one sent at t = 1 from the place of the receiver arrives at t = 2.
     """
 
     base: Delay = 0

@@ -183,8 +183,8 @@ class Belief(WorldTransform):
         return window._asdict(), self._written(beliefs)
 
     def _written(self, beliefs: Beliefs) -> Entries:
-        own: Entries = {keys.OWN_BELIEF: self.from_rows(beliefs.own)} if self.own else {}
-        return {keys.BELIEF: self.from_rows(beliefs.server), **own}
+        pairs = zip(self.out_keys, beliefs, strict=False)  # the own ones are none if they are not wanted
+        return {key: self.from_rows(belief) for key, belief in pairs}
 
     @property
     def grid(self) -> SourceGrid:

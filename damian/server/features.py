@@ -253,10 +253,7 @@ def _any_has_detected(v: FeatureCache) -> Tensor:
 
 def _to_source(v: FeatureCache) -> Tensor:
     """Vector from each UAV to the estimated position of the source [m], [*, N, 2]."""
-    counts, detected_time = v(_has_detected), v.messages.detected_time
-    if v.context.observation.estimate == "newest":
-        counts = counts & (detected_time == detected_time.amax(-1, keepdim=True))
-    weight = counts.to(v.messages.position.dtype)
+    weight = v(_has_detected).to(v.messages.position.dtype)
     total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-2, keepdim=True)
     estimate = total / weight.sum(-1).clamp(min=1)[..., None, None]
     return estimate - v.messages.position

@@ -1,7 +1,7 @@
 """Delays, action histories and slow clocks as TorchRL transforms, on any TorchRL environment."""
 
 from damian.transforms.action import ActionDelay
-from damian.transforms.base import StatefulTransform, check_order, set_seed
+from damian.transforms.base import StatefulTransform, set_seed
 from damian.transforms.channel import Channel
 from damian.transforms.history import ActionHistory
 from damian.transforms.hold import SampleAndHold
@@ -19,6 +19,5 @@ __all__ = [
     "RewardDelay",
     "SampleAndHold",
     "StatefulTransform",
-    "check_order",
     "set_seed",
 ]

@@ -13,9 +13,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import (
     Compose,
-    ConditionalSkip,
     EnvBase,
-    NoopResetEnv,
     RandomTruncationTransform,
     StepCounter,
     TerminateTransform,
@@ -453,9 +451,8 @@ class StatefulTransform(Transform):
 def check_order(transforms: Sequence[Transform]) -> None:
     """Refuse an order, as outputs pass the transforms, in which one undoes or misses what another does.
 
-    Raises ``InputError`` if a transform reads what one of an earlier stage changes after it, if rewards in
-    transit would be lost at an end of the episode, or if TorchRL's transforms take or skip steps unknown to
-    others.
+    Raises ``InputError`` if a transform reads what one of an earlier stage changes after it, or if rewards in
+    transit would be lost at an end of the episode.
     """
     for first, second in itertools.combinations(transforms, 2):
         problem = None
@@ -473,10 +470,6 @@ def check_order(transforms: Sequence[Transform]) -> None:
             )
         ):
             problem = "what is in transit at the end of an episode would be lost"
-        elif isinstance(first, StatefulTransform) and isinstance(second, NoopResetEnv):
-            problem = "it would remember what was before the idle steps"
-        elif isinstance(first, ConditionalSkip) and isinstance(second, StatefulTransform):
-            problem = "only then do the others know which worlds skip a step"
         if problem:
             names = type(first).__name__, type(second).__name__
             raise InputError(f"order of transforms: {names[0]} must come after {names[1]}: {problem}")

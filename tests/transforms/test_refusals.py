@@ -4,7 +4,7 @@ import pytest
 import torch
 from environments import LATE, OBSERVATION, Drift, uavs
 from tensordict import TensorDict
-from torchrl.envs import Compose, ConditionalSkip, GymEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import Compose, GymEnv, StepCounter, Transform, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.transforms import (
@@ -75,7 +75,6 @@ WRONG = {
     "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
     "an observation delay after a history that appends": (appending, delay),
     "a time limit after a reward delay": (lambda: RewardDelay(2), lambda: StepCounter(max_steps=5)),
-    "skipped steps before a delay": (lambda: ConditionalSkip(lambda td: td["done"]), delay),
 }
 
 
