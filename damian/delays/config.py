@@ -63,21 +63,14 @@ class LinkConfig(Settings):
     )
     loss: Any = setting(0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix"))
     range: float | None = setting(
-        None,
-        "A UAV hears only UAVs within this distance when they send.",
-        unit="m",
-        above=0,
-        kinds=("matrix",),
+        None, "A UAV hears only UAVs within this distance.", unit="m", above=0, kinds=("matrix",)
     )
-    hears: Any = setting(None, "Whom UAVs hear: per receiver a list of true and false.", kinds=("matrix",))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse_unread()
         if self.kind == "updown" or not is_matrix(self.loss):
             checks.in_range("links.loss", self.loss, 0.0, 1.0)
-        both = self.range is not None and self.hears is not None
-        self.refuse(both, "range", "does not go with links.hears: leave out one of them")
 
 
 def is_matrix(written: Any) -> bool:

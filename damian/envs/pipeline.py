@@ -160,7 +160,6 @@ def link_transforms(scenario: ScenarioConfig, server: Server) -> list[Transform]
         delays.links,
         keys.MESSAGE,
         keys.LINKED,
-        hears=links.hears,
         comm_range=links.range,
         position_key=keys.POSITION if delays.links.reads or links.range is not None else None,
         sent_key=keys.MESSAGE_SENT,

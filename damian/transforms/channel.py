@@ -9,7 +9,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
-from damian.delays.laws import link_sampler, same_size
+from damian.delays.laws import link_sampler
 from damian.delays.line import DelayLine, slot_rows
 from damian.delays.samplers import MessageContext
 from damian.keys import STEPPED
@@ -50,8 +50,8 @@ class Channel(StatefulTransform):
             ``action_key`` is given, ``("agents", "observation")``. A bare name for another key means an entry
             beside it.
         out_key: key under which the received entries are written, [*B, N, N, ...] (receiver, sender).
-        loss: probability that a message does not reach a receiver, or an N x N nested list of it.
-        hears: which sender each receiver hears, [N, N] of bool; all if not given.
+        loss: probability that a message does not reach a receiver, or an N x N nested list of it, 1 where a
+            receiver never hears a sender.
         comm_range: an agent hears only agents within this distance [m] when they send.
         position_key: key of an entry [*B, N, ...] whose first two numbers are the agent's position [m].
         sent_key: key of a flag [*B, N] bool: does the agent send in this step.
@@ -77,7 +77,6 @@ class Channel(StatefulTransform):
         out_key: NestedKey = "received",
         *,
         loss: Any = 0.0,
-        hears: Any = None,
         comm_range: float | None = None,
         position_key: NestedKey | None = None,
         sent_key: NestedKey | None = None,
@@ -110,10 +109,8 @@ class Channel(StatefulTransform):
         self.message_size, self.known_at_reset, self.dt = message_size, known_at_reset, dt
         self.comm_range = comm_range
         self.sampler = link_sampler(delay, loss, dt)
-        by_pair = same_size({"delay": delay, "loss": loss, "hears": hears})
-        self.n_agents = by_pair or getattr(self.sampler, "n_agents", None)
+        self.n_agents = getattr(self.sampler, "n_agents", None)
         """The number of agents for which links are given one by one, if any are."""
-        self.hears = None if hears is None else torch.as_tensor(hears, dtype=torch.bool).flatten().tolist()
         for name in self.sampler.reads:
             given = placed and name in ("position", "receiver_position")
             checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
@@ -146,10 +143,8 @@ class Channel(StatefulTransform):
         streams = self.streams(tensordict.batch_size, content.device, self.sampler)
         links = torch.arange(len(streams), device=streams.device)
         receiver, sender = links // n, links % n
-        hears = receiver % n != sender
-        if self.hears is not None:
-            hears = hears & torch.tensor(self.hears, device=streams.device).repeat(len(streams) // n**2)
-        memory = self.line.init_memory([], streams) | {"sender": receiver // n * n + sender, "hears": hears}
+        memory = self.line.init_memory([], streams)
+        memory |= {"sender": receiver // n * n + sender, "hears": receiver % n != sender}
         memory["link"] = links.view(-1, n, n)[:, -1].flatten()
         memory["contents"] = content.new_zeros(self._n_slots, *content.shape)
         memory["held"] = content.new_zeros(len(links), *content.shape[1:])
