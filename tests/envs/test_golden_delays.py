@@ -150,6 +150,10 @@ def test_the_server_holds_the_recorded_messages_but_for_late_ones_of_the_reset(c
 
 
 LATE_RESET = "a late message of the reset came last"
+NOTHING_COVERED = "the newest position always covers nothing"
+DIVIDED = "divided again for every further UAV"
+ONCE = "a place that several UAVs report counts once"
+NO_BEARING = "no bearing to where it stands"
 
 
 def make_server(case: int) -> Server:
@@ -165,16 +169,16 @@ def reason_for_other_feature(step: Step, name: str, uav: int) -> str | None:
     if step.lost_in_reset:
         return LATE_RESET
     if name == "coverage":
-        return "the newest position always covers nothing"
+        return NOTHING_COVERED
     if name == "source_time" and uav > 0 and step.recorded("last_time") not in (None, step.number - 1):
-        return "divided again for every further UAV"
+        return DIVIDED
     detected = step.held.detected_time >= 0
     places = {tuple(place) for place in step.held.detected_position[detected].tolist()}
     if name in ESTIMATED and len(places) < detected.sum():
-        return "a place that several UAVs report counts once"
+        return ONCE
     at_estimate = step.recorded("est_pos") == pytest.approx(step.recorded("server_agent_pos")[uav], abs=1e-2)
     if name in ("source_bearing", "source_drift") and at_estimate:
-        return "no bearing to where it stands"
+        return NO_BEARING
     return None
 
 
@@ -185,26 +189,8 @@ ESTIMATED = ("source_distance", "source_bearing", "source_drift", "mean_distance
 @pytest.mark.parametrize(
     ("case", "compared", "reasons"),
     [
-        (
-            1,
-            974,
-            {
-                "the newest position always covers nothing": 181,
-                "no bearing to where it stands": 112,
-                LATE_RESET: 14,
-            },
-        ),
-        (
-            2,
-            4593,
-            {
-                "a place that several UAVs report counts once": 672,
-                "the newest position always covers nothing": 603,
-                LATE_RESET: 270,
-                "divided again for every further UAV": 136,
-                "no bearing to where it stands": 26,
-            },
-        ),
+        (1, 974, {NOTHING_COVERED: 181, NO_BEARING: 112, LATE_RESET: 14}),
+        (2, 4593, {ONCE: 672, NOTHING_COVERED: 603, LATE_RESET: 270, DIVIDED: 136, NO_BEARING: 26}),
     ],
 )
 def test_the_server_computes_the_recorded_features(case, compared, reasons):
