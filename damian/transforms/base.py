@@ -205,17 +205,6 @@ class StatefulTransform(Transform):
         """Expand a mask of worlds [B] to a mask of rows [M]."""
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
-    def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        """The memory if only the worlds ``stepped`` [B] have stepped; the others have sent nothing.
-
-        Buffers that a step writes in place are right already, as ``on_step`` knows who has stepped.
-        """
-        rows, merged = self.expand_worlds(stepped), {}
-        for name, new in after.items():
-            old = before[name]
-            merged[name] = new if new is old else torch.where(expand_mask(rows, new), new, old)
-        return merged
-
     def sending_rows(self, entries: Entries) -> Tensor | None:
         """The rows that send a message in this step, [M] bool; None if all do."""
         sending = None if self.sent_key is None else entries[self.sent_key].reshape(-1)
@@ -278,13 +267,16 @@ class StatefulTransform(Transform):
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
     ) -> Change:
-        """Undo a change in the worlds that do not step: ``before`` has their entries, or else ``after``."""
-        memory, entries = change
-        stepped = stepped.reshape(-1)
-        memory = self.merge_worlds(self.memory, memory, stepped)
-        rows = self.expand_worlds(stepped)
+        """Undo a change in the worlds that do not step: ``before`` has their entries, or else ``after``.
+
+        Buffers that a step writes in place are right already, as ``on_step`` knows who has stepped.
+        """
+        rows, memory = self.expand_worlds(stepped.reshape(-1)), self.memory
+        for name, new in change[0].items():
+            if new is not memory[name]:
+                memory[name] = torch.where(expand_mask(rows, new), new, memory[name])
         merged: Entries = {}
-        for key, new in entries.items():
+        for key, new in change[1].items():
             # A later transform that widens an entry restores it itself.
             found = (td.get(key, None) for td in (before, after))
             same_shape = (value for value in found if value is not None and value.shape == new.shape)
