@@ -16,6 +16,7 @@ from damian import keys
 from damian.common import checks, counter_rng, devices
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.config import ScenarioConfig
+from damian.server.belief import certain_belief
 from damian.server.components import checked_features
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
@@ -233,8 +234,10 @@ class UavEnv(EnvBase):
 
     def _privileged(self, state: State, global_observation: Tensor | None) -> Tensor:
         """Observation of a critic that knows the simulator's true state, [B, N, G + 2]."""
-        if global_observation is None or self.server.grid is not None:
-            features = self.server.privileged_features(state.sent, state.steps, state.source)
+        grid = self.server.grid
+        if global_observation is None or grid is not None:
+            belief = None if grid is None else certain_belief(grid, state.source)
+            features = self.server.features(state.sent, state.steps, belief=belief)
             _, global_observation = self.server.observations(features)
         scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
         to_source = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
