@@ -96,7 +96,7 @@ class UavEnv(EnvBase):
         self.action_columns = self.server.action_columns(features)
         """Columns of the actors' observations with a value for each action; None if there are none."""
         self._reset_outputs = self._outputs_at_reset(initial, features)
-        self._make_specs(self._bounds(features))
+        self._make_specs(features)
         self.set_seed(seed)
         self.to(torch.device(device))
 
@@ -269,18 +269,13 @@ class UavEnv(EnvBase):
         root[keys.AGENTS] = make(agents, shape, self.device)
         return make(root, self.batch_size, self.device)
 
-    def _bounds(self, features: Features) -> Bounds:
-        """The bounds that the features declare, and [-1, 1] for the privileged offset to the source."""
+    def _make_specs(self, features: Features) -> None:
+        """Specs with the bounds that the features declare, and [-1, 1] for the offset to the source."""
         low, high = (self.server.observations(limit) for limit in feature_bounds(features))
         actor, critic = ((lowest[0], highest[0]) for lowest, highest in zip(low, high, strict=True))
         privileged = pad(critic[0], [0, 2], value=-1.0), pad(critic[1], [0, 2], value=1.0)
-        return {
-            keys.OBSERVATION: actor,
-            keys.GLOBAL_OBSERVATION: critic,
-            keys.PRIVILEGED_OBSERVATION: privileged,
-        }
-
-    def _make_specs(self, bounds: Bounds) -> None:
+        bounds: Bounds = {keys.OBSERVATION: actor, keys.GLOBAL_OBSERVATION: critic}
+        bounds[keys.PRIVILEGED_OBSERVATION] = privileged
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
         ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in keys.ENDS}
         observations: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}
