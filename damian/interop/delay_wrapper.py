@@ -27,7 +27,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
     Args:
         env: any Gymnasium environment; its spaces stay as they are.
         observation, action: delay of each: steps (``3``), a time (``"3s"``), a distribution
-            (``Uniform(3, 7)``), or a function, as ``damian.Function`` says.
+            (``Uniform(3, 7)``), or a function, as ``ObservationDelay`` takes.
         loss: probability that an observation never arrives.
         default: the action that is executed until the first one arrives; if not given, 0 (in all parts). It
             is not needed if no action is late.
