@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from damian.delays.config import DelayConfig
-    from damian.delays.laws import Burst, Constant, Distance, Function, Geometric, Lag, Law, Trace, Uniform
+    from damian.delays.laws import Burst, Constant, Distance, Geometric, Lag, Law, Trace, Uniform
     from damian.delays.samplers import ContextSampler, MessageContext, Sampler, TableSampler
     from damian.envs.config import ClockConfig, ScenarioConfig
     from damian.envs.nodes import ServerNode
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
         ObservationTimeline,
         RewardDelay,
         SampleAndHold,
-        delay_trajectories,
         set_seed,
     )
     from damian.world.sensors import sensor
@@ -45,7 +44,6 @@ _MODULES = {
         "Burst",
         "Constant",
         "Distance",
-        "Function",
         "Geometric",
         "Lag",
         "Law",
@@ -73,7 +71,6 @@ _MODULES = {
         "ObservationDelay",
         "RewardDelay",
         "SampleAndHold",
-        "delay_trajectories",
         "set_seed",
     ],
     "damian.envs.nodes": ["ServerNode"],
@@ -93,7 +90,6 @@ __all__ = [
     "CumulativeReward",
     "DelayConfig",
     "Distance",
-    "Function",
     "Geometric",
     "Lag",
     "Law",
@@ -112,7 +108,6 @@ __all__ = [
     "UavEnv",
     "Uniform",
     "compose_scenario",
-    "delay_trajectories",
     "feature",
     "load",
     "make_env",

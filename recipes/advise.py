@@ -6,7 +6,6 @@ damian advise fit=journals/north.jsonl                    (only the delays, as a
 
 __package__ = "damian.recipes"  # also of a script: python recipes/advise.py
 
-import json
 import time
 from pathlib import Path
 
@@ -14,8 +13,10 @@ import hydra
 from omegaconf import DictConfig
 
 from damian.baselines.greedy import greedy_policy
+from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
+from damian.common.tables import write_csv
 from damian.common.text_files import named
 from damian.delays.law_fit import fit_laws
 from damian.field.advice import next_landings
@@ -23,14 +24,13 @@ from damian.field.fitting import (
     check_clocks,
     fit,
     law_summary,
-    plot_delays,
     read_log,
     steps_of,
     summary,
     trace_rows,
 )
 from damian.field.node import Node, for_uavs, scenario_of_reports
-from damian.field.rows import as_csv, as_rows, read_file
+from damian.field.rows import read_file
 from damian.world.vehicles import MOTION_MODELS
 
 from . import cli
@@ -41,7 +41,9 @@ from .shared.runs import run_folder, save_config, start, stored_values
 
 def advise(config: AdviseConfig, folder: Path) -> None:
     """Answer a table of reports, or write the delays of a log."""
-    config.check_source()
+    given = [name for name in ("table", "fit") if getattr(config, name) is not None]
+    problem = "is not the only one of table=FILE, fit=FILE: give one"
+    checks.require(len(given) == 1, "table", " and ".join(given) or "nothing", problem)
     if config.fit is not None:
         fit_delays(config, folder)
     else:
@@ -61,9 +63,9 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
         policy = stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
         answers = next_landings(rows, node, policy, time.time(), config.flown == "sampled")
     save_config(config, folder)
-    write_atomically(folder / "advice.json", json.dumps(as_rows(answers), indent=1))
-    write_atomically(folder / "advice.csv", table := as_csv(answers))
-    print(table, end="")
+    write_atomically(folder / "advice.json", answers.to_json(orient="records", indent=1, double_precision=15))
+    write_csv(folder / "advice.csv", answers, unknown="NA")
+    print((folder / "advice.csv").read_text(encoding="utf-8"), end="")
 
 
 def check_motion(config: AdviseConfig) -> None:
@@ -78,7 +80,7 @@ def check_motion(config: AdviseConfig) -> None:
 
 
 def fit_delays(config: AdviseConfig, folder: Path) -> None:
-    """Write the delays of a log of reports as a trace, draw them, and print which law fits them best."""
+    """Write the delays of a log of reports as a trace, and print which law fits them best."""
     log = Path(str(config.fit))
     check_clocks(fitted := fit(read_log(log)), log)
     save_config(config, folder)
@@ -88,7 +90,6 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
     laws = fit_laws(steps_of(fitted, config.clock.dt))
     print(law_summary(*laws, config.clock.dt))
-    plot_delays(fitted, *laws, folder / "delays.png")
 
 
 @cli.one_line_errors("advise")

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``one_line_errors`` prints them
 
@@ -22,13 +22,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
-from hydra.experimental.callback import Callback
-from hydra.plugins.config_source import ConfigResult, ConfigSource
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -37,7 +32,7 @@ from damian.common.errors import RUN_ERROR, InputError, RunError
 from damian.common.fields import filled, set_at, value_at
 from damian.common.text_files import one_line
 from damian.learners.config import LEARNERS
-from damian.runs.interrupt import end_interrupted, number_of
+from damian.runs.processes import end_interrupted
 
 from .known import CONF, SCHEMAS, described, key_of, known_settings, no_such_key
 
@@ -45,8 +40,6 @@ Work = Callable[[Any, Path], None]
 """The work of a program: takes checked settings and the run folder to fill."""
 ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError)
 """What Hydra raises for words and files that it cannot compose."""
-
-# ------------------------------------------------------------------------------------------ schemas
 
 
 def _schema(kind: type) -> DictConfig:
@@ -71,45 +64,17 @@ def _register() -> None:
 _register()
 
 
-class OwnOptions(ConfigSource):
-    """Options that are code of the user's own: ``learner=package.module:Name``, also of region and motion."""
-
-    NAMES: ClassVar = {"learner": "name", "region": "kind", "motion": "kind"}
-
-    @staticmethod
-    def scheme() -> str:
-        return "own"
-
-    def load_config(self, config_path: str) -> ConfigResult:
-        group, _, name = config_path.removesuffix(".yaml").partition("/")
-        return ConfigResult(
-            self.provider, self.path, OmegaConf.create({self.NAMES[group]: name}), {"package": None}
-        )
-
-    def is_config(self, config_path: str) -> bool:
-        return config_path.partition("/")[0] in self.NAMES and ":" in config_path
-
-    def is_group(self, config_path: str) -> bool:
-        return False
-
-    def available(self) -> bool:
-        return True
-
-    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        return []
+OWN = {"learner": "name", "region": "kind", "motion": "kind"}
+"""Groups whose option may be code of the user's own, and the setting that names it."""
 
 
-class OwnOptionsPath(SearchPathPlugin):
-    """Makes Hydra look for options among those of the user's own, too."""
-
-    def manipulate_search_path(self, search_path: Any) -> None:
-        search_path.append("damian", "own://")
-
-
-Plugins.instance().register(OwnOptions)
-Plugins.instance().register(OwnOptionsPath)
-
-# ------------------------------------------------------------------------------------------ settings
+def _register_own(words: Sequence[str]) -> None:
+    """Make each ``learner=package.module:Name`` of a command line an option of its group."""
+    for word in words:
+        group, _, names = word.partition("=")
+        for name in names.split(",") if group in OWN else ():
+            if ":" in name:
+                ConfigStore.instance().store(group=group, name=name, node={OWN[group]: name})
 
 
 def settings(*words: str, program: str = "train") -> Any:
@@ -121,7 +86,8 @@ def composed(*words: str, program: str = "train") -> DictConfig:
     """What Hydra composes from words; in a program of damian with the options of its --config-dir."""
     running = GlobalHydra.instance().hydra
     try:
-        if running and "own://" in str(running.config_loader.get_search_path()):
+        _register_own(words)
+        if running and str(CONF) in str(running.config_loader.get_search_path()):
             return compose(program, [*words], return_hydra_config=True)
         GlobalHydra.instance().clear()  # of a Hydra application that calls this
         with initialize_config_dir(str(CONF), version_base=None):
@@ -190,8 +156,6 @@ def _check_whole(values: Mapping[str, Any], words: Sequence[str], choices: Mappi
 LAWS = ("delay.obs", "delay.act", "delay.rew", "links.delay")
 """Settings that are laws."""
 
-# ------------------------------------------------------------------------------------------ errors
-
 
 def reason(error: BaseException, program: str = "train") -> str:
     """The deepest cause of an error on one line, with its key in front."""
@@ -210,6 +174,7 @@ def reason(error: BaseException, program: str = "train") -> str:
 @contextmanager
 def one_line_errors(program: str = "train") -> Iterator[None]:
     """End a program with one line on stderr if input is wrong (code 2) or a run cannot go on (3)."""
+    _register_own(sys.argv[1:])
     try:
         yield
     except (InputError, RunError, OSError, *ERRORS) as error:
@@ -220,68 +185,30 @@ def one_line_errors(program: str = "train") -> Iterator[None]:
             line += " (DAMIAN_TRACEBACK=1 shows the traceback)"
         print(f"error: {line}", file=sys.stderr)
         sys.exit(RUN_ERROR if isinstance(error, RunError | OSError) else 2)
-    except KeyboardInterrupt as error:
-        end_interrupted(number_of(error))
+    except KeyboardInterrupt:
+        end_interrupted()
     finally:
-        Folders.remove_empty()
-
-
-# ------------------------------------------------------------------------------------------ folders
-
-
-class Folders(Callback):
-    """Removes the folders that a refused run has made."""
-
-    made: ClassVar[list[Path]] = []
-    """The folders that Hydra will make, the deepest first."""
-
-    def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        self._remember(Path(config.hydra.run.dir))
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        self._remember(Path(config.hydra.sweep.dir))
-        str(config.hydra.sweep.subdir)  # the names of the runs' folders need the words of the whole sweep
-
-    @classmethod
-    def _remember(cls, folder: Path) -> None:
-        folder = folder.absolute()
-        cls.made[:] = [each for each in (folder, *folder.parents) if not each.exists()]
-
-    @classmethod
-    def remove_empty(cls) -> None:
-        """Remove the folders in which nothing was written."""
-        for each in cls.made:
-            with suppress(OSError):
-                if [*each.iterdir()] == [each / "multirun.yaml"]:
-                    (each / "multirun.yaml").unlink()
-                each.rmdir()
-        cls.made.clear()
+        if HydraConfig.initialized() and not OmegaConf.is_missing(HydraConfig.get().runtime, "output_dir"):
+            with suppress(OSError):  # a refused run has nothing in the folder that Hydra has made for it
+                Path(HydraConfig.get().runtime.output_dir).rmdir()
 
 
 def _sweep_name(sweep: Sequence[str]) -> str:
     """The name of a sweep's folder, the same for the same command: what is swept, and a hash of all words."""
-    return f"{_run_name(sweep, sweep)}-{sha256(' '.join(sweep).encode()).hexdigest()[:8]}"
+    return f"{_run_name(sweep, sweep)}-{_hash(' '.join(sweep))}"
 
 
 def _run_name(sweep: Sequence[str], words: Sequence[str]) -> str:
-    """The name of a run's folder: the settings in which the runs of a sweep differ."""
-    swept = {
-        each.key_or_group
-        for each in OverridesParser.create().parse_overrides([*sweep])
-        if each.is_sweep_override()
-    }
-    return _name(word for word in words if key_of(word) in swept) or "run"
-
-
-def _name(words: Any) -> str:
-    """Words as the name of a folder that can be typed; the end of a long one is a hash."""
-    text = "_".join(word.replace("=", "-") for word in words)
+    """The name of a run's folder: the settings in which the runs of a sweep differ, or their hash."""
+    parsed = OverridesParser.create().parse_overrides([*sweep])
+    swept = {each.key_or_group for each in parsed if each.is_sweep_override()}
+    text = "_".join(word.replace("=", "-") for word in words if key_of(word) in swept) or "run"
     name = re.sub(r"[^\w.,+-]+", "-", text).strip("-")
-    return (
-        name
-        if len(name) <= LONGEST_NAME
-        else f"{name[:LONGEST_NAME]}-{sha256(text.encode()).hexdigest()[:8]}"
-    )
+    return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}-{_hash(text)}"
+
+
+def _hash(text: str) -> str:
+    return sha256(text.encode()).hexdigest()[:8]
 
 
 LONGEST_NAME = 80

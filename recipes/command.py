@@ -12,18 +12,8 @@ from importlib import import_module
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
 
-from .known import check_words, help_text
+from .known import PROGRAMS, check_words, help_text
 
-PROGRAMS = {
-    "train": "train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one",
-    "evaluate": "evaluate a trained policy, also in another scenario or under other delays",
-    "compare": "train and evaluate several methods with several seeds, and compare them with intervals",
-    "fly": "fly episodes, and keep or replay them as files, films, figures and pages",
-    "advise": "advise real UAVs: from what they report, where each should land next",
-    "export": "export a policy that flies without damian: damian export RUN",
-    "results": "show the results in a folder as one table: damian results FOLDER",
-}
-"""What each program does, by its name; the program is the module of this name."""
 FOLDERS = {"export": "checkpoint={}", "results": "folders=[{}]"}
 """The setting that plain words mean, of programs whose main setting is a folder."""
 MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."
@@ -39,7 +29,7 @@ def main(words: Sequence[str] | None = None) -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     name, *words = (sys.argv[1:] if words is None else words) or ["--help"]
     if name in ("-h", "--help"):
-        _show(usage())
+        print(usage())
     elif name == "--version":
         print(import_module("damian").__version__)
     else:
@@ -64,7 +54,7 @@ def _checked(name: str, words: list[str]) -> list[str] | None:
     before = dict(zip(options, ["", *options], strict=False))
     plain = [word for word in options if word[0] != "-" and before[word][:1] != "-"]
     if {"-h", "--help"} & {*options}:
-        _show(help_text(name, [word for word in options if word[0] != "-"]))
+        print(help_text(name, [word for word in options if word[0] != "-"]))
         return None
     if plain and name in FOLDERS:
         options = [word for word in options if word not in plain]
@@ -76,14 +66,6 @@ def _checked(name: str, words: list[str]) -> list[str] | None:
     if not any(word.startswith(("--config-dir", "-cd")) for word in options):  # it may have any key
         check_words(name, rest)
     return [*options, *rest]  # Hydra wants options first
-
-
-def _show(text: str) -> None:
-    """Print, also to a reader that stops early, as in ``damian train --help learner | head``."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the exit would write once more
 
 
 def usage() -> str:

@@ -1,10 +1,10 @@
 """All settings of the programs but ``damian compare``: those of ``damian train``, which the others extend."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
-from damian.common.fields import Settings, constant, setting
+from damian.common.fields import Settings, constant, rules, setting
 from damian.compare.config import SCORES, STORED
 from damian.envs.config import ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
@@ -12,8 +12,6 @@ from damian.runs.config import LoggerConfig
 
 FORMATS = ("gif", "mp4", "png", "html", "geojson")
 FILMS = FORMATS[:2]
-MOST_EPISODES = 12
-"""Episodes that one page can play side by side."""
 COMPILE_FROM = 1_000_000
 """Environment steps from which on compiling saves more time than it takes, half a minute."""
 
@@ -102,19 +100,14 @@ class TrainConfig(ScenarioConfig):
 
 @dataclass
 class FlownPolicyConfig(TrainConfig):
-    """All settings of ``damian train``, and which policy flies."""
+    """All settings of ``damian train``, and which policy flies: the first choice flies a checkpoint."""
 
-    policy: str | None = None
-
-    policies: ClassVar[tuple[str, ...]] = STORED
-    """The policies that the program knows; the first of them flies a checkpoint if none is chosen."""
+    policy: str | None = setting(None, choices=STORED)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         problem = "is for damian train: nothing is trained here; give the run folder as checkpoint"
         self.refuse(self.resume is not None, "resume", problem)
-        if self.policy is not None:
-            checks.one_of("policy", self.policy, self.policies)
         problem = "needs checkpoint: the run folder with the policy to fly"
         self.refuse(self.learnt and not self.checkpoint, "policy", problem)
         problem = "flies no checkpoint: leave it out"
@@ -122,8 +115,8 @@ class FlownPolicyConfig(TrainConfig):
 
     @property
     def flown(self) -> str:
-        """The policy that flies, one of ``policies``."""
-        return self.policy or (self.policies[0] if self.checkpoint else "script")
+        """The policy that flies."""
+        return self.policy or (rules(type(self))["policy"].choices[0] if self.checkpoint else "script")
 
     @property
     def learnt(self) -> bool:
@@ -137,7 +130,9 @@ class FlyConfig(FlownPolicyConfig):
 
     eval_episodes: int = setting(1, "Episodes to fly.")
     policy: str | None = setting(
-        None, "sampled (default with a checkpoint), deterministic, script (default without), or random."
+        None,
+        "sampled (default with a checkpoint), deterministic, script (default without), or random.",
+        choices=(*STORED, "script", "random"),
     )
     keep: str = setting(
         "all",
@@ -151,38 +146,30 @@ class FlyConfig(FlownPolicyConfig):
     )
     views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
     journal: str | None = setting(
-        None,
-        "Journal of a fleet whose flight to show, instead of flying, with the settings given here.",
+        None, "Journal of a fleet whose flight to show, instead of flying, with the settings given here."
     )
     span: list[float] | None = setting(
         None, "First and last time of the journal to show, since every UAV had reported.", unit="s"
     )
     replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
 
-    policies: ClassVar[tuple[str, ...]] = ("sampled", "deterministic", "script", "random")
-
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
-        if self.journal or self.replay:
-            flies = {"policy": None, "eval_episodes": 1, "keep": "all"}
-            for name, none in flies.items():
-                wrong = getattr(self, name) != none
-                self.refuse(wrong, name, "means nothing with journal or replay, which fly nothing")
-        problem = f"is more than {MOST_EPISODES} episodes"
-        self.refuse(len(self.replay) > MOST_EPISODES, "replay", problem)
         if self.span is not None:
             good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal
             self.refuse(not good, "span", "is not [FIRST, LAST], two times of a journal [s]")
-        films = {*self.formats} & {*FILMS}
-        self.refuse(films and not self.views, "views", "names no view for the films: choose 2d or 3d")
 
 
 @dataclass
 class AdviseConfig(FlownPolicyConfig):
     """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
 
-    policy: str | None = setting(None, "deterministic (default with checkpoint), sampled, or script.")
+    policy: str | None = setting(
+        None,
+        "deterministic (default with checkpoint), sampled, or script.",
+        choices=("deterministic", "sampled", "script"),
+    )
     table: str | None = setting(None, "Table of reports, CSV or JSON: where should each UAV land next?")
     fit: str | None = setting(
         None, "Journal, or table with receive times: only write its delays as a trace, ``trace.csv``."
@@ -190,14 +177,6 @@ class AdviseConfig(FlownPolicyConfig):
     instant: bool = setting(
         False, "Whether a policy may advise whose UAVs were at their targets at once in training."
     )
-
-    policies: ClassVar[tuple[str, ...]] = ("deterministic", "sampled", "script")
-
-    def check_source(self) -> None:
-        """Require exactly one source of reports."""
-        given = [name for name in ("table", "fit") if getattr(self, name) is not None]
-        problem = "is not the only one of table=FILE, fit=FILE: give one"
-        checks.require(len(given) == 1, "table", " and ".join(given) or "nothing", problem)
 
 
 @dataclass

@@ -1,7 +1,9 @@
 """Evaluate a trained policy: as it was trained, or with more UAVs, other delays or another region.
 
 damian evaluate checkpoint=runs/first agents=10 delay=paper
-damian evaluate -m checkpoint=runs/first delay.obs=0,2,4,8
+damian evaluate -m checkpoint=runs/first,runs/second delay.obs=0,2,4,8
+
+Words change settings of the run; what is not mentioned stays.
 """
 
 __package__ = "damian.recipes"  # also of a script: python recipes/evaluate.py
@@ -38,25 +40,17 @@ likely one is taken. A policy without memory often needs chance to search."""
 
 
 def fly(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the policy of ``config.checkpoint`` and fill the run folder."""
+    """Evaluate the policy of ``config.checkpoint``, or the untrained networks, and fill the run folder."""
     env = make_eval_env(config)
-    actor = stored_actor(config, env)
+    actor = stored_actor(config, env) if config.checkpoint else None
     save_config(config, folder)
     report(config, folder, env, actor)
 
 
-def fly_untrained(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the networks before their first update, and fill the run folder."""
-    save_config(config, folder)
-    report(config, folder, make_eval_env(config))
-
-
 def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
     """The actor of ``config.checkpoint``, for an environment."""
-    if not config.checkpoint:
-        raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
     actor = config.learner.make_actor(env, config.model)
-    load_networks(Path(config.checkpoint), "checkpoint", {"actor": actor})
+    load_networks(Path(str(config.checkpoint)), "checkpoint", {"actor": actor})
     return actor
 
 

@@ -36,8 +36,6 @@ from . import cli
 from .evaluate import load
 from .shared.runs import any_number_of_uavs, run_folder, stored_config
 
-DESCRIPTION = "policy.json"
-NEED = "pip install 'damian[export]'"
 UNFILTERED = (
     "the columns of the belief are those of a Bayes filter, which is not exported: "
     "compute them with damian.server.belief, or train a policy without a belief"
@@ -46,7 +44,10 @@ UNFILTERED = (
 
 def export(run: Path, trust: bool = False) -> Path:
     """Export the policy of a run folder into its subfolder ``export``; returns that folder."""
-    safetensors, _ = _needed("safetensors.torch"), _needed("onnxscript")
+    try:
+        safetensors, _ = import_module("safetensors.torch"), import_module("onnxscript")
+    except ImportError as error:
+        raise InputError(f"export needs {error.name}: pip install 'damian[export]'") from None
     actor, env = load(run, worlds=2, deterministic=True, trust=trust)
     config, target = stored_config(run_folder(run), "checkpoint"), run_folder(run) / EXPORT
     any_number = any_number_of_uavs(config)
@@ -58,21 +59,9 @@ def export(run: Path, trust: bool = False) -> Path:
         weights = {name: weight.contiguous() for name, weight in policy.state_dict().items()}
         safetensors.save_file(weights, target / "policy.safetensors")
         onnx.save(target / "policy.onnx", external_data=False)
-    write_atomically(target / DESCRIPTION, json.dumps(described, indent=2, default=_plain) + "\n")
+    text = json.dumps(described, indent=2, default=lambda x: x.tolist() if isinstance(x, Tensor) else str(x))
+    write_atomically(target / "policy.json", text + "\n")
     return target
-
-
-def _plain(value: Any) -> Any:
-    """A value for JSON."""
-    return value.tolist() if isinstance(value, Tensor) else str(value)
-
-
-def _needed(module: str) -> Any:
-    """A module that not every installation has."""
-    try:
-        return import_module(module)
-    except ImportError:
-        raise InputError(f"export needs {module.partition('.')[0]}: {NEED}") from None
 
 
 def describe(run: Path, policy: ExportedPolicy, env: DelayedEnv, any_number: bool) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Fly episodes and keep each as file, film, figure or page: what is true, and what the server believes.
 
 damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
-damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
+damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"   (in one page, side by side)
+damian fly journal=north.jsonl "span=[600,900]" "formats=[html]"               (the flight of real UAVs)
 """
 
 __package__ = "damian.recipes"  # also of a script: python recipes/fly.py
@@ -25,9 +26,8 @@ from damian.common import checks
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
-from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
-from damian.show.film import save_film
+from damian.show.film import save_film, save_picture
 from damian.show.geojson import origin_of, save_geojson
 from damian.show.replay_page import save_page
 
@@ -78,21 +78,28 @@ def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:
 
 
 def show(config: FlyConfig, folder: Path) -> None:
-    """Fly episodes and fill the run folder."""
+    """Replay or fly episodes, or take the flight of a journal, and fill the run folder."""
+    films = "mp4" not in config.formats or FFMpegWriter.isAvailable()
+    checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
+    if config.replay:
+        page = folder / "replay.html"
+        save_page([Episode.load(Path(file)) for file in config.replay], page)
+        print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
+        return
     episodes = kept(fly(config), config.keep)
     if "geojson" in config.formats:
         origin_of(next(iter(episodes.values())))  # refuses a region without a place on Earth
     save_config(config, folder)
-    films = [kind for kind in config.formats if kind in FILMS]
+    kinds = [kind for kind in config.formats if kind in FILMS]
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
         episode.save(folder / f"{name}.json")
         if "png" in config.formats:
-            plot_beliefs(episode, folder / f"{name}.png")
+            save_picture(episode, folder / f"{name}.png")
         if "html" in config.formats:
             save_page([episode], folder / f"{name}.html")
         if "geojson" in config.formats:
             save_geojson(episode, folder / f"{name}.geojson")
-        for kind, view in product(films, config.views):
+        for kind, view in product(kinds, config.views):
             save_film(episode, folder / f"{name}{'_3d' * (view == '3d')}.{kind}", view)
     for name, episode in episodes.items():
         print(summary(name, episode))
@@ -109,22 +116,10 @@ def summary(name: str, episode: Episode) -> str:
     )
 
 
-def fly_or_replay(config: FlyConfig, folder: Path) -> None:
-    """Replay or fly episodes, or take the flight of a journal."""
-    films = "mp4" not in config.formats or FFMpegWriter.isAvailable()
-    checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
-    if config.replay:
-        page = folder / "replay.html"
-        save_page([Episode.load(Path(file)) for file in config.replay], page)
-        print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
-    else:
-        show(config, folder)
-
-
 @cli.one_line_errors("fly")
 @hydra.main(config_path="../conf", config_name="fly", version_base=None)
 def main(given: DictConfig) -> None:
-    start(fly_or_replay, given, "fly")
+    start(show, given, "fly")
 
 
 if __name__ == "__main__":

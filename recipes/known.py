@@ -3,15 +3,15 @@
 Nothing here imports torch or Hydra, so that help and a misspelt word are answered at once.
 """
 
-import dataclasses
+import ast
 import difflib
 import functools
 import re
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -37,28 +37,27 @@ SCHEMAS: dict[str, type] = {
 """Settings of the programs."""
 SYNONYMS = {
     "learning_rate": "learner.lr",
-    "belief": "aware=belief",
-    "latency": "delay.obs",
     "num_envs": "worlds",
-    "n_envs": "worlds",
     "total_frames": "frames",
     "total_timesteps": "frames",
-    "timesteps": "frames",
-    "uavs": "agents",
-    "algo": "learner",
     "algorithm": "learner",
     "task": "scenario",
     "env": "scenario",
-    "gpu": "device",
-    "cuda": "device",
 }
 """What people type who know other programs, and what it is called here."""
 
-# ------------------------------------------------------------------------------------------ settings
+
+def about(program: str) -> str:
+    """What the module of a program says of it, which is not imported for that."""
+    file = Path(__file__).with_name(f"{program}.py")
+    return ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
 
 
-@dataclass(frozen=True)
-class Setting:
+PROGRAMS = {name: about(name).partition("\n")[0] for name in SCHEMAS}
+"""What each program does, by its name."""
+
+
+class Setting(NamedTuple):
     """A setting as its dataclass declares it."""
 
     kind: str
@@ -67,12 +66,12 @@ class Setting:
     """Default value; None of a section."""
     text: str
     """What the setting means, with its unit."""
-    is_section: bool = False
+    is_section: bool
 
     @property
     def shown(self) -> str:
         """The default value as text; empty of a section."""
-        return "" if self.is_section or self.default is dataclasses.MISSING else repr(self.default)
+        return "" if self.is_section or self.default is MISSING else repr(self.default)
 
 
 @functools.cache
@@ -89,19 +88,13 @@ def described(kind: type, path: str = "") -> dict[str, Setting]:
     """Every setting of a dataclass by its dotted key, sections included."""
     found: dict[str, Setting] = {}
     for each in fields(kind):
-        rule, default = rules(kind)[each.name], default_of(each)
-        if rule.fixed:
-            continue
-        section: Any = (
-            type(default) if is_dataclass(default) else each.type if is_dataclass(each.type) else None
-        )
-        written = str(each.type)
-        named = written if "[" in written else getattr(each.type, "__name__", written)
-        found[f"{path}{each.name}"] = Setting(
-            named, None if section else default, rule.meaning, bool(section)
-        )
-        if section:
-            found |= described(section, f"{path}{each.name}.")
+        rule, default, declared = rules(kind)[each.name], default_of(each), each.type
+        section: Any = next((x for x in (type(default), declared) if is_dataclass(x)), None)
+        if not rule.fixed:
+            named = str(declared) if "[" in str(declared) else getattr(declared, "__name__", str(declared))
+            value = None if section else default
+            found[f"{path}{each.name}"] = Setting(named, value, rule.meaning, section is not None)
+            found |= described(section, f"{path}{each.name}.") if section else {}
     return found
 
 
@@ -126,9 +119,6 @@ def groups() -> dict[str, list[str]]:
     return options
 
 
-# ------------------------------------------------------------------------------------------ hints
-
-
 def key_of(word: str) -> str:
     """The key or group that a word sets."""
     return word.lstrip("+~").partition("=")[0]
@@ -147,11 +137,6 @@ def check_words(program: str, words: Iterable[str]) -> None:
                 raise InputError(f"{key}: {wrong[0]} is not one of {', '.join(options[key])}")
         elif not (is_known(key, program) or key.startswith(("hydra", "+", "~", "-"))):
             raise InputError(no_such_key(key, program))
-
-
-def without(words: Sequence[str], replaced: Collection[str]) -> list[str]:
-    """The words but those that set one of these keys and groups, or a key below them."""
-    return [w for w in words if not any(f"{key_of(w)}.".startswith(f"{key}.") for key in replaced)]
 
 
 def is_known(key: str, program: str) -> bool:
@@ -174,27 +159,6 @@ def no_such_key(key: str, program: str) -> str:
     return f"{key}: unknown setting" + "".join(f"; did you mean {name}?" for name in near)
 
 
-# ------------------------------------------------------------------------------------------ help
-
-DELAYS = """\
-  delay.obs=3 (steps) | 3s | 1..7 (uniform) | 3s..7s | "{law: geometric, mean: 2s}"   delay.act=..."""
-POLICY = "  changed settings of the run: agents=5 delay=paper delay.obs=6; what is not mentioned stays\n"
-SWEEP = "  hydra.run.dir=FOLDER   --config-dir FOLDER (options of your own)   -m seed=0,1,2 (a sweep)"
-HINTS = {
-    "train": "agents=3 seed=0 frames=300000 worlds=64 device=cuda compile=true learner.lr=3e-4\n"
-    f"{DELAYS}\n  resume=FOLDER (go on with a run)   checkpoint=FOLDER (begin with its policy)\n{SWEEP}",
-    "evaluate": f"checkpoint=FOLDER eval_episodes=200\n{POLICY}{DELAYS}\n{SWEEP}, of checkpoint=A,B too",
-    "fly": 'checkpoint=FOLDER policy=deterministic "formats=[gif,png,html]" "views=[2d,3d]" keep=extremes\n'
-    f'{POLICY}{DELAYS}\n  "replay=[A.json,B.json]" (stored episodes in one page)\n{SWEEP}',
-    "compare": "experiment=delaybench seeds=10 processes=2 (the same command continues a comparison)\n"
-    '  "tasks=[crowded]" "delays=[paper]" "arms=[undelayed,naive]" "overrides=[\'frames=100000\']"\n'
-    "  report_only=true (tables of what is stored)   keep=true (without the folders of finished runs)\n"
-    "  hydra.run.dir=FOLDER   --config-dir FOLDER (experiments of your own)",
-    "advise": f"checkpoint=FOLDER table=REPORTS.csv (or fit=JOURNAL: its delays as a trace)\n{POLICY}{SWEEP}",
-    "export": "checkpoint=FOLDER, or just FOLDER",
-    "results": 'FOLDER, or two folders to compare; "folders=[A,B]" score=steps',
-}
-"""What is often written with each program."""
 MEANING = """\
 Meaning, type, default and unit: damian {name} --help KEY | GROUP ...
 All settings with your words, before any training: damian {name} ... --cfg job"""
@@ -205,7 +169,7 @@ def help_text(name: str, keys: Sequence[str] = ()) -> str:
     if keys:
         found = [[*_options(name, key), *_meaning(name, key)] for key in keys]
         return "\n".join("\n".join(f or [no_such_key(k, name)]) for k, f in zip(keys, found, strict=True))
-    lines = [f"damian {name} [GROUP=OPTION] [KEY=VALUE] ...", "", f"Often used: {HINTS[name]}"]
+    lines = [f"damian {name} [GROUP=OPTION] [KEY=VALUE] ...", "", about(name)]
     known, common = known_settings(name), {} if name in ("train", "compare") else known_settings("train")
     own = [key for key in known if key not in common and not known[key].is_section and "." not in key]
     if name != "train":

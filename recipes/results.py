@@ -17,7 +17,7 @@ from damian.common.tables import markdown_table
 from damian.runs.run_folder import RESULTS
 
 from . import cli
-from .shared.comparison_results import MARKDOWN, ROWS, stored_results
+from .shared.comparison_runs import MARKDOWN, POINTS, stored_results
 from .shared.sweeps import compared, report, sweep_rows
 
 
@@ -32,23 +32,17 @@ def results(folder: str | Path) -> pd.DataFrame:
         InputError: there is no result in the folder.
     """
     folder = Path(folder)
-    return stored_results(folder).rows if is_comparison(folder) else sweep_rows(folder)[1]
-
-
-def is_comparison(folder: Path) -> bool:
-    """Whether a comparison has stored its results in a folder; a sweep stores them under the same name."""
-    path = folder / ROWS
-    return path.is_file() and "arm" in path.read_text(encoding="utf-8").partition("\n")[0].split(",")
+    return stored_results(folder).rows if (folder / POINTS).is_file() else sweep_rows(folder)[1]
 
 
 def table(folders: list[Path], score: str) -> str:
     """The table of a folder, or of two folders."""
-    folder = folders[0]
+    folder, is_comparison = folders[0], (folders[0] / POINTS).is_file()
     if len(folders) == 2:
         return compared(folders, score)
-    if is_comparison(folder) and (folder / MARKDOWN).exists():
+    if is_comparison and (folder / MARKDOWN).exists():
         return (folder / MARKDOWN).read_text(encoding="utf-8")
-    if is_comparison(folder) or (folder / RESULTS).exists():
+    if is_comparison or (folder / RESULTS).exists():
         rows = results(folder)
         cells = rows.map(lambda x: f"{x:.4g}" if isinstance(x, float) else str(x))
         return markdown_table([*map(str, rows)], cells.to_numpy())

@@ -1,7 +1,13 @@
 """Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one (docs/runs.md).
 
 damian train scenario=paper/usecase2 delay=paper aware=both hydra.run.dir=runs/first
-damian train resume=runs/first frames=600000
+damian train agents=3 seed=0 frames=300000 worlds=64 device=cuda compile=true learner.lr=3e-4
+damian train delay.obs=3  (steps; or 3s, 1..7 (uniform), 3s..7s, "{law: geometric, mean: 2s}"; delay.act)
+damian train resume=runs/first frames=600000     (the run goes on)
+damian train checkpoint=runs/first delay=paper   (a new run that begins with its policy)
+damian train -m seed=0,1,2 delay=none,paper      (a sweep; the same command goes on with what is missing)
+
+--config-dir FOLDER has options of your own.
 """
 
 __package__ = "damian.recipes"  # also of a script: python recipes/train.py
@@ -26,10 +32,9 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
 from damian.learners.base import Learner, divergence
 from damian.learners.schedule import SystemClock
-from damian.runs.interrupt import Interrupt, end_interrupted
-from damian.runs.loggers import make_loggers
 from damian.runs.metrics import Evaluation, evaluate
-from damian.runs.metrics_log import MetricsLog
+from damian.runs.metrics_log import MetricsLog, make_loggers
+from damian.runs.processes import Interrupt, end_interrupted
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
 from damian.runs.training_state import RandomState, TrainingState, load_networks
 from damian.server.components import not_finite
@@ -47,10 +52,8 @@ from .shared.learning import (
     replay_buffer,
     ticks,
 )
-from .shared.runs import names_own_code, run_folder, save_config, start, stored_values
-from .shared.settings import (
-    check_learning,
-)
+from .shared.runs import run_folder, save_config, start, stored_values
+from .shared.settings import check_learning
 
 
 def train(config: TrainConfig, folder: Path) -> None:
@@ -65,10 +68,9 @@ def train(config: TrainConfig, folder: Path) -> None:
     begin(config, state)
     if config.compiles:
         print("compiling: the first update takes up to a minute longer")
-    loggers, settings = make_loggers(config.logger, folder), dict(leaves(config))
-    log = MetricsLog(
-        folder, config.logger.tensorboard, config.logger.csv, state.progress.frames, loggers, settings
-    )
+    made = state.progress.frames
+    loggers = make_loggers(config.logger, folder, made)
+    log = MetricsLog(folder, config.logger.csv, made, loggers, dict(leaves(config)))
     eval_env = make_eval_env(config) if config.eval_every else None
     with closing(log):
         with closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
@@ -80,11 +82,12 @@ def train(config: TrainConfig, folder: Path) -> None:
                 if eval_env and state.progress.updates % cast(int, config.eval_every) == 0:
                     log.show(frames, evaluate_meanwhile(config, eval_env, learner).row("eval/"))
                 began = time.perf_counter()
-                show(bar, config, state)
+                bar.set_postfix({name: f"{mean:.2f}" for name, mean in state.episodes.means().items()})
+                bar.update(counted(config, state) - bar.n)
                 if save_or_stop(config, state, log, interrupt):
                     break
         if interrupt.asked:
-            end_interrupted(interrupt.asked, f"continue with resume={folder}")
+            end_interrupted(f"continue with resume={folder}", interrupt.asked)
         evaluations = report(config, folder, eval_env or make_eval_env(config), learner.actor)
         log.show(state.progress.frames, evaluations[TRAINED].row("eval/"))
         log.show(state.progress.frames, evaluations[TRAINED + DETERMINISTIC].row("eval_deterministic/"))
@@ -92,7 +95,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     title = f"{config.agents} UAVs, {name or module.upper()}"
     plot_learning_curve(log.rows, evaluations, folder / FIGURE, title)
     print(f"learning curve: {folder / FIGURE}")
-    print(f"fly this policy: {best_flight(evaluations, folder)}{' trust=true' * names_own_code(config)}")
+    print(f"fly this policy: damian fly checkpoint={shlex.quote(str(folder))}")
 
 
 def evaluate_meanwhile(config: TrainConfig, env: DelayedEnv, learner: Learner) -> Evaluation:
@@ -104,23 +107,13 @@ def evaluate_meanwhile(config: TrainConfig, env: DelayedEnv, learner: Learner) -
     return found
 
 
-def best_flight(evaluations: dict[str, Evaluation], folder: Path) -> str:
-    """The command that flies the trained policy, drawing its actions or not, whichever is better."""
-    policies = {"sampled": TRAINED, "deterministic": TRAINED + DETERMINISTIC}
-    scores = {name: evaluations[policy] for name, policy in policies.items()}
-    best = max(scores, key=lambda name: (scores[name].success_rate, scores[name].return_))
-    return f"damian fly checkpoint={shlex.quote(str(folder))} policy={best}"
-
-
 def begin(config: TrainConfig, state: TrainingState) -> None:
     """Load what the run continues or starts from, and write the first checkpoint and then the settings."""
     if config.resume:
         state.load()
-        made = state.progress
-        should = f"is fewer than the {made.frames} that the run has made"
-        checks.require(
-            made.frames - made.frames / max(made.updates, 1) < config.frames, "frames", config.frames, should
-        )
+        made, updates = state.progress.frames, max(state.progress.updates, 1)
+        problem = f"is fewer than the {made} that the run has made"
+        checks.require(made - made / updates < config.frames, "frames", config.frames, problem)
     elif config.checkpoint:
         trained = stored_values(run_folder(Path(config.checkpoint)), "checkpoint")["learner"]["name"]
         names = ["actor", "critic"] if trained == config.learner.name else ["actor"]
@@ -177,20 +170,18 @@ def failure(state: TrainingState, problem: str) -> RunError:
 
 
 def progress_bar(config: TrainConfig, state: TrainingState) -> tqdm:
-    """A progress bar that counts episodes if ``config.episodes`` limits the run, else environment steps."""
-    if config.episodes:
-        return tqdm(total=config.episodes, initial=state.episodes.finished, unit=" episodes")
-    return tqdm(total=config.frames, initial=state.progress.frames, unit=" steps", unit_scale=True)
+    """A progress bar that shows how far the training has come."""
+    unit, total = (" episodes", config.episodes) if config.episodes else (" steps", config.frames)
+    return tqdm(total=total, initial=counted(config, state), unit=unit, unit_scale=not config.episodes)
 
 
-def show(bar: tqdm, config: TrainConfig, state: TrainingState) -> None:
-    """Show how far the training has come."""
-    bar.set_postfix({name: f"{mean:.2f}" for name, mean in state.episodes.means().items()})
-    bar.update((state.episodes.finished if config.episodes else state.progress.frames) - bar.n)
+def counted(config: TrainConfig, state: TrainingState) -> int:
+    """How far the training has come: in episodes if they limit the run, else in environment steps."""
+    return state.episodes.finished if config.episodes else state.progress.frames
 
 
 def enough(config: TrainConfig, state: TrainingState) -> bool:
-    """Has the run reached ``config.frames`` or ``config.episodes``?"""
+    """Whether the run has reached ``config.frames`` or ``config.episodes``."""
     return state.progress.frames >= config.frames or state.episodes.finished >= (config.episodes or torch.inf)
 
 

@@ -247,8 +247,7 @@ def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, Server
         return torch.tensor([[read(uav) for uav in uavs] for _, uavs in worlds], dtype=dtype)
 
     place = column(lambda uav: uav.place)
-    messages = Messages(
-        time=torch.zeros(place.shape[:-1]),
+    messages = Messages.blank(torch.zeros(*place.shape[:-1], 2, dtype=torch.long))._replace(
         position=place,
         target=place,
         track=column(lambda uav: uav.track),
@@ -258,12 +257,6 @@ def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, Server
         motions=column(lambda uav: uav.motions, torch.long),
         detected_time=column(lambda uav: [-1.0 if uav.heard_at is None else uav.heard_at]),
         detected_position=column(lambda uav: [uav.heard_from]),
-        requests=place.new_zeros(*place.shape[:-1], 0, 3),
-        served=place.new_zeros(*place.shape[:-1], 0),
-        serves=place.new_zeros(*place.shape[:-1], 0),
-        trail=torch.zeros(*place.shape[:-1], 2, dtype=torch.long),
-        landed=torch.zeros(*place.shape[:-1], 2),
-        readings=torch.zeros(*place.shape[:-1], 0),
     )
     server = ServerContext(
         now=torch.tensor([now for now, _ in worlds]),

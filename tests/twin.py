@@ -37,20 +37,14 @@ class Uav:
 
 
 def features(
-    uavs: Sequence[Uav],
-    now: float,
-    scale: float,
-    time_scale: float,
-    resolution: float = 5.0,
-    newest: bool = False,
+    uavs: Sequence[Uav], now: float, scale: float, time_scale: float, resolution: float = 5.0
 ) -> dict[str, list]:
     """The features of the paper's Table 2 except the coverage: a list with one value for each UAV."""
     heard = [uav for uav in uavs if uav.heard_at is not None]
     source = None
     if heard:
         last = max(uav.heard_at for uav in heard)
-        used = [uav for uav in heard if uav.heard_at == last or not newest]
-        source = tuple(sum(uav.heard_from[axis] for uav in used) / len(used) for axis in (0, 1))
+        source = tuple(sum(uav.heard_from[axis] for uav in heard) / len(heard) for axis in (0, 1))
     table: dict[str, list] = {}
     for uav in uavs:
         others = [other for other in uavs if other is not uav]
@@ -182,7 +176,6 @@ class World:
     task: RewardConfig
     episode: EpisodeConfig
     uavs: list[Uav]
-    newest: bool = False
     steps: int = 0
     ended: tuple[bool, bool, bool] = field(default=(False, False, False))
 
@@ -213,7 +206,7 @@ class World:
 
     def observe(self) -> dict[str, list]:
         """The features of all UAVs now."""
-        return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale, newest=self.newest)
+        return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale)
 
     def _preferences(self, uav: Uav, move: tuple[float, float]) -> list[int]:
         """Landing points, nearest the target first; only the UAV's own point if the target is outside."""

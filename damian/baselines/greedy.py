@@ -67,9 +67,8 @@ class Greedy:
     """Function from messages to actions, for the regions, the source and the UAVs of an environment."""
 
     def __init__(self, worlds: UavEnv) -> None:
-        scenario, simulation = worlds.scenario, worlds.simulation
+        scenario, simulation, server = worlds.scenario, worlds.simulation, worlds.server
         source = scenario.source
-        server = worlds.server
         self.unpack, self.region_of, self.counted = server.messages, server.region_of, server.counted
         self.grid = server.grid
         self.radius, self.dt = simulation.radius, scenario.clock.dt

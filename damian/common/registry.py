@@ -63,8 +63,7 @@ class Registry(Generic[T]):
 
     def __init__(self, kind: str, fits: type | Callable[[Any], bool], problem: str) -> None:
         self.kind, self._fits, self._problem = kind, fits, problem
-        self._components: dict[str, T] = {}
-        self._imported: dict[str, T] = {}  # a compiled step looks a component up, but cannot import it
+        self._components: dict[str, T] = {}  # also imported ones: a compiled step cannot import anything
 
     def register(self, name: str) -> Callable[[Component], Component]:
         """Decorator that adds a component under a name."""
@@ -79,15 +78,12 @@ class Registry(Generic[T]):
 
     def get(self, name: Any, key: str) -> T:
         """The component with this name or path; errors name the setting ``key``."""
-        if isinstance(name, str) and name in self._components:
-            return self._components[name]
-        if isinstance(name, str) and name in self._imported:
-            return self._imported[name]
-        if not isinstance(name, str) or ":" not in name:
+        if isinstance(name, str) and ":" not in name and name not in self:
             load_plugins()
-            if name in self:
-                return self._components[name]
-            known = f"one of {', '.join(self._components)}, nor " if self._components else ""
+        if name in self:
+            return self._components[name]
+        if not isinstance(name, str) or ":" not in name:
+            known = f"one of {', '.join(self)}, nor " if [*self] else ""
             raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
         door = _door.get()
         if door and not door.trust and name not in door.named:
@@ -97,7 +93,7 @@ class Registry(Generic[T]):
         fits = self._fits
         good = isinstance(component, fits) if isinstance(fits, type) else fits(component)
         checks.require(good, key, name, self._problem)
-        self._imported[name] = component
+        self._components[name] = component
         IMPORTED.add(name)
         return component
 
@@ -111,7 +107,7 @@ class Registry(Generic[T]):
 
     def __iter__(self) -> Iterator[str]:
         """Registered names, in order of registration."""
-        return iter(self._components)
+        return (name for name in self._components if ":" not in name)
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and name in self._components

@@ -5,7 +5,6 @@ import difflib
 import io
 import os
 import reprlib
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.resources import files
@@ -14,8 +13,6 @@ from typing import Any, NamedTuple
 
 from damian.common.errors import InputError
 
-MAX_COLUMNS = 1000
-"""Most columns of a table."""
 MAX_LINE = 1000
 """Characters of an error; the middle of a longer one is left out."""
 
@@ -50,22 +47,19 @@ class Row(NamedTuple):
 
 def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
     """Parse a CSV table with a header, which must have these columns; empty rows are left out."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        header = [name.strip() for name in reader.fieldnames or ()]
+        lines = [(reader.line_num, [*row.values()]) for row in reader]
     except csv.Error as error:
         raise InputError(f"line {reader.line_num}: {error}; give comma-separated values") from None
-    (first, header), *lines = [row for row in lines if any(row[1])] or [(1, [])]
-    if len(header) > MAX_COLUMNS:
-        raise InputError(f"line {first}: {len(header)} columns are more than {MAX_COLUMNS}")
     if missing := [column for column in columns if column not in header]:
-        raise InputError(f"line {first}: no column {', '.join(missing)}; {near(missing[0], header)}")
-    if doubled := [column for column, times in Counter(header).items() if column and times > 1]:
-        raise InputError(f"line {first}: the column {show(doubled[0])} appears twice")
+        raise InputError(f"line 1: no column {', '.join(missing)}; {near(missing[0], header)}")
     for number, cells in lines:
-        if len(cells) != len(header):
-            raise InputError(f"line {number}: {len(cells)} values for {len(header)} columns")
-    return [Row(number, dict(zip(header, cells, strict=True))) for number, cells in lines]
+        if len(cells) != len(header) or None in cells:
+            raise InputError(f"line {number}: it has not {len(header)} values, one for each column")
+    rows = [(number, [cell.strip() for cell in cells]) for number, cells in lines]
+    return [Row(number, dict(zip(header, cells, strict=True))) for number, cells in rows if any(cells)]
 
 
 @contextmanager

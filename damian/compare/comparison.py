@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import trim_mean
 
 from damian.compare.config import LESS_IS_BETTER, Arm
 from damian.compare.statistics import (
@@ -29,24 +28,22 @@ HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed arm."""
-MEASURED = {
-    "return": "return",
-    "success_rate": "success",
-    "steps": "steps",
-    "perceived_return": "perceived return",
-    "perceived_success_rate": "perceived success",
-    "perceived_steps": "perceived steps",
-    "age": "age",
-    "late": "late",
-    "lost": "lost",
-    "backupdated": "back-updated",
-}
-"""Means over seeds, by measure, and their headings in Markdown: most are of an ``Evaluation``."""
+MEASURED = (
+    "return",
+    "success_rate",
+    "steps",
+    "perceived_return",
+    "perceived_success_rate",
+    "perceived_steps",
+)
+MEASURED += ("age", "late", "lost", "backupdated")
+"""Measures whose means over seeds are shown: most are of an ``Evaluation``."""
 SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
 """Measures whose intervals end at 0 and at 1."""
-COMPARED = {"J_norm": "J_norm", "recovery": "recovery", "improvement": "P > naive"}
-"""What is found of an arm beside others under the same delay, and its headings (``normalised``, ``recovery``,
-``probability_of_improvement``), the naive arm being the strongest one of the same track."""
+COMPARED = ("J_norm", "recovery", "improvement")
+"""What is found of an arm beside others under the same delay (``normalised``, ``recovery``,
+``probability_of_improvement``), the naive arm being the strongest one of the same track: arms that learn from
+late data only (R0), or those that had a simulator."""
 RUN = ["task", "delay", "arm", "seed"]
 """Columns of results that name a run."""
 ENDS = ("", "_low", "_high")
@@ -59,18 +56,11 @@ COLUMNS += [name + end for name in (*MEASURED, *COMPARED) for end in ENDS]
 def regime(arms: Mapping[str, Arm], name: str) -> str:
     """The regime of an arm: its own, or R3 without delay, R2 if it needs a policy without, or else R0."""
     arm = arms[name]
-    if arm.regime:
-        return arm.regime
-    if not arm.delayed:
-        return "R3"
+    if arm.regime or not arm.delayed:
+        return arm.regime or "R3"
     if arm.source is None:
         return "R0"
     return "R2" if not arms[arm.source].delayed else regime(arms, arm.source)
-
-
-def track(arms: Mapping[str, Arm], name: str) -> str:
-    """The track of an arm; no recovery mixes arms that learn from late data and arms that had a simulator."""
-    return "late data only" if regime(arms, name) == "R0" else "simulator allowed"
 
 
 def shown(line: Mapping[Any, Any], name: str) -> str:
@@ -85,21 +75,28 @@ def shown(line: Mapping[Any, Any], name: str) -> str:
 def _estimates(
     names: Sequence[str], statistic: Callable[[Floats], Floats], scores: Floats
 ) -> dict[str, float]:
-    """Columns (``ENDS``) of a statistic from ``scores`` [strata, ..., seeds] to a number for each name."""
+    """Columns (``ENDS``) of a statistic from ``scores`` [arms, seeds] to a number for each name."""
     triples = zip(names, *(np.ravel(x).tolist() for x in bootstrap(statistic, scores)), strict=True)
     return {name + end: x for name, *triple in triples for end, x in zip(ENDS, triple, strict=True)}
 
 
 def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
     """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for each seed."""
-    found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1)[..., 0, :], _scores(runs))
+    found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1), _scores(runs))
     shares = [name + end for name in SHARES for end in ENDS if name in runs]
     return found | {name: float(np.clip(found[name], 0, 1)) for name in shares}
 
 
+def improvement(scores: Floats, others: Floats) -> dict[str, float]:
+    """Columns (``ENDS``) of the probability that a run beats another, from scores by seed, [seeds] each."""
+    probability = float(probability_of_improvement(scores, others))
+    ends = (probability, *improvement_interval(probability, len(scores)))
+    return {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
+
+
 def _scores(runs: pd.DataFrame) -> Floats:
-    """Columns of a table with a row for each seed, as one stratum [1, columns, seeds]."""
-    return np.ascontiguousarray(runs.to_numpy(dtype=float).T)[None]
+    """Columns of a table with a row for each seed, [columns, seeds]."""
+    return np.ascontiguousarray(runs.to_numpy(dtype=float).T)
 
 
 @dataclass(frozen=True)
@@ -188,7 +185,8 @@ class Comparison:
     def _compared(self, scores: pd.DataFrame, arm: str) -> dict[str, Any]:
         """``COMPARED`` of a delayed arm, over the seeds that it and all it is compared with have finished."""
         undelayed, random, *delayed = scores.columns
-        others = [name for name in delayed if track(self.arms, name) == track(self.arms, arm)]
+        tracks = {name: regime(self.arms, name) == "R0" for name in (*delayed, arm)}
+        others = [name for name in delayed if tracks[name] == tracks[arm]]
         naive = [name for name in others if self.arms[name].naive]
         paired = scores[[undelayed, random, *(name for name in naive if name != arm), arm]].dropna()
         if paired.empty:
@@ -196,44 +194,14 @@ class Comparison:
         array = _scores(paired)
         found = {"compared_seeds": len(paired), **_estimates(["J_norm"], _norms, array)}
         if naive and arm not in naive:
-            _, _, *of_naive, own = array[0]
-            probability = float(probability_of_improvement(own, max(of_naive, key=np.mean)))
-            ends = (probability, *improvement_interval(probability, len(paired)))
-            found |= {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
-            if not np.isnan(recovery(array[0])):
-                found |= _estimates(["recovery"], lambda drawn: recovery(drawn[..., 0, :, :], 0.0), array)
-        return found
-
-    def overall(self) -> dict[str, dict[str, float]]:
-        """Number of ``seeds`` and interquartile mean of ``J_norm`` by delayed arm, over all tasks and delays.
-
-        Held-out tasks do not count, nor do arms and delays that a task lacks, or seeds that are not finished
-        everywhere; there must be two combinations of task and delay. Seeds are resampled within each task,
-        because its delays share the undelayed arm. As many values are left out at each end as in rliable.
-        """
-        by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT_MARK not in task}
-        delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
-        cells = [self.scores(task, delay) for task in by_task for delay in delays]
-        if len(cells) < 2:
-            return {}
-        found, (undelayed, random, *arms) = {}, cells[0].columns
-        for arm in [arm for arm in arms if all(arm in cell for cell in cells)]:
-            runs = pd.concat([cell[[undelayed, random, arm]] for cell in cells], axis=1).dropna().sort_index()
-            if len(runs):
-                by_cell = _scores(runs).reshape(len(by_task), len(delays), 3, len(runs))
-                found[arm] = {"seeds": len(runs), **_estimates(["J_norm"], _interquartile_norms, by_cell)}
+            _, _, *of_naive, own = array
+            found |= improvement(own, max(of_naive, key=np.mean))
+            if not np.isnan(recovery(array)):
+                found |= _estimates(["recovery"], lambda drawn: recovery(drawn, 0.0), array)
         return found
 
 
 def _norms(scores: Floats) -> Floats:
-    """J_norm of the last arm's mean score, [*, 1, arms, seeds] to [*]; first come undelayed and random."""
-    means = scores.mean(-1)[..., 0, :]
+    """J_norm of the last arm's mean score, [*, arms, seeds] to [*]; first come undelayed and random."""
+    means = scores.mean(-1)
     return normalised(means[..., -1], means[..., 0], means[..., 1])
-
-
-def _interquartile_norms(scores: Floats) -> Floats:
-    """Interquartile mean of J_norm, [*, tasks, delays, 3, seeds] to [*]: undelayed, random and an arm."""
-    means = scores.mean(-1, keepdims=True)
-    norms = normalised(scores[..., 2, :], means[..., 0, :], means[..., 1, :])
-    norms = norms.reshape(*norms.shape[:-3], -1)
-    return np.where(np.isnan(norms).any(-1), np.nan, trim_mean(norms, 0.25, axis=-1))

@@ -28,12 +28,10 @@ LABELS = {
 """Axis labels of the measures in training: in hindsight, from late data, or as the server perceived them."""
 ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
 """Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
-_LINES, _DOTTED, _MARKERS = ("-", "-.", "--"), (":", (0, (1, 4))), "os^D"
-"""Of arms that train, of those that train nothing, and of points; later ones where two have one colour."""
 _POINTS = 200
 """Number of points of a learning curve."""
-_DELAY, _FLOWN = "delay_", 4
-"""Begin of the name of a held-out delay; least number of them under which a policy flew, to be drawn."""
+_DELAY, _FLOWN = "@delay_", 4
+"""Mark of the tasks of held-out delays; least number of them under which a policy flew, to be drawn."""
 _SPECIALISTS = ", trained at each delay"
 """End of the label of a line of policies that fly under the delay at which they were trained."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
@@ -62,18 +60,13 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
     """Draw J_norm of each arm under each delay, with 95 % intervals, in a panel for each task with any."""
     known = comparison.table.dropna(subset="J_norm")
     arms = [name for name, arm in comparison.arms.items() if arm.delayed]
+    styles = {name: look(comparison.arms, name) | {"linestyle": ""} for name in arms}
 
     def panel(axis: Axes, task: str) -> None:
-        delays = comparison.delays(task)
-        for arm, lines in known[known["task"] == task].groupby("arm", sort=False):
-            shift = 0.7 * ((arms.index(str(arm)) + 0.5) / len(arms) - 0.5)
-            places = [delays.index(delay) + shift for delay in lines["delay"]]
-            style = look(comparison.arms, str(arm)) | {"label": arm, "linestyle": ""}
-            _error_bars(axis, places, lines, "J_norm", **style)
-        axis.set_xticks(range(len(delays)), delays)
+        lines = known[known["task"] == task]
+        _draw_groups(axis, lines, ("delay", "arm", "J_norm"), comparison.delays(task), styles, spread=0.7)
         title = task.replace(HELD_OUT_MARK, ", held-out ")
         axis.set(title=title, xlabel="delay", ylabel="J_norm (dashed: undelayed 1, random 0)")
-        axis.set_xlim(-0.5, max(len(delays), 1) - 0.5)
         for level in (0, 1):
             axis.axhline(level, **_LEVEL)
 
@@ -86,77 +79,89 @@ def plot_matrix(comparison: Comparison, path: Path) -> None:
     Held-out tasks of delays have names that begin with ``delay_``; a policy must have flown under four.
     Dashed, an arm that was trained at several constant delays: at each one, the policies trained there.
     """
-    drawn = {task: found for task in comparison.tasks() if (found := _matrix(comparison, task))}
+    drawn = {task: lines for task in comparison.tasks() if len(lines := _matrix(comparison, task))}
 
     def panel(axis: Axes, task: str) -> None:
-        names = sorted({name for lines in drawn[task].values() for name in lines.index}, key=_delay_order)
-        for number, (label, lines) in enumerate(drawn[task].items()):
-            line = "--" if label.endswith(_SPECIALISTS) else "-"
-            in_order = lines.loc[[name for name in names if name in lines.index]]
-            places = [names.index(name) for name in in_order.index]
-            _error_bars(
-                axis, places, in_order, comparison.score, label=label, linestyle=line, **_style(number)
-            )
-        axis.set_xticks(range(len(names)), names, rotation=90)
+        names = sorted(drawn[task]["flown"].unique(), key=lambda x: (not x.isdecimal(), x.zfill(9)))
+        styles = {label: _style(n) for n, label in enumerate(drawn[task]["label"].unique())}
+        for label, style in styles.items():
+            style["linestyle"] = "--" if label.endswith(_SPECIALISTS) else "-"
+        _draw_groups(axis, drawn[task], ("flown", "label", comparison.score), names, styles)
+        axis.tick_params(axis="x", rotation=90)
         axis.set(title=task, xlabel="delay of the flight [steps], or its law", ylabel=comparison.score)
 
     _save(path, [*drawn], panel, (6.4, 3.6))
 
 
-def _matrix(comparison: Comparison, task: str) -> dict[str, pd.DataFrame]:
-    """Lines of the figure of a task by their labels: lines of the table, by the delay of the flight."""
+def _matrix(comparison: Comparison, task: str) -> pd.DataFrame:
+    """Lines of the table with the delay in which they were ``flown``, and a ``label`` for each training."""
     table = comparison.table[comparison.table["policy"] == comparison.policy]
-    held_out = f"{task}{HELD_OUT_MARK}{_DELAY}"
-    away = table[table["task"].str.startswith(held_out)]
-    away = away.set_index(away["task"].str.removeprefix(held_out))
-    drawn = {
-        f"{arm}, trained at {delay}": lines
-        for (delay, arm), lines in away.groupby(["delay", "arm"], sort=False)
-        if len(lines) >= _FLOWN
-    }
-    constant = [name for name in away.index.unique() if name.isdecimal()]
+    away = table[table["task"].str.startswith(f"{task}{_DELAY}")]
+    flown, label = (
+        away["task"].str.removeprefix(f"{task}{_DELAY}"),
+        away["arm"] + ", trained at " + away["delay"],
+    )
+    away = away.assign(flown=flown, label=label)
+    away = away[away.groupby("label")["flown"].transform("size") >= _FLOWN]
+    constant = [name for name in flown.unique() if name.isdecimal()]
     trained = [name for name, arm in comparison.arms.items() if arm.policy_of is None]
     own = table[(table["task"] == task) & table["delay"].isin(constant) & table["arm"].isin(trained)]
-    of_arms = own.set_index("delay", drop=False).groupby("arm", sort=False)
-    special = {f"{arm}{_SPECIALISTS}": lines for arm, lines in of_arms if len(lines) > 1}
-    return drawn | special if drawn else {}
-
-
-def _delay_order(name: str) -> tuple[bool, int, str]:
-    """Constant delays by their number of steps, then laws."""
-    return (False, int(name), "") if name.isdecimal() else (True, 0, name)
+    own = own.assign(flown=own["delay"], label=own["arm"] + _SPECIALISTS)
+    own = own[own.groupby("label")["flown"].transform("size") > 1]
+    return pd.concat([away, own]) if len(away) else away
 
 
 def plot_means(table: pd.DataFrame, name: str, path: Path) -> None:
-    """Draw a column of a table with a line for each group of runs and policy: a row for each group."""
+    """Draw a column of a table of means by groups of runs, for each policy."""
     groups, policies = table["group"].unique().tolist(), table["policy"].unique().tolist()
+    styles = {policy: _style(n) | {"linestyle": ""} for n, policy in enumerate(policies)}
 
     def panel(axis: Axes, _: None) -> None:
-        for place, (policy, lines) in enumerate(table.groupby("policy", sort=False)):
-            shift = 0.5 * ((place + 0.5) / len(policies) - 0.5)
-            rows = [groups.index(group) + shift for group in lines["group"]]
-            value, low, high = (lines[name + end].to_numpy() for end in ENDS)
-            ends = np.nan_to_num([value - low, high - value])
-            axis.errorbar(value, rows, xerr=ends, fmt="o", color=ARM_COLOURS[place], label=policy)
-        axis.set_yticks(range(len(groups)), groups)
-        axis.invert_yaxis()
-        axis.set_xlabel(name)
+        _draw_groups(axis, table, ("group", "policy", name), groups, styles, spread=0.5)
+        axis.tick_params(axis="x", rotation=90)
+        axis.set_ylabel(name)
 
-    _save(path, [None], panel, (5.2, 0.4 * len(groups) + 1.4))
+    _save(path, [None], panel, (0.4 * len(groups) + 1.4, 5.2))
+
+
+def _draw_groups(
+    axis: Axes,
+    lines: pd.DataFrame,
+    columns: tuple[str, str, str],
+    order: Sequence[str],
+    styles: Mapping[str, dict[str, Any]],
+    spread: float = 0.0,
+) -> None:
+    """Draw values with their intervals over places in order, for each group beside the others.
+
+    ``columns`` of the lines have the place, the group and the value; an infinite interval has no bar.
+    """
+    place, group, name = columns
+    for number, (label, style) in enumerate(styles.items()):
+        own = lines[lines[group] == label].set_index(place)
+        own = own.loc[[each for each in order if each in own.index]]
+        shift = spread * ((number + 0.5) / len(styles) - 0.5)
+        value, low, high = (own[name + end].to_numpy() for end in ENDS)
+        places = [order.index(each) + shift for each in own.index]
+        axis.errorbar(places, value, yerr=[value - low, high - value], markersize=4, label=label, **style)
+    axis.set_xticks(range(len(order)), order)
+    axis.set_xlim(-0.5, max(len(order), 1) - 0.5)
 
 
 def look(arms: Mapping[str, Arm], arm: str) -> dict[str, Any]:
     """Style of an arm by its place among all; dotted lines are of arms that train nothing."""
-    style, again = _style([*arms].index(arm)), [*arms].index(arm) // len(ARM_COLOURS)
     trains = arms[arm].policy_of is None and not arms[arm].untrained
-    lines = _LINES if trains else _DOTTED
-    return style | {"linestyle": lines[again % len(lines)]}
+    return _style([*arms].index(arm)) | {"linestyle": "-" if trains else ":"}
 
 
-def _style(number: int) -> dict[str, str]:
-    """Colour, and a marker, which tells from others of this colour."""
+def _style(number: int) -> dict[str, Any]:
+    """Colour, and a marker and a width, which tell from others of this colour."""
     again, colour = divmod(number, len(ARM_COLOURS))
-    return {"color": ARM_COLOURS[colour], "marker": _MARKERS[again % len(_MARKERS)]}
+    return {
+        "color": ARM_COLOURS[colour],
+        "marker": "os^D"[again % 4],
+        "linewidth": (1.2, 2.0, 0.6)[again % 3],
+    }
 
 
 def _save(
@@ -198,8 +203,8 @@ def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, st
         style: dict[str, Any] = look(comparison.arms, name) | {"marker": "", "label": name}
         if run in comparison.curves:
             place, values = curve(comparison.curves[run], measure)
-            mean, low, high = bootstrap(lambda v: v.mean(-1)[..., 0, :], values[None], draws=500)
-            axis.plot(place, mean, linewidth=1.2, **style)
+            mean, low, high = bootstrap(lambda drawn: drawn.mean(-1), values, draws=500)
+            axis.plot(place, mean, **style)
             axis.fill_between(place, low, high, color=style["color"], alpha=0.2, linewidth=0)
         elif (level := table.get((*run, comparison.policy_of(name)))) is not None:
             axis.axhline(level, **style)
@@ -219,9 +224,3 @@ def curve(runs: Sequence[pd.DataFrame], name: str) -> tuple[Floats, Floats]:
         return np.full(_POINTS, np.nan), np.full((_POINTS, 1), np.nan)
     place = np.linspace(first, last, _POINTS)
     return place, np.stack([np.interp(place, run[:, 0], run[:, 1]) for run in points], -1)
-
-
-def _error_bars(axis: Axes, places: Sequence[float], lines: pd.DataFrame, name: str, **style: Any) -> None:
-    """Draw a column of a comparison's table at these places; an infinite interval has no bar."""
-    value, low, high = (lines[name + end].to_numpy() for end in ENDS)
-    axis.errorbar(places, value, yerr=[value - low, high - value], markersize=4, **style)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import pandas as pd
 
 from damian.common.tables import markdown_table
-from damian.compare.comparison import means_over_seeds, shown
+from damian.compare.comparison import improvement, means_over_seeds, shown
 from damian.compare.config import LESS_IS_BETTER
-from damian.compare.statistics import FEWEST, improvement_interval, probability_of_improvement
+from damian.compare.statistics import FEWEST
 
 MEASURES = ["return", "success_rate", "steps", "perceived_return", "age"]
 """Measures of the table of a sweep; success and steps only where some run succeeds."""
@@ -44,10 +44,8 @@ def difference(runs: pd.DataFrame, others: pd.DataFrame, score: str) -> dict[str
         return {}
     new, old = pairs[f"{score}_x"], pairs[f"{score}_y"]
     sign = -1 if score in LESS_IS_BETTER else 1
-    better = float(probability_of_improvement(sign * new.to_numpy(), sign * old.to_numpy()))
-    low, high = improvement_interval(better, len(pairs))
     found = means_over_seeds(pd.DataFrame({"difference": new - old}))
-    return found | {"improvement": better, "improvement_low": low, "improvement_high": high}
+    return found | improvement(sign * new.to_numpy(), sign * old.to_numpy())
 
 
 def as_table(lines: pd.DataFrame, groups: Sequence[str], score: str = "return") -> str:

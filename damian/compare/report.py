@@ -26,26 +26,15 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
     hours = f"{len(runs)} runs, which took {runs['seconds'].sum() / 3600:.2f} hours"
     parts = ["\n".join(f"- {note}" for note in (*notes, hours))]
     for task in comparison.tasks():
-        frames = runs.loc[(runs["task"] == task) & (runs["frames"] > 0), "frames"].astype(int)
-        steps = (
-            " to ".join(f"{x:,}" for x in dict.fromkeys((frames.min(), frames.max())))
-            if len(frames)
-            else "no"
-        )
-        trained = (
-            "Policies of another task."
-            if HELD_OUT_MARK in task
-            else f"Trained for {steps} environment steps."
-        )
+        frames = runs.loc[runs["task"] == task, "frames"].max()
+        trained = f"Trained for {frames:,.0f} environment steps at most."
+        if HELD_OUT_MARK in task:
+            trained = "Policies of another task."
         for delay in comparison.delays(task) or [NOT_LATE]:
             lines = table[(table["task"] == task) & table["delay"].isin([NOT_LATE, delay])]
             parts += [f"## {task}, delay {delay}", trained, _table(lines)]
             if delay != NOT_LATE:
                 parts += _steps(comparison, task, delay)
-    overall = [(arm, found["seeds"], shown(found, "J_norm")) for arm, found in comparison.overall().items()]
-    if overall:
-        head = ("method", "n", "interquartile mean of J_norm")
-        parts += ["## All tasks and delays", markdown_table(head, overall)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -56,7 +45,8 @@ def _table(lines: pd.DataFrame) -> str:
         labels = (line["arm"] + undelayed, line["regime"], line["policy"], line["seeds"])
         measured, compared = ([shown(line, name) for name in names] for names in (MEASURED, COMPARED))
         rows.append([*labels, *measured, line["compared_seeds"] or "-", *compared])
-    head = ["method", "regime", "policy", "n", *MEASURED.values(), "n compared", *COMPARED.values()]
+    measured = [name.replace("_", " ") for name in MEASURED]
+    head = ["method", "regime", "policy", "n", *measured, "n compared", *COMPARED[:-1], "P > naive"]
     return markdown_table(head, rows, left=3)
 
 

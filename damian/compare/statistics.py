@@ -1,7 +1,4 @@
-"""Statistics of runs, vectorised over leading dimensions ``*``; higher scores are better.
-
-Source of the stratified bootstrap: Agarwal et al. 2021, arXiv 2108.13264.
-"""
+"""Statistics of runs, vectorised over leading dimensions ``*``; higher scores are better."""
 
 import math
 from collections.abc import Callable
@@ -47,14 +44,10 @@ def recovery(scores: Floats, least: float = LEAST_GAP) -> Floats:
 
 
 def resampled(scores: Floats, draws: int) -> Floats:
-    """Draw seeds with replacement for each stratum, a task with all its arms, which get the same draws.
-
-    Scores are [strata, *, seeds], and the result is [draws, strata, *, seeds].
-    """
-    strata, n_seeds = scores.shape[0], scores.shape[-1]
-    drawn = np.random.default_rng(0).integers(n_seeds, size=(draws, strata, n_seeds))
-    between = (1,) * (scores.ndim - 2)
-    return np.take_along_axis(scores[None], drawn.reshape(draws, strata, *between, n_seeds), -1)
+    """Draw seeds with replacement, the same for all arms, [*, arms, seeds] to [draws, *, arms, seeds]."""
+    n_seeds = scores.shape[-1]
+    drawn = np.random.default_rng(0).integers(n_seeds, size=(draws, n_seeds))
+    return np.moveaxis(scores[..., drawn], -2, 0)
 
 
 def interval(values: Floats) -> tuple[Floats, Floats]:
@@ -97,7 +90,7 @@ def improvement_interval(probability: float, n_seeds: int) -> tuple[float, float
 def bootstrap(
     statistic: Callable[[Floats], Floats], scores: Floats, draws: int = 2000
 ) -> tuple[Floats, Floats, Floats]:
-    """A statistic over seeds, and the low and high ends of its stratified bootstrap interval.
+    """A statistic over seeds, and the low and high ends of its bootstrap interval.
 
     For the mean of few seeds, the interval of the resampled statistics (``interval``) is too narrow: of those
     for 95 %, only 83 % contain the truth with 5 seeds, and 88 % with 10. So both ends are moved away from the
@@ -105,15 +98,13 @@ def bootstrap(
     correction for bias. With fewer than ``FEWEST`` seeds both ends are nan.
 
     Args:
-        statistic: function from scores [*, strata, ..., seeds] to [*, ...], for any leading dimensions *.
-        scores: scores by seed, [strata, ..., seeds].
+        statistic: function from scores [*, arms, seeds] to [*, ...], for any leading dimensions *.
+        scores: scores by seed, [arms, seeds].
         draws: number of resamples.
     """
-    value = np.asarray(statistic(scores), dtype=float)
-    strata, n_seeds = scores.shape[0], scores.shape[-1]
+    value, n_seeds = np.asarray(statistic(scores), dtype=float), scores.shape[-1]
     if n_seeds < FEWEST:
         return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
-    student = stdtrit(strata * (n_seeds - 1), (1 + LEVEL) / 2)
-    factor = math.sqrt(n_seeds / (n_seeds - 1)) * student / NORMAL
+    factor = math.sqrt(n_seeds / (n_seeds - 1)) * stdtrit(n_seeds - 1, (1 + LEVEL) / 2) / NORMAL
     low, high = interval(statistic(resampled(scores, draws)))
     return value, value - factor * (value - low), value + factor * (high - value)

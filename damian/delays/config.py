@@ -63,31 +63,14 @@ class LinkConfig(Settings):
     )
     loss: Any = setting(0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix"))
     range: float | None = setting(
-        None,
-        "A UAV hears only UAVs within this distance when they send.",
-        unit="m",
-        above=0,
-        kinds=("matrix",),
+        None, "A UAV hears only UAVs within this distance.", unit="m", above=0, kinds=("matrix",)
     )
-    hears: Any = setting(None, "Whom UAVs hear: per receiver a list of true and false.", kinds=("matrix",))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse_unread()
         if self.kind == "updown" or not is_matrix(self.loss):
             checks.in_range("links.loss", self.loss, 0.0, 1.0)
-        both = self.range is not None and self.hears is not None
-        self.refuse(both, "range", "does not go with links.hears: leave out one of them")
-
-    def check_pairs(self, n_agents: int) -> None:
-        """Check the shape of what is given for each pair of UAVs."""
-        for name in ("delay", "loss", "hears"):
-            rows = getattr(self, name)
-            if is_matrix(rows) or (name == "hears" and rows is not None):
-                lists = [rows, *rows] if is_matrix(rows) else [rows]
-                square = all(is_matrix(each) and len(each) == n_agents for each in lists)
-                problem = f"is not {n_agents} lists (receivers) of {n_agents} entries (senders)"
-                self.refuse(not square, name, problem)
 
 
 def is_matrix(written: Any) -> bool:

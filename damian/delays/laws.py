@@ -1,9 +1,10 @@
 """Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"133ms"``)."""
 
 import copy
+import itertools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from numbers import Real
@@ -33,6 +34,8 @@ Delay = int | str
 """Whole steps (``3``), or a time with its unit (``"3s"``)."""
 
 LOSES = "loses messages, but no reward may be lost"
+LONGEST_OF_FUNCTION = 20
+"""Delay to which those of a function are cut [steps]; a ``ContextSampler`` may have another one."""
 
 LOST = "lost"
 """Entry of a trace for a message that never arrives."""
@@ -52,14 +55,25 @@ class Law(ABC):
 
 
 def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-    """Build the sampler of a law, or of what ``law_of`` takes; the arguments are those of ``Law.sampler``.
+    """Build the sampler of a law, a range, a function, or of what ``law_of`` takes.
 
-    A sampler is copied: transforms share none, because each may move to a device of its own.
+    The arguments are those of ``Law.sampler``. A range of steps (``1..7``) or of times, each rounded up to
+    whole steps (``3s..7s``), is uniform over these steps. A function is that of a ``ContextSampler`` that
+    loses nothing. A sampler is copied: transforms share none, because each may move to a device of its own.
     """
     checks.above("dt", dt, 0.0, "s")
     if isinstance(written, Sampler):
         checks.require(loss == 0, "loss", loss, "does not go with a sampler, which has the losses of its own")
         return copy.deepcopy(written)
+    if callable(written) and not isinstance(written, type):
+        return ContextSampler(cast(Any, written), LONGEST_OF_FUNCTION, loss, loses=False)
+    if isinstance(written, str) and ".." in written:
+        ends = [_number(each) for each in written.split("..", 1)]
+        low, high = (in_steps(key, each, dt, _NO_DELAY) for each in ends)
+        alike = isinstance(ends[0], str) == isinstance(ends[1], str)
+        problem = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order"
+        checks.require(alike and low <= high, key, written, problem)
+        written = Uniform(low, high)
     law = law_of(written, key)
     for name, rule in rules(type(law)).items():
         value = getattr(law, name)
@@ -109,11 +123,7 @@ LAWS = Registry[type[Law]](
 @LAWS.register("constant")
 @dataclass(frozen=True)
 class Constant(Law):
-    """Every message has the same delay.
-
-    A worked timeline of ``Constant(3)``: a message sent at t = 0 arrives at t = 3, one sent at t = 1 at
-    t = 4.
-    """
+    """Every message has the same delay."""
 
     delay: Delay = 0
     """Delay: steps, or a time."""
@@ -129,9 +139,6 @@ class Uniform(Law):
 
     Delays in steps are equally likely whole numbers, both ends included. Delays in time are continuous and
     rounded up to whole steps, so that 3 to 7 s are 4, 5, 6 or 7 steps of 1 s.
-
-    A worked timeline of ``Uniform(1, 3)``: a message sent at t = 0 arrives at t = 1, 2 or 3. If it draws 3
-    and the next message draws 1, that one arrives at t = 2 and overtakes it.
     """
 
     low: Delay = 0
@@ -156,29 +163,10 @@ class Uniform(Law):
         return TableSampler([[weighted[0] + 1 - self.probability, *weighted[1:]]], loss=loss)
 
 
-@dataclass(frozen=True)
-class Range(Uniform):
-    """Whole steps from ``low`` to ``high``, equally likely; ``law_of`` makes one of ``1..7`` or ``3s..7s``.
-
-    A worked timeline of ``Range(1, 2)``: a message sent at t = 0 arrives at t = 1 or at t = 2.
-    """
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        alike = isinstance(self.low, str) == isinstance(self.high, str)
-        low, high = in_steps(key, self.low, dt, _NO_DELAY), in_steps(key, self.high, dt, _NO_DELAY)
-        problem = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order"
-        checks.require(alike and low <= high, key, f"{self.low}..{self.high}", problem)
-        return Uniform(low, high).sampler(dt, loss, key)
-
-
 @LAWS.register("geometric")
 @dataclass(frozen=True)
 class Geometric(Law):
-    """A message arrives in each step with the same probability, as if it were retransmitted until received.
-
-    A worked timeline of ``Geometric(mean=1)``: half of the messages sent at t = 0 arrive at t = 0, a quarter
-    at t = 1, an eighth at t = 2, and a sixteenth at t = 3.
-    """
+    """A message arrives in each step with the same probability, as if retransmitted until received."""
 
     mean: Delay = 1
     """Mean delay before the cut at ``longest``: steps, which may be a fraction, or a time."""
@@ -229,11 +217,7 @@ class Burst(Law):
 @LAWS.register("trace")
 @dataclass(frozen=True)
 class Trace(Law):
-    """Recorded delays of a file, one per step in its order; each sender starts at a random row.
-
-    A worked timeline of a file with the rows 3, 0 and lost: a sender that starts at its first row sends at
-    t = 0 what arrives at t = 3, at t = 1 what arrives at t = 1, and at t = 2 what never arrives.
-    """
+    """Recorded delays of a file, one per step in its order; each sender starts at a random row."""
 
     path: str = ""
     """CSV table with a column ``delay``: steps, times with their unit, or ``lost``. That of the package is
@@ -295,9 +279,6 @@ class Distance(Law):
     normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002, section 4.9).
 
     The law reads the sender's ``position``, and ``receiver_position`` where it is given, [m], [M, 2].
-
-    A worked timeline of ``Distance(base=1, speed=10)`` and steps of 1 s: a message sent at t = 0 from a place
-    20 m away arrives at t = 3; one sent at t = 1 from the place of the receiver arrives at t = 2.
     """
 
     base: Delay = 0
@@ -335,30 +316,8 @@ class Distance(Law):
         return torch.where(context.uniform < loss, -1.0, steps)
 
 
-@dataclass(frozen=True)
-class Function(Law):
-    """Delays that a function computes from the contexts of M messages; ``law_of`` makes one of a function.
-
-    A worked timeline of ``Function(lambda message: 5 * message.uniform)``: a message sent at t = 0 whose
-    random number is 0.42 has a delay of 2.1 steps, which is rounded up: it arrives at t = 3.
-    """
-
-    function: Callable[[MessageContext], Tensor]
-    """Pure function of a ``MessageContext``, without branches on data: the delays [steps], [M]."""
-    longest: Delay = 20
-    """Longest delay, to which longer ones are cut: steps, or a time."""
-    reads: Sequence[str] = ()
-    """Names of the entries of the context that the function reads, such as ``position``."""
-    loses: bool = False
-    """Whether a message of negative delay is lost; else it has no delay."""
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        longest = in_steps(f"{key}.longest", self.longest, dt)
-        return ContextSampler(self.function, longest, loss, loses=self.loses, reads=self.reads)
-
-
 def law_of(written: Any, key: str = "delay") -> Law:
-    """Convert a setting to a law: a law, steps, a time, a mapping, or a function of a ``MessageContext``.
+    """Convert a setting to a law: a law, steps, a time, or a mapping.
 
     ``{law: uniform, low: 3s, high: 7s}`` names a registered law and its settings; ``{law:
     my_lab.delays:Satellite, mean: 2s}`` a frozen dataclass derived from ``Law`` in a module that can be
@@ -366,12 +325,8 @@ def law_of(written: Any, key: str = "delay") -> Law:
     """
     if isinstance(written, Law):
         return written
-    if callable(written) and not isinstance(written, type):
-        return Function(cast(Any, written))
     if isinstance(written, str) and (written in LAWS or ":" in written):
         raise InputError(f"{key}: {written} is not a delay; that law is written {{law: {written}}}")
-    if isinstance(written, str) and ".." in written:
-        return Range(*map(_number, written.split("..", 1)))
     if not isinstance(written, Mapping):
         return Constant(_number(written))
     kind = written.get("law")
@@ -417,13 +372,13 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     n = same_size({key: delay, loss_key: loss})
     if n is None or isinstance(delay, Sampler):
         return sampler_of(delay, dt, loss, key)
-    by_link = is_matrix(delay)
-    distinct: list[Law] = []
+    distinct: list[Any] = []
     samplers: list[Sampler] = []
     index = []
-    for i, j in ((i, j) for i in range(n) for j in range(n)):
-        name = f"{key}[{i}][{j}]" if by_link else key
-        law = law_of((0 if i == j else delay[i][j]) if by_link else delay, name)
+    for i, j in itertools.product(range(n), range(n)):
+        law, name = delay, key
+        if is_matrix(delay):
+            law, name = 0 if i == j else delay[i][j], f"{key}[{i}][{j}]"
         if law not in distinct:
             distinct.append(law)
             samplers.append(sampler_of(law, dt, key=name))

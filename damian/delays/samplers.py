@@ -97,9 +97,6 @@ class Sampler(nn.Module, ABC):
 class TableSampler(Sampler):
     """Draws delays from a table of probabilities.
 
-    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` a message sent at t = 0 arrives at t = 0 or, as
-    likely, at t = 3, whatever the delays of the others.
-
     Args:
         states: for each of S states of a sender, the probabilities of the delays 0, 1, ... [steps]; if they
             sum to less than 1, the rest is the probability that the message is lost.
@@ -253,9 +250,6 @@ _NEVER = 2**40
 
 class ContextSampler(Sampler):
     """Computes each delay from the context of the message, by a function.
-
-    A worked timeline: the function returns 2.4 for a message sent at t = 0, which is rounded up to 3 steps:
-    the message arrives at t = 3. For a message sent at t = 1 it returns -1: the message never arrives.
 
     Args:
         delay_fn: pure function of a ``MessageContext``, without branches on data, that returns the delays

@@ -81,7 +81,6 @@ class ScenarioConfig(WorldConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.links.check_pairs(self.agents)
         links, observation, episode = self.links.kind, self.observation, self.episode
         problem = "does not go with clock.server: between two broadcasts no observation changes"
         self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)

@@ -52,58 +52,55 @@ class Drop(WorldTransform):
         return observation_spec
 
 
-class _Node(WorldTransform):
-    """Base class of nodes that count the steps of an episode."""
-
-    stage = "server"
-    created_keys = ()  # type: ignore[assignment]  # a node writes again what the environment has written
-
-    def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        device = tensordict.get(self.in_keys[0]).device
-        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}
-
-    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        return memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
-
-
-class ServerNode(_Node):
+class ServerNode(WorldTransform):
     """Computes observations, rewards and the task's status from the messages that have arrived.
 
-    It writes the entries that ``UavEnv`` writes itself when no message is delayed; after a reset, the server
-    holds the first message of every UAV. ``damian.make_env`` adds it where a scenario delays or loses
-    messages.
+    It writes the entries that ``UavEnv`` writes itself when no message is delayed; after a reset, the server,
+    and every UAV, holds the first message of every UAV. ``damian.make_env`` adds it where a scenario delays
+    or loses messages, or UAVs hear each other.
 
     Args:
         server: server node that does the computations.
         message_key: key of the packed messages that the server holds, [B, N, M].
+        heard_key: key of the packed messages from which the UAVs compute their own observations, by the same
+            formulas, [B, N, N, M] (receiver, sender); None if they get them from the server.
         reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
     """
 
+    stage = "server"
+    created_keys = ()  # type: ignore[assignment]  # it writes again what the environment has written
+
     def __init__(
-        self, server: Server, message_key: NestedKey = keys.RECEIVED, *, reward_terms: bool = False
+        self,
+        server: Server,
+        message_key: NestedKey = keys.RECEIVED,
+        *,
+        heard_key: NestedKey | None = None,
+        reward_terms: bool = False,
     ) -> None:
         names = server.reward.terms if reward_terms else []
         created = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.REWARD]
         created += [(*keys.REWARD_TERMS, name) for name in names]
         super().__init__([message_key], [*created, keys.SUCCESS, *keys.ENDS])
-        self.server, self.reward_terms = server, reward_terms
+        self.server, self.heard_key, self.reward_terms = server, heard_key, reward_terms
         self.own_key = keys.MESSAGE if server.observation.own else None
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + server.observation.own] if server.grid else []
-        self.step_keys = existing([*self.in_keys, self.own_key, *self.belief_keys, keys.SOURCE_OVER])
+        self.step_keys = [*self.required_keys, keys.SOURCE_OVER]
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
-        return existing([*self.in_keys, self.own_key, *self.belief_keys])
+        return existing([*self.in_keys, self.heard_key, self.own_key, *self.belief_keys])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        memory, rows = super().init_memory(tensordict), tensordict.get(self.in_keys[0])
+        rows = tensordict.get(self.in_keys[0])
+        memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
         if not self.server.remembers_coverage:
             return memory
         trail = self.server.counted(self.server.messages(rows))
         return memory | {"trail": trail, "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory, _ = super().on_reset(memory, entries, mask)
+        memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
         if "coverage" in memory:
             memory["coverage"] = memory["coverage"].masked_fill(expand_mask(mask, memory["coverage"]), -1)
         return memory, {}
@@ -114,7 +111,10 @@ class ServerNode(_Node):
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
         outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, entries.get(keys.BELIEF))
         written = outputs.entries(self.reward_terms)
-        if self.own_key:
+        if self.heard_key:
+            heard = self.server.messages(entries[self.heard_key])
+            written[keys.OBSERVATION] = self.server.observe_each(heard, steps)
+        elif self.own_key:
             written[keys.OBSERVATION] = self.server.observe_with_own_messages(
                 received, entries[self.own_key], steps, belief=entries.get(keys.OWN_BELIEF)
             )
@@ -122,24 +122,6 @@ class ServerNode(_Node):
         if outputs.coverage is not None:
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
         return memory, written
-
-
-class OnboardNode(_Node):
-    """Computes each UAV's observation from ``("agents", "linked")``, by the server's formulas.
-
-    Rewards, the task's status and the critic's observation stay those of the server node. After a reset every
-    UAV knows the first message of every other. ``damian.make_env`` adds the transform with ``links=matrix``.
-    """
-
-    def __init__(self, server: Server) -> None:
-        super().__init__(keys.LINKED, keys.OBSERVATION)
-        self.server, self.step_keys = server, self.in_keys
-
-    def on_step(self, memory: Memory, entries: Entries) -> Change:
-        elapsed = memory["elapsed"] + 1
-        known = self.server.messages(entries[self.in_keys[0]])
-        observation = self.server.observe_each(known, elapsed.view(self.rows))
-        return {"elapsed": elapsed}, {keys.OBSERVATION: observation}
 
 
 class Belief(WorldTransform):
@@ -183,8 +165,8 @@ class Belief(WorldTransform):
         return window._asdict(), self._written(beliefs)
 
     def _written(self, beliefs: Beliefs) -> Entries:
-        own: Entries = {keys.OWN_BELIEF: self.from_rows(beliefs.own)} if self.own else {}
-        return {keys.BELIEF: self.from_rows(beliefs.server), **own}
+        pairs = zip(self.out_keys, beliefs, strict=False)  # the own ones are none if they are not wanted
+        return {key: self.from_rows(belief) for key, belief in pairs}
 
     @property
     def grid(self) -> SourceGrid:

@@ -4,8 +4,8 @@ What a step passes, in this order (a transform is there only if the scenario ask
 
     policy -> action -> ActionDelay -> UavEnv: physics makes messages
     UavEnv -> message -> ObservationDelay -> Belief, ObservationTimeline
+                      -> Channel: what UAVs have sent each other directly
                       -> ServerNode: observations, rewards, ends
-                      -> Channel -> OnboardNode: observations from what other UAVs have sent directly
     reward -> RewardDelay -> CumulativeReward
     observation -> SampleAndHold (server) -> ObservationDelay (broadcast) -> SampleAndHold (agents)
                 -> ActionHistory -> policy
@@ -22,7 +22,7 @@ from damian import keys
 from damian.common import checks
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.nodes import Belief, Drop, OnboardNode, ServerNode
+from damian.envs.nodes import Belief, Drop, ServerNode
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
 from damian.transforms import (
@@ -58,8 +58,7 @@ def make_env(
     """
     extras = checks.names("extras", extras, ALL_EXTRAS)
     remote = has_server_node(scenario)
-    needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
-    needed |= {*["position"] * scenario.delays.reads_positions}
+    needed = {*["message"] * remote, *["position"] * scenario.delays.reads_positions}
     env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
     pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras))
     pipeline.set_seed(seed)
@@ -70,16 +69,15 @@ def make_env(
 
 def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
     """All transforms of a scenario in order: outputs pass them forwards, a policy's actions backwards."""
-    hear_each_other = scenario.links.kind == "matrix"
     transforms = [
         *action_transforms(scenario),
         *(server_transforms(scenario, server, extras) if has_server_node(scenario) else []),
-        *(link_transforms(scenario, server) if hear_each_other else []),
         *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
     ]
-    if hear_each_other or (has_server_node(scenario) and "message" not in extras):
-        transforms.append(Drop([keys.LINKED, *([] if "message" in extras else _REPORTED)]))
+    dropped = [*[keys.LINKED] * (scenario.links.kind == "matrix"), *_REPORTED * ("message" not in extras)]
+    if has_server_node(scenario) and dropped:
+        transforms.append(Drop(dropped))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
@@ -100,8 +98,8 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
 
 
 def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
-    """The message delay (paper, section 3.4), and the server node, which uses the arrived messages."""
-    output_messages, delayed = "message" in extras, scenario.delays.obs.late
+    """The message delay (paper, section 3.4), links, and the server node, which uses arrived messages."""
+    output_messages, delayed, links = "message" in extras, scenario.delays.obs.late, scenario.links
     remembers = server.grid is not None or scenario.delay.messages > 0
     transforms: list[Transform] = []
     if delayed:
@@ -118,8 +116,24 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         transforms.append(uplink)
     longest = scenario.delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
-    held = keys.RECEIVED if delayed else keys.MESSAGE
-    return [*transforms, ServerNode(server, held, reward_terms="reward_terms" in extras)]
+    held, heard = keys.RECEIVED if delayed else keys.MESSAGE, None
+    if links.kind == "matrix":
+        heard, law = keys.LINKED, scenario.delays.links
+        channel = Channel(
+            law,
+            keys.MESSAGE,
+            heard,
+            comm_range=links.range,
+            position_key=keys.POSITION if law.reads or links.range is not None else None,
+            sent_key=keys.MESSAGE_SENT,
+            known_at_reset=True,
+            dt=scenario.clock.dt,
+            age_key=None,
+            mask_key=None,
+        )
+        transforms.append(channel)
+    node = ServerNode(server, held, heard_key=heard, reward_terms="reward_terms" in extras)
+    return [*transforms, node]
 
 
 def remembering_transforms(
@@ -151,25 +165,6 @@ def scaled_messages(server: Server, rows: Tensor) -> Tensor:
     way = messages.target - messages.position
     flags = torch.stack([messages.spotted, messages.battery / 100], -1)
     return torch.cat([messages.position / scale, way / scale, flags], -1)
-
-
-def link_transforms(scenario: ScenarioConfig, server: Server) -> list[Transform]:
-    """The links over which UAVs hear each other, and the nodes that compute observations on board."""
-    links, delays = scenario.links, scenario.delays
-    channel = Channel(
-        delays.links,
-        keys.MESSAGE,
-        keys.LINKED,
-        hears=links.hears,
-        comm_range=links.range,
-        position_key=keys.POSITION if delays.links.reads or links.range is not None else None,
-        sent_key=keys.MESSAGE_SENT,
-        known_at_reset=True,
-        dt=scenario.clock.dt,
-        age_key=None,
-        mask_key=None,
-    )
-    return [channel, OnboardNode(server)]
 
 
 def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
@@ -240,7 +235,7 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
 def has_server_node(scenario: ScenarioConfig) -> bool:
     """Whether a ``ServerNode`` computes observations and rewards, instead of ``UavEnv``."""
     remembers = bool(scenario.observation.belief) or scenario.delay.messages > 0
-    return scenario.delays.obs.late or remembers
+    return scenario.delays.obs.late or remembers or scenario.links.kind == "matrix"
 
 
 def hold_action(actions: ActionConfig) -> int:

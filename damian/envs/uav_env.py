@@ -16,6 +16,7 @@ from damian import keys
 from damian.common import checks, counter_rng, devices
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.config import ScenarioConfig
+from damian.server.belief import certain_belief
 from damian.server.components import checked_features
 from damian.server.features import feature_bounds, nearest_way
 from damian.server.server import Features, Server
@@ -96,7 +97,7 @@ class UavEnv(EnvBase):
         self.action_columns = self.server.action_columns(features)
         """Columns of the actors' observations with a value for each action; None if there are none."""
         self._reset_outputs = self._outputs_at_reset(initial, features)
-        self._make_specs(self._bounds(features))
+        self._make_specs(features)
         self.set_seed(seed)
         self.to(torch.device(device))
 
@@ -236,8 +237,10 @@ class UavEnv(EnvBase):
 
     def _privileged(self, state: State, global_observation: Tensor | None) -> Tensor:
         """Observation of a critic that knows the simulator's true state, [B, N, G + 2]."""
-        if global_observation is None or self.server.grid is not None:
-            features = self.server.privileged_features(state.sent, state.steps, state.source)
+        grid = self.server.grid
+        if global_observation is None or grid is not None:
+            belief = None if grid is None else certain_belief(grid, state.source[:, 0])
+            features = self.server.features(state.sent, state.steps, belief=belief)
             _, global_observation = self.server.observations(features)
         scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
         ways = state.source.unsqueeze(-3) - state.position[..., None, :2]
@@ -270,18 +273,13 @@ class UavEnv(EnvBase):
         root[keys.AGENTS] = make(agents, shape, self.device)
         return make(root, self.batch_size, self.device)
 
-    def _bounds(self, features: Features) -> Bounds:
-        """The bounds that the features declare, and [-1, 1] for the privileged offset to the source."""
+    def _make_specs(self, features: Features) -> None:
+        """Specs with the bounds that the features declare, and [-1, 1] for the offset to the source."""
         low, high = (self.server.observations(limit) for limit in feature_bounds(features))
         actor, critic = ((lowest[0], highest[0]) for lowest, highest in zip(low, high, strict=True))
         privileged = pad(critic[0], [0, 2], value=-1.0), pad(critic[1], [0, 2], value=1.0)
-        return {
-            keys.OBSERVATION: actor,
-            keys.GLOBAL_OBSERVATION: critic,
-            keys.PRIVILEGED_OBSERVATION: privileged,
-        }
-
-    def _make_specs(self, bounds: Bounds) -> None:
+        bounds: Bounds = {keys.OBSERVATION: actor, keys.GLOBAL_OBSERVATION: critic}
+        bounds[keys.PRIVILEGED_OBSERVATION] = privileged
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
         ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in keys.ENDS}
         observations: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}

@@ -8,12 +8,11 @@ import numpy as np
 import pandas as pd
 
 from damian.common.errors import InputError
-from damian.common.plotting import COLOURS
 from damian.common.text_files import named
 from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers, LawFit
 from damian.delays.laws import LOST, in_steps
 from damian.field.journal import SUFFIX, read_journal
-from damian.field.rows import Report, TimedReport, read_file
+from damian.field.rows import Report, read_file
 
 LATEST_MEDIAN = 1800.0
 """Longest median delay of a UAV [s]; a longer one is a clock of another time zone, or one since the start."""
@@ -28,7 +27,7 @@ def read_log(path: Path) -> list[Report]:
         reports = [report for _, line in lines for report in line.reports]
     else:
         with named(path):
-            rows = read_file(path, TimedReport)
+            rows = read_file(path)
             for where, report in rows:
                 said = report.model_fields_set
                 if "time" not in said or not {"received", "aoi"} & said:
@@ -113,20 +112,3 @@ def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
     if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
         text += "\na bad fit: take the trace"
     return text
-
-
-def plot_delays(messages: pd.DataFrame, best: LawFit, own: LawFit, path: Path) -> None:
-    """Draw how often each delay was recorded, and how often the law has it; and the delays of each UAV."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, and a service needs none)
-
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    shares, times = figure.subplots(2)
-    shares.bar(range(len(own.chances)), own.chances, color="0.8")
-    shares.plot(best.chances, "o", color=COLOURS[0], markersize=4)
-    shares.set(xlabel="delay [steps]; the last bar: lost", ylabel="share of messages")
-    shares.set_title(f"recorded (bars), and {best.written}", fontsize=7)
-    for i, (uav, sent) in enumerate(messages.groupby("uav")):
-        times.scatter(sent.time - messages.time[0], sent.delay, 3, COLOURS[i % len(COLOURS)], label=uav)
-    times.set(xlabel="time of the message [s]", ylabel="delay [s]")
-    times.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
-    figure.savefig(path, dpi=150)

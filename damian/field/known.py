@@ -11,7 +11,6 @@ from functools import lru_cache
 from itertools import zip_longest
 
 import numpy as np
-import shapely
 import torch
 from torch import Tensor
 
@@ -31,13 +30,6 @@ class Ground:
         self.region, self.reach = airspace.regions[0], reach
         self.columns = METRES if self.region.origin is None else DEGREES
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
-        if self.region.origin is None:
-            places = (self.points + self.region.offset).round(3)
-        else:
-            east, north = self.points.T
-            places = np.column_stack(to_latlon(east, north, self.region.origin)).round(8)
-        self._places = places.tolist()
-        self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
         self.landing_point = lru_cache(10_000)(self._landing_point)  # each place is looked up several times
         """Number of the landing point nearest to a place; ``InputError`` if it is farther than ``reach``."""
 
@@ -50,18 +42,19 @@ class Ground:
         return float(x), float(y)
 
     def _landing_point(self, place: Place) -> int:
-        x, y = self.local(place)
-        point = int(self._tree.nearest(shapely.Point(x, y)))
-        away = float(np.hypot(*(self.points[point] - (x, y))))
-        if away > self.reach:
-            where = f"{', '.join(self.columns)}: {place[0]:.10g}, {place[1]:.10g}"
-            raise InputError(f"{where} is {away:.0f} m away from the landing points of {self.region.name}")
-        return point
+        away = np.hypot(*(self.points - self.local(place)).T)
+        if away.min() > self.reach:
+            where = f"{', '.join(self.columns)}: {place[0]:.10g}, {place[1]:.10g} is {away.min():.0f} m away"
+            raise InputError(f"{where} from the landing points of {self.region.name}")
+        return int(away.argmin())
 
     def place(self, point: int) -> Place:
         """Where a landing point is, in ``columns``, to a millimetre."""
-        first, second = self._places[point]
-        return first, second
+        east, north = self.points[point].tolist()
+        if self.region.origin is None:
+            return round(east + self.region.offset[0], 3), round(north + self.region.offset[1], 3)
+        latitude, longitude = to_latlon(east, north, self.region.origin)
+        return round(float(latitude), 8), round(float(longitude), 8)
 
     def way(self, origin: int, goal: int) -> tuple[float, float]:
         """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
@@ -116,7 +109,8 @@ class UavLog:
         return self.reports[-1] if self.reports else None
 
     def check(self, report: Report) -> None:
-        """Require places near landing points, and as many readings as the sensors give."""
+        """Require complete places near landing points, and as many readings as the sensors give."""
+        report.check_places()
         if report.columns != self.ground.columns:
             own = ", ".join(self.ground.columns)
             raise InputError(f"places in {self.ground.region.name} are {own}: give those of {report.id} so")
@@ -130,17 +124,13 @@ class UavLog:
 
     def has(self, time: float) -> bool:
         """Has a report that was generated at this time come in before."""
-        at = self._place_of(time)
+        at = bisect.bisect_left(self.reports, time, key=lambda each: each.report.time)
         return at < len(self.reports) and self.reports[at].report.time == time
-
-    def _place_of(self, time: float) -> int:
-        """Number of reports that were generated before this time."""
-        return bisect.bisect_left(self.reports, time, key=lambda filled: filled.report.time)
 
     def add(self, report: Report, step: int, detected: int | None, origin: int | None = None) -> FilledReport:
         """Add a report, in its place by the time when it was generated; arguments as of ``FilledReport``."""
         filled = FilledReport(report, step, origin, detected=detected)
-        at = self._place_of(report.time)
+        at = bisect.bisect_left(self.reports, report.time, key=lambda each: each.report.time)
         self.reports.insert(at, filled)
         for i in range(at, len(self.reports)):
             self._fill(self.reports[i], self.reports[i - 1] if i else None)
@@ -151,30 +141,26 @@ class UavLog:
         report, near = filled.report, self.ground.landing_point
         here, target = report.place(), report.place("target_")
         assert here is not None  # every report has it
-        filled.point = filled.target = near(here)
-        if report.flies and (before or filled.origin is not None):
-            filled.point = filled.target = before.point if filled.origin is None else filled.origin
+        took_off = before.point if before and filled.origin is None else filled.origin
+        filled.point = filled.target = took_off if report.flies and took_off is not None else near(here)
         if target is not None:
             filled.target = near(target)
-        track, battery, readings = 0.0, 100.0, (0.0,) * self.n_readings
-        if before:
-            track, battery, readings = before.track, before.battery, before.readings
-        filled.track = track if report.track is None else math.radians(report.track) % (2 * math.pi)
-        filled.battery = battery if report.battery is None else report.battery
-        filled.battery_known = report.battery is not None or (before is not None and before.battery_known)
-        filled.readings = readings if report.readings is None else report.readings
-        filled.spotted = report.source_spotted and not report.flies
-        place = report.place("source_")
+        known = before or FilledReport(report, filled.step, readings=(0.0,) * self.n_readings)
+        filled.track = known.track
+        if report.track is not None:
+            filled.track = math.radians(report.track) % (2 * math.pi)
+        filled.battery = known.battery if report.battery is None else report.battery
+        filled.battery_known = known.battery_known or report.battery is not None
+        filled.readings = known.readings if report.readings is None else report.readings
+        filled.spotted, place = report.source_spotted and not report.flies, report.place("source_")
         if filled.spotted:
             filled.detected, filled.detected_at = filled.step, filled.point
         elif report.source_time is None:
-            if before:
-                filled.detected, filled.detected_at = before.detected, before.detected_at
+            filled.detected, filled.detected_at = known.detected, known.detected_at
         elif place is not None:
             filled.detected_at = near(place)
         else:
-            held = before and before.detected_at
-            filled.detected_at = filled.point if held is None else held
+            filled.detected_at = filled.point if known.detected_at is None else known.detected_at
         filled.motions = 0 if before is None else 1 if before.spotted else before.motions + 1
         if report.motions is not None:
             filled.motions = report.motions

@@ -98,9 +98,10 @@ def _episode(tracker: Tracker, rows: Rows, steps: Sequence[int], about: Mapping[
     instants = cast(TensorDictBase, torch.stack([at_instant(each) for each in known]))  # type: ignore[arg-type]
     for rewards in (instants[keys.REWARD], *instants.get(keys.REWARD_TERMS, {}).values()):
         rewards[0] = 0  # of a step before
+    position, battery = (torch.as_tensor(columns[name]) for name in ("position", "battery"))
     unknown = torch.zeros(len(steps), 1, 2)
-    true = (torch.as_tensor(columns[name]) for name in ("position", "battery"))
-    instants[keys.STATE] = Truth(*true, unknown[..., 0], unknown, unknown[:, :0], unknown[:, 0, :0]).pack()
+    nothing = unknown[:, :0], unknown[:, 0, :0]
+    instants[keys.STATE] = Truth(position, battery, unknown[..., 0], unknown, *nothing).pack()
     told = {**about, "uavs": tracker.uavs, "began": written(tracker.start + steps[0] * node.dt)}
     episode = episode_of(instants, node.worlds, told)
     return replace(episode, **columns, instant=False, source=None, emits=None)

@@ -1,16 +1,15 @@
-"""Rows of tables as pydantic models: reports that come in, and answers that go out, as CSV and JSON.
+"""Rows of tables as pydantic models: reports that come in, as CSV and JSON.
 
 Columns of a report may be written in any case, and with ``_`` for a space. ``NA``, an empty cell and null
 mean that the value is not known.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
-import pandas as pd
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import from_json
 
@@ -155,25 +154,16 @@ class Report(Row):
         if "time" not in said:
             self.time = self.received - self.aoi
 
-    @model_validator(mode="after")
-    def _places_are_complete(self) -> "Report":
+    def check_places(self) -> None:
+        """Require pairs of coordinates, of one kind, and the UAV's own place."""
         said, prefixes = self.model_fields_set, ("", "source_", "target_")
-        own, others = (DEGREES, METRES) if self.columns == DEGREES else (METRES, DEGREES)
-        pairs = [{f"{prefix}{name}" in said for name in own} for prefix in prefixes]
+        others = METRES if self.columns == DEGREES else DEGREES
+        pairs = [{f"{prefix}{name}" in said for name in self.columns} for prefix in prefixes]
         mixed = any(f"{prefix}{name}" in said for prefix in prefixes for name in others)
         if mixed or pairs[0] != {True} or any(len(pair) > 1 for pair in pairs):
-            raise ValueError("places are pairs lat, lon [deg], or all of them x, y [m]; the UAV's is needed")
+            raise InputError("places are pairs lat, lon [deg], or all of them x, y [m]; the UAV's is needed")
         if True in pairs[1] and self.source_time is None and not self.source_spotted:
-            raise ValueError("source time: it is missing: when the source was detected at this place [s]")
-        return self
-
-
-class TimedReport(Report):
-    """A row of a log of which only the times count; its places need not be complete."""
-
-    @model_validator(mode="after")
-    def _places_are_complete(self) -> "TimedReport":
-        return self
+            raise InputError("source time: it is missing: when the source was detected at this place [s]")
 
 
 def column_of(name: str) -> str:
@@ -186,10 +176,10 @@ Found = list[tuple[str, Any]]
 Rows = list[tuple[str, Report]]
 
 
-def read_file(path: Path, kind: type[Report] = Report) -> Rows:
+def read_file(path: Path) -> Rows:
     """Reports of a file: JSON if its name ends with ``.json``, or else CSV."""
     text = read_text(path)
-    return reports_of(rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text), kind)
+    return reports_of(rows_of_json(text) if path.suffix.lower() == ".json" else rows_of_csv(text))
 
 
 def rows_of_csv(text: str) -> Found:
@@ -203,11 +193,11 @@ def rows_of_json(text: str | bytes) -> Found:
     return [(f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)]
 
 
-def reports_of(found: Found, kind: type[Report] = Report) -> Rows:
+def reports_of(found: Found) -> Rows:
     """Rows as reports."""
     if not found:
         raise InputError("there are no rows")
-    return [(where, validated(kind, row, where)) for where, row in found]
+    return [(where, validated(Report, row, where)) for where, row in found]
 
 
 def parsed_json(text: str | bytes) -> Any:
@@ -230,18 +220,6 @@ def validated(model: type[Model], value: Any, where: str = "") -> Model:
         field, shown = ".".join(map(str, first["loc"])), show(first["input"])
         parts = [where, field, shown if field and first["type"] != "missing" else "", first["msg"]]
         raise InputError(": ".join(filter(None, parts))) from None
-
-
-def as_rows(answers: Sequence[BaseModel]) -> list[dict[str, Any]]:
-    """Answers as rows of JSON; only the columns of places that were not given are left out."""
-    return [answer.model_dump(exclude_unset=True) for answer in answers]
-
-
-def as_csv(answers: Sequence[BaseModel]) -> str:
-    """A CSV table of answers with the same columns; what is not known is ``NA``."""
-    rows = as_rows(answers)
-    table = pd.DataFrame(rows, columns=list(rows[0]) if rows else ["ID"], dtype=object)
-    return table.to_csv(index=False, na_rep="NA", lineterminator="\n")
 
 
 def written(time: float) -> float | str:

@@ -6,7 +6,8 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from gymnasium.spaces import Space
+from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 
 from damian.common import counter_rng
 from damian.common.errors import InputError
@@ -26,10 +27,10 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
     Args:
         env: any Gymnasium environment; its spaces stay as they are.
         observation, action: delay of each: steps (``3``), a time (``"3s"``), a distribution
-            (``Uniform(3, 7)``), or a function, as ``damian.Function`` says.
+            (``Uniform(3, 7)``), or a function, as ``ObservationDelay`` takes.
         loss: probability that an observation never arrives.
-        default: the action that is executed until the first one arrives; if not given, that nearest to 0.
-            It is not needed if no action is late.
+        default: the action that is executed until the first one arrives; if not given, 0 (in all parts). It
+            is not needed if no action is late.
         dt: length of a step [s], for delays given as times.
 
     Examples:
@@ -52,7 +53,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         self._observations = _Link("observation", observation, loss, dt)
         self._actions = _Link("action", action, 0.0, dt, before_step=True)
         if default is None and self._actions.late:
-            default = _nearest_to_zero(env.action_space)
+            default = _zero(env.action_space)
         self._default = default
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
@@ -105,20 +106,9 @@ class _Link:
         return self._sent[held], int(delivery.age)
 
 
-def _nearest_to_zero(space: Space[Any]) -> Any:
-    """The legal action nearest to 0."""
-    if isinstance(space, Box):
-        return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
-    if isinstance(space, Discrete):
-        return np.clip(space.dtype.type(0), space.start, space.start + space.n - 1)
-    if isinstance(space, MultiDiscrete):
-        return np.clip(np.zeros_like(space.nvec), space.start, space.start + space.nvec - 1).astype(
-            space.dtype
-        )
-    if isinstance(space, MultiBinary):
-        return np.zeros(space.shape, space.dtype)
-    if isinstance(space, Dict):
-        return {name: _nearest_to_zero(inner) for name, inner in space.items()}
-    if isinstance(space, Tuple):
-        return tuple(map(_nearest_to_zero, space))
-    raise InputError(f"default: is missing, and {space} has no action nearest to 0")
+def _zero(space: Space[Any]) -> Any:
+    """The action 0 of a space."""
+    zero = next(iter(iterate(batch_space(space, 1), create_empty_array(space, 1))))
+    if not space.contains(zero):
+        raise InputError(f"default: is missing, and {space} has no action 0")
+    return zero

@@ -5,12 +5,11 @@ import warnings
 from contextlib import redirect_stderr
 from io import StringIO
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
+from torch.distributions import Distribution
 from torchrl.data import Categorical, TensorSpec
 from torchrl.modules import ProbabilisticActor
 
@@ -35,7 +34,6 @@ class ExportedPolicy(nn.Module):
         names = ["probability"] if self.discrete else map(last_name, self.parameter_keys)
         self.inputs = [last_name(key) for key in self.in_keys]
         self.outputs = ["action", *names, *["hidden"] * self.recurrent]
-        self.answers: list[Any] = []
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Inputs [B, N, *] to outputs [B, N, *]; the action is the actor's own without chance."""
@@ -44,36 +42,14 @@ class ExportedPolicy(nn.Module):
             entries.set(key, value)
         for layer in self.layers:
             entries = layer(entries)
-        # A tensor that is traced makes a list of its items one by one, so that nobody would be asked for it.
-        with patch.object(type(inputs[0]), "tolist", Tensor.tolist), _Answers(self.answers):
+        Distribution.set_default_validate_args(False)  # no program can contain checks of parameters
+        try:
             action = self.last(entries)[keys.ACTION]
-            shown = [entries[key] for key in self.parameter_keys]
-            if self.discrete:
-                shown = [self.last.get_dist(entries).probs]
+            shown = [self.last.get_dist(entries).probs] if self.discrete else []
+        finally:
+            Distribution.set_default_validate_args(True)
+        shown = shown or [entries[key] for key in self.parameter_keys]
         return action, *shown, *([entries[keys.HIDDEN]] if self.recurrent else [])
-
-
-class _Answers(TorchFunctionMode):
-    """Keeps what Python asks about values in tensors at first, and then always answers the same.
-
-    Distributions check their parameters in this way, which no program of ``torch.export`` can contain.
-    """
-
-    ASK = (Tensor.__bool__, Tensor.item, Tensor.tolist, torch.equal)
-
-    def __init__(self, answers: list[Any]) -> None:
-        super().__init__()
-        self.kept, self.known = answers, iter([*answers]) if answers else None
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        if func not in self.ASK:
-            return func(*args, **kwargs or {})
-        if self.known is not None:
-            return next(self.known)
-        self.kept.append(func(*args, **kwargs or {}))
-        return self.kept[-1]
 
 
 def exported(

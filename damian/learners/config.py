@@ -207,9 +207,6 @@ class SacConfig(LearnerConfig):
     target_entropy: float = setting(
         0.5, "Target entropy of discrete actions, as a share of that of a uniform choice.", low=0, high=1
     )
-    n_steps: int = setting(
-        1, "Decisions whose rewards are summed (n-step returns).", low=1, high=checks.STEPS
-    )
     updates: int = setting(4, "Updates per round.", low=1, high=checks.STEPS)
     batch_size: int = setting(512, "Decisions per update.", low=1, high=checks.STEPS)
     buffer_steps: int = setting(200000, "Environment steps in the replay buffer.", low=1)

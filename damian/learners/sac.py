@@ -73,7 +73,7 @@ class Sac:
         if (valid := steps.get(keys.VALID, None)) is not None:  # not after an end that was known only later
             ready = ready & cast(Tensor, valid)[settled]
         done, terminated = (steps[next_key(key)][settled].squeeze(-1) for key in (keys.DONE, keys.TERMINATED))
-        decisions = find_decisions(ready, ready_next, done, terminated, self.config.n_steps)
+        decisions = find_decisions(ready, ready_next, done, terminated)
         if len(order) * batch.shape[0] < self.config.warm_up or not len(decisions.begin):
             return dict.fromkeys(NUMBERS, math.nan)
         rounds = []

@@ -92,9 +92,8 @@ class BackupdateStorage(TimeStorage):
                 should = "needs corrections that credit late rewards, and goes without hindsight_key"
                 raise InputError(f"recompute: None {should}")
             delay_key = cast(NestedKey, self._late_rewards.delay_key)
-        self._message_keys = unravel_key(message_key), unravel_key(received_key)
         delay_key = unravel_key(delay_key)
-        self._sent, self._held = (next_key(key) for key in self._message_keys)
+        self._sent, self._held = (next_key(unravel_key(key)) for key in (message_key, received_key))
         self._delay, self._age = next_key(delay_key), next_key(unravel_key(age_key))
         self._count = unravel_key(step_count_key)
         self._hindsight = None if hindsight_key is None else next_key(unravel_key(hindsight_key))
@@ -122,18 +121,14 @@ class BackupdateStorage(TimeStorage):
     def _require_entries(self, data: TensorDictBase) -> None:
         """Require that steps [T, B] have the entries that the storage reads, and fit into it."""
         late, present = self._late_rewards, data.keys(True)
-        needed = [("step_count_key", self._count, "StepCounter()"), ("done", ENDS[0], "every environment")]
-        delays = []
-        if late and late.delay_key:
-            delays.append(("reward", next_key(late.delay_key), "RewardDelay(delay_key=...)"))
+        delays = {"reward": next_key(late.delay_key)} if late and late.delay_key else {}
+        needed = [("step_count_key", self._count), ("done", ENDS[0])]
         if self.recompute is not None:
-            sent, held = self._message_keys
-            writer = f"ObservationDelay(delay, {sent!r}, {held!r}, delay_key=...)"
-            needed += [("message_key", self._sent, "the environment")]
-            needed += [("received_key", self._held, writer), ("age_key", self._age, writer)]
-            delays.append(("message", self._delay, writer))
-        for name, key, writer in [*needed, *(("delay_key", *delay[1:]) for delay in delays)]:
-            checks.require(key in present, name, key, f"is not in the steps: {writer} writes it")
+            delays["message"] = self._delay
+            needed += [("message_key", self._sent), ("received_key", self._held), ("age_key", self._age)]
+        should = "is not in the steps: docs/backupdating.md says which transform writes it"
+        for name, key in [*needed, *(("delay_key", delay) for delay in delays.values())]:
+            checks.require(key in present, name, key, should)
         if self._n_worlds is None and min(data.shape) > 1:
             along = [(data[self._count].squeeze(-1).diff(dim=dim) == 1).double().mean() for dim in (0, 1)]
             should = "grows from world to world instead of step to step: give ReplayBuffer.extend [B, T]"
@@ -147,7 +142,7 @@ class BackupdateStorage(TimeStorage):
             f"{needs} steps of {n_worlds} worlds need {needs * n_worlds}"
         )
         checks.require(self.max_size >= needs * n_worlds, "max_size", self.max_size, should)
-        for name, key, _ in delays:
+        for name, key in delays.items():
             takes = f"steps, but a {name} takes {int(data[key].max())} steps"
             checks.require(bool(data[key].max() <= self.longest), "longest", self.longest, takes)
 

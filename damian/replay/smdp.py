@@ -29,24 +29,14 @@ class Decisions(NamedTuple):
         return Decisions(*(part[drawn] for part in self))
 
 
-def find_decisions(
-    ready: Tensor, ready_next: Tensor, done: Tensor, terminated: Tensor, n_decisions: int = 1
-) -> Decisions:
+def find_decisions(ready: Tensor, ready_next: Tensor, done: Tensor, terminated: Tensor) -> Decisions:
     """All decisions in T consecutive steps that have ended by the last of these steps.
 
     Decisions that a time limit truncates in flight are left out, because their outcome is unknown. ``ready``
     and ``ready_next`` [T, B, N] tell whether a UAV could choose before and after each step, ``done`` and
-    ``terminated`` [T, B] how the episode ended; ``n_decisions`` consecutive ones are joined, for n-step
-    returns.
+    ``terminated`` [T, B] how the episode ended.
     """
-    n_steps = len(ready)
-    ended = done.unsqueeze(-1).expand_as(ready)
-    next_end = next_true(ready_next | ended)  # n_steps: none has ended yet
-    next_end = torch.cat([next_end, torch.full_like(next_end[:1], n_steps)])
-    end = next_end[:-1]
-    for _ in range(n_decisions - 1):
-        over = ended.gather(0, end.clamp(max=n_steps - 1))
-        end = torch.where(over, end, next_end.gather(0, (end + 1).clamp(max=n_steps)))
+    n_steps, end = len(ready), next_true(ready_next | done.unsqueeze(-1))  # n_steps: it has not ended yet
     outcome_known = (ready_next | terminated.unsqueeze(-1)).gather(0, end.clamp(max=n_steps - 1))
     begin, world, agent = (ready & outcome_known & (end < n_steps)).nonzero().unbind(-1)
     return Decisions(begin, world, agent, end[begin, world, agent])

@@ -1,17 +1,12 @@
 """A replay-buffer storage that keeps steps in order of time."""
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
-
-_LAST = "latest_step.json"
-"""File that tells which of the saved steps is the latest."""
 
 
 class TimeStorage(LazyTensorStorage):
@@ -63,10 +58,5 @@ class TimeStorage(LazyTensorStorage):
         super().load_state_dict(state_dict)
         self._last_cursor = state_dict["last"]
 
-    def dumps(self, path: str | Path) -> None:
-        super().dumps(path)
-        (Path(path) / _LAST).write_text(json.dumps(self._last), encoding="utf-8")
-
-    def loads(self, path: str | Path) -> None:
-        super().loads(path)
-        self._last_cursor = json.loads((Path(path) / _LAST).read_text(encoding="utf-8"))
+    def dumps(self, path: Any) -> None:
+        raise NotImplementedError("the files do not tell which step is the latest: save state_dict()")

@@ -7,18 +7,6 @@ from damian.common.fields import Settings, setting
 
 
 @dataclass
-class WandbConfig(Settings):
-    """What ``logger=wandb`` is told."""
-
-    section: ClassVar[str] = "logger.wandb"
-
-    project: str = setting("damian", "Project of Weights & Biases.")
-    offline: bool = setting(
-        False, "Keep everything in the run folder, for ``wandb sync``; so does WANDB_MODE=offline."
-    )
-
-
-@dataclass
 class LoggerConfig(Settings):
     """Which files of metrics the training writes into the run folder."""
 
@@ -26,7 +14,7 @@ class LoggerConfig(Settings):
 
     tensorboard: bool = setting(True, "Write TensorBoard events.")
     csv: bool = setting(True, "Write ``metrics.csv``.")
-    wandb: WandbConfig = setting(WandbConfig)
     custom: list[Any] = setting(
-        [], "Loggers of your own: package.module:Name, or {logger: package.module:Name, parameter: ...}."
+        [],
+        "Further loggers: wandb or package.module:Name, or {logger: wandb, project: ..., offline: true}.",
     )

@@ -136,8 +136,9 @@ class EpisodeLog:
 
     def __init__(self, worlds: int, hindsight: "HindsightReturns | None" = None) -> None:
         self.finished, self.hindsight = 0, hindsight
-        self._perceived = _LatestEpisodes(worlds, len(self.NAMES))
-        self._settled = _LatestEpisodes(hindsight.worlds, 1) if hindsight else self._perceived
+        parts = [(worlds, len(self.NAMES)), *([(hindsight.worlds, 1)] if hindsight else [])]
+        self._known = [torch.full((b, math.ceil(self.EPISODES / b), n), torch.nan) for b, n in parts]
+        """Numbers of the latest episodes of each world [B, K, N], perceived and in hindsight."""
 
     def add(self, batch: TensorDictBase) -> None:
         """Add the episodes that end in a batch [B, T], with the entries of ``EpisodeTotals``."""
@@ -145,45 +146,39 @@ class EpisodeLog:
         done = steps[keys.DONE].to("cpu")
         of_episodes = (cast(Tensor, steps[key]) for key in _TOTALS)
         totals = torch.stack([each.flatten(2).float().mean(2) for each in of_episodes], -1)
-        self._perceived.add(totals.to("cpu").masked_fill(~done, torch.nan))
+        ended = [totals.to("cpu").masked_fill(~done, torch.nan)]
         if self.hindsight:
-            self._settled.add(self.hindsight.add(batch).to("cpu").unsqueeze(-1))
+            ended.append(self.hindsight.add(batch).to("cpu").unsqueeze(-1))
+        self._known = [*map(_latest, self._known, ended)]
         self.finished += int(done.sum())
 
     def state_dict(self) -> dict[str, Any]:
-        state = {"finished": self.finished, "perceived": self._perceived.known}
-        if self.hindsight:
-            state |= {"settled": self._settled.known, "hindsight": self.hindsight.state_dict()}
-        return state
+        hindsight = self.hindsight.state_dict() if self.hindsight else None
+        return {"finished": self.finished, "known": self._known, "hindsight": hindsight}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.finished, self._perceived.known = int(state["finished"]), state["perceived"]
+        self.finished, self._known = state["finished"], state["known"]
         if self.hindsight:
-            self._settled.known = state["settled"]
             self.hindsight.load_state_dict(state["hindsight"])
 
     def means(self) -> dict[str, float]:
         """Mean returns, success rate and steps; nan before an episode has ended in each world."""
-        settled, perceived = self._settled.means()[0], self._perceived.means()
-        return {"hindsight_return": settled, **dict(zip(self.NAMES, perceived, strict=True))}
+        perceived, *settled = (known.nanmean(1).mean(0).tolist() for known in self._known)
+        names = dict(zip(self.NAMES, perceived, strict=True))
+        return {"hindsight_return": (settled or [perceived])[0][0], **names}
 
 
-class _LatestEpisodes:
-    """Numbers of the latest episodes, as many of each world, at least ``EpisodeLog.EPISODES`` in all."""
+def _latest(known: Tensor, ended: Tensor) -> Tensor:
+    """Numbers of the latest episodes of each world, [B, K, N].
 
-    def __init__(self, worlds: int, numbers: int) -> None:
-        kept = math.ceil(EpisodeLog.EPISODES / worlds)
-        self.known = torch.full((worlds, kept, numbers), torch.nan)
-
-    def add(self, ended: Tensor) -> None:
-        """Add the numbers of the episodes that end in some steps, nan where none does, [B, T, K]."""
-        known = torch.cat([self.known, ended], 1)
-        when = torch.arange(known.shape[1]).where(~known[..., 0].isnan(), -1)
-        latest = when.topk(self.known.shape[1], 1).indices.unsqueeze(-1).expand(-1, -1, known.shape[2])
-        self.known = known.gather(1, latest)
-
-    def means(self) -> list[float]:
-        return self.known.nanmean(1).mean(0).tolist()
+    Args:
+        known: those of the latest ones so far, [B, K, N], nan where there were fewer.
+        ended: those of the episodes that end in some later steps, nan where none does, [B, T, N].
+    """
+    both = torch.cat([known, ended], 1)
+    when = torch.arange(both.shape[1]).where(~both[..., 0].isnan(), -1)
+    latest = when.topk(known.shape[1], 1).indices.unsqueeze(-1).expand(-1, -1, both.shape[2])
+    return both.gather(1, latest)
 
 
 class HindsightReturns:

@@ -1,25 +1,108 @@
-"""Numbers of a training, written row by row: ``metrics.csv``, TensorBoard events, the user's own loggers."""
+"""Numbers of a training: row by row in ``metrics.csv``, and given to loggers such as TensorBoard."""
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+from uuid import NAMESPACE_URL, uuid5
 
 import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
 
-from damian.common.atomic_files import writing
+from damian.common import checks
 from damian.common.errors import InputError, naming_errors
+from damian.common.registry import Registry, check_parameters
 from damian.common.tables import read_csv, write_csv
-from damian.runs.loggers import Logger
+from damian.runs.config import LoggerConfig
+
+
+class Logger(Protocol):
+    """Receives numbers, as TorchRL's loggers do.
+
+    If it has them, ``log_hparams(settings)`` is called at first, with every setting by its dotted key,
+    ``flush()`` before a checkpoint, and ``close()`` at the end.
+    """
+
+    def log_scalar(self, name: str, value: float, step: int) -> None:
+        """Log a number, nan if it is not known yet, by a name such as ``train/perceived_return``.
+
+        ``step`` counts environment steps over all worlds.
+        """
+        ...
+
+
+LOGGERS = Registry[Callable[..., Logger]](
+    "logger",
+    lambda found: callable(found) and (not isinstance(found, type) or hasattr(found, "log_scalar")),
+    "is not a function (folder) -> logger, nor a class with a method log_scalar",
+)
+"""Loggers by name or ``package.module:Name``: functions or classes that get the run folder."""
+
+
+def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Logger]:
+    """Make the loggers of settings that ``check_loggers`` has checked.
+
+    Args:
+        config: the settings.
+        folder: the run folder.
+        frames: environment steps that a resumed run has made; TensorBoard drops what it logged of later ones.
+    """
+    loggers: list[Logger] = [TensorBoard(folder, frames)] if config.tensorboard else []
+    for path, make, parameters in map(_read, config.custom):
+        with naming_errors(f"logger.custom: {path}"):
+            logger = make(folder, **parameters)
+            should = "is not a logger: it has no method log_scalar(name, value, step)"
+            checks.require(hasattr(logger, "log_scalar"), path, type(logger).__name__, should)
+        loggers.append(logger)
+    return loggers
+
+
+class TensorBoard:
+    """Writes TensorBoard events into the run folder; the files that a resumed run adds belong to the same."""
+
+    def __init__(self, folder: Path, frames: int) -> None:
+        self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
+
+    def log_scalar(self, name: str, value: float, step: int) -> None:
+        self._events.add_scalar(name, value, step)
+
+    def flush(self) -> None:
+        self._events.flush()
+
+    def close(self) -> None:
+        self._events.close()
+
+
+def check_loggers(written: Sequence[Any]) -> None:
+    """Check loggers, each ``package.module:Name`` or ``{logger: package.module:Name, ...}``."""
+    for each in written:
+        _read(each)
+
+
+def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
+    key, entry = "logger.custom", written if isinstance(written, Mapping) else {"logger": written}
+    path, make, parameters = LOGGERS.read(entry, key, "logger")
+    check_parameters(make, parameters, path, key)
+    return path, make, parameters
+
+
+@LOGGERS.register("wandb")
+def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Logger:
+    """A run of Weights & Biases, named as the run folder; a resumed training continues it."""
+    from torchrl.record.loggers import WandbLogger  # noqa: PLC0415 (takes seconds to import)
+
+    number = uuid5(NAMESPACE_URL, str(folder.resolve())).hex
+    logger: Any = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
+    logger.close = import_module("wandb").finish
+    return logger
+
 
 METRICS = "metrics.csv"
 _FIRST_COLUMN = "frames"
 
 
 class MetricsLog:
-    """Writes named numbers to ``metrics.csv``, TensorBoard and other loggers; a resumed run appends to them.
+    """Gives named numbers to loggers, and writes them to ``metrics.csv`` with each checkpoint and at the end.
 
     A number that a row lacks is nan; rows after ``frames``, where a run resumes, are dropped.
     """
@@ -27,60 +110,36 @@ class MetricsLog:
     def __init__(
         self,
         folder: Path,
-        tensorboard: bool,
-        to_csv: bool,
+        to_csv: bool = True,
         frames: int = 0,
         loggers: Sequence[Logger] = (),
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        self._folder, self._loggers, self._settings = folder, loggers, settings or {}
+        self._loggers = loggers
         self._path = folder / METRICS if to_csv else None
         stored = read_metrics(folder)
-        stored = stored[stored[_FIRST_COLUMN] <= frames]
-        self.rows: list[dict[Any, Any]] = stored.to_dict("records")
-        self._columns = [*stored.columns] if self.rows else []
-        if self._path:
-            write_csv(self._path, pd.DataFrame(self.rows))
-        # TensorBoard does not show what older files hold of steps from ``purge_step`` on.
-        purge_step = frames + 1 if frames else None
-        self._events = SummaryWriter(str(folder), purge_step=purge_step) if tensorboard else None
-        self._call("log_hparams", dict(self._settings))
+        self.rows: list[dict[Any, Any]] = stored[stored[_FIRST_COLUMN] <= frames].to_dict("records")
+        self._call("log_hparams", settings or {})
 
     def show(self, frames: int, numbers: Mapping[str, float]) -> None:
-        """Give numbers to TensorBoard and the loggers alone, by names in groups such as ``train/kl``."""
-        tags = {name if "/" in name else f"train/{name}": number for name, number in numbers.items()}
-        for tag, number in tags.items():
-            self._call("log_scalar", tag, number, frames)
-            if self._events:
-                self._add_settings(tags)
-                self._events.add_scalar(tag, number, frames)
+        """Give numbers to the loggers alone, by names in groups such as ``train/kl``."""
+        for name, number in numbers.items():
+            self._call("log_scalar", name if "/" in name else f"train/{name}", number, frames)
 
     def add(self, frames: int, numbers: Mapping[str, float]) -> None:
         """Log numbers by name, after so many environment steps over all worlds."""
         self.show(frames, numbers)
-        row = {_FIRST_COLUMN: float(frames), **numbers}
-        self.rows.append(row)
-        new = [name for name in row if name not in self._columns]
-        self._columns += new
-        if self._path and new:  # a learner may log more once it has begun to learn
-            write_csv(self._path, pd.DataFrame(self.rows))
-        elif self._path:
-            line = pd.DataFrame([row], columns=self._columns)
-            with writing(self._path):
-                line.to_csv(self._path, mode="a", header=False, index=False, na_rep="nan")
+        self.rows.append({_FIRST_COLUMN: float(frames), **numbers})
 
     def sync(self) -> None:
         """Make the rows last, even if the machine stops; a checkpoint comes after its rows."""
-        if self._events:
-            self._events.flush()
+        self._call("flush")
         if self._path:
-            with writing(self._path), self._path.open("rb") as file:
-                os.fsync(file.fileno())
+            write_csv(self._path, pd.DataFrame(self.rows))
 
     def close(self) -> None:
-        """Close all files, and all loggers that can be closed."""
-        if self._events:
-            self._events.close()
+        """Write what has come since, and close all loggers that can be closed."""
+        self.sync()
         self._call("close")
 
     def _call(self, method: str, *arguments: Any) -> None:
@@ -90,19 +149,9 @@ class MetricsLog:
                 with naming_errors(f"logger {type(logger).__name__}"):
                     getattr(logger, method)(*arguments)
 
-    def _add_settings(self, numbers: Mapping[str, float]) -> None:
-        """Give TensorBoard the settings, once; its table of runs needs the names of the numbers too."""
-        if self._settings:
-            kinds = (bool, int, float)
-            plain = {key: x if isinstance(x, kinds) else str(x) for key, x in self._settings.items()}
-            self._settings = {}
-            # ``add_hparams`` would write them into a folder of their own.
-            for summary in hparams(plain, dict.fromkeys(numbers, 0.0)):
-                self._events.file_writer.add_summary(summary)  # type: ignore[union-attr]
-
 
 def read_metrics(folder: Path) -> pd.DataFrame:
-    """The rows of a run's ``metrics.csv``, if there is one, without an unfinished last line."""
+    """The rows of a run's ``metrics.csv``, if there is one."""
     path = folder / METRICS
     table = read_csv(path) if path.exists() else pd.DataFrame()
     if len(table) and _FIRST_COLUMN not in table:

@@ -1,39 +1,69 @@
-"""Many runs, several at a time, each in a process of its own, which a signal stops as it stops this one."""
+"""Runs in processes, and how a signal ends them: a training after its current update, many runs at once."""
 
 import multiprocessing
 import os
 import signal
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from itertools import islice
-from typing import TypeVar
+from types import FrameType
+from typing import Any, NoReturn, TypeVar
 
 from damian.common.errors import RunError
-from damian.runs.interrupt import interrupt
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Ctrl-C, and what batch systems and ``kill`` send."""
+
+
+class Interrupt:
+    """Context in which the first Ctrl-C or SIGTERM only sets ``asked``; a second one ends the run at once."""
+
+    asked: int | None = None
+    """Number of the signal that asked to stop."""
+
+    def __enter__(self) -> "Interrupt":
+        self._before: dict[int, Any] = {number: signal.signal(number, self._ask) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+    def _ask(self, number: int, _: FrameType | None) -> None:
+        self.asked = number
+        self.__exit__()
+
+
+def end_interrupted(remedy: str = "", number: int = signal.SIGINT) -> NoReturn:
+    """End a program that a signal has stopped, with the exit code of shells: 130 or 143."""
+    print(f"interrupted; {remedy}" if remedy else "interrupted", file=sys.stderr)
+    sys.exit(128 + number)
+
 
 R = TypeVar("R")
 
 
 def each_in_processes(
-    perform: Callable[[R], None], runs: Iterable[R], processes: int
+    perform: Callable[[R], None], runs: Sequence[R], processes: int
 ) -> Iterator[tuple[R, BaseException | None]]:
-    """Perform runs, taken one by one as processes become free; yields each with its error, or None.
+    """Perform runs, and yield each that has ended with its error, or None.
 
     After Ctrl-C or SIGTERM it raises ``KeyboardInterrupt``, when every training has written a checkpoint.
     """
-    before = signal.signal(signal.SIGTERM, interrupt)  # batch systems send it
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it
     try:
         if processes > 1:
             yield from _in_pool(perform, runs, processes)
         else:
             for run in runs:
+                error = None
                 try:
                     perform(run)
-                except Exception as error:
-                    yield run, error
-                else:
-                    yield run, None
+                except Exception as raised:
+                    error = raised
+                yield run, error
     except BrokenExecutor as error:
         raise RunError("a worker process was killed; the same command continues all runs") from error
     finally:
@@ -41,13 +71,13 @@ def each_in_processes(
 
 
 def _in_pool(
-    perform: Callable[[R], None], runs: Iterable[R], processes: int
+    perform: Callable[[R], None], runs: Sequence[R], processes: int
 ) -> Iterator[tuple[R, BaseException | None]]:
     waiting, futures = iter(runs), dict[Future[None], R]()
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin) as pool:
         try:
             while True:
-                for run in islice(waiting, processes - len(futures)):
+                for run in islice(waiting, processes - len(futures)):  # none waits in a worker's queue
                     futures[pool.submit(perform, run)] = run
                 if not futures:
                     return
@@ -57,14 +87,9 @@ def _in_pool(
                         raise error
                     yield futures.pop(future), error
         except KeyboardInterrupt:
-            _interrupt_workers()
+            for worker in multiprocessing.active_children():  # a signal to this process alone reaches none
+                os.kill(worker.pid or 0, signal.SIGINT)
             raise
-
-
-def _interrupt_workers() -> None:
-    """Stop trainings in workers, which a signal to this process alone does not reach."""
-    for worker in multiprocessing.active_children():
-        os.kill(worker.pid or 0, signal.SIGINT)
 
 
 def _begin() -> None:

@@ -1,12 +1,13 @@
-"""Files of a run folder: their names, the learning curve, and the table of results."""
+"""Files of a run folder: their names, its lock, the learning curve, and the table of results."""
 
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pandas as pd
+from filelock import FileLock, Timeout
 
-from damian.common.atomic_files import write_atomically
+from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError
 from damian.common.tables import markdown_table, read_csv, write_csv
 from damian.runs.metrics import Evaluation
@@ -43,19 +44,19 @@ def plot_learning_curve(
     from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
     # In hindsight, which is close to what truly happened; what is perceived may rank policies wrongly.
-    panels = {"hindsight_return": ("return", "return")}
-    if any(row["perceived_success_rate"] > 0 for row in rows):
-        panels["perceived_success_rate"] = ("success rate", "perceived_success_rate")
+    panels, table = {"hindsight_return": "return"}, pd.DataFrame(rows).set_index("frames")
+    if (table["perceived_success_rate"] > 0).any():
+        panels["perceived_success_rate"] = "perceived_success_rate"
     figure = Figure(figsize=(5 * len(panels), 3.4), layout="tight")
     axes = figure.subplots(1, len(panels), squeeze=False)
-    for axis, (name, (label, measure)) in zip(axes[0], panels.items(), strict=True):
-        points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
-        points.insert(0, (0, evaluations[UNTRAINED].row()[measure]))
-        axis.plot(*zip(*points, strict=True), color="tab:blue", marker="o", markevery=[0], label="training")
+    for axis, (name, measure) in zip(axes[0], panels.items(), strict=True):
+        levels = {policy: each.row()[measure] for policy, each in evaluations.items()}
+        curve = pd.concat([pd.Series({0: levels[UNTRAINED]}), table[name].dropna()])
+        axis.plot(curve, color="tab:blue", marker="o", markevery=[0], label="training")
         for policy, style in {SCRIPT: "-.", RANDOM: "--"}.items():
-            if policy in evaluations:  # a region may be too large for the script
-                level = evaluations[policy].row()[measure]
-                axis.axhline(level, color="tab:gray", linestyle=style, label=policy)
+            if policy in levels:  # a region may be too large for the script
+                axis.axhline(levels[policy], color="tab:gray", linestyle=style, label=policy)
+        label = measure.removeprefix("perceived_").replace("_", " ")
         axis.set(xlabel="environment steps, all worlds", ylabel=label)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.grid(alpha=0.3)
@@ -101,3 +102,27 @@ def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = F
             lines.append([name, *numbers])
     head = ["policy", *measures, *(f"{measure}, deterministic" for measure in likely)]
     return markdown_table([title.replace("_", " ") for title in head], lines)
+
+
+LOCK = ".lock"
+"""The file that is locked; a process that was killed leaves it in the folder, where it does no harm."""
+
+
+@contextmanager
+def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
+    """Lock a folder for what is done inside; the lock ends with the process, however that ends."""
+    check_no_links(folder, key)
+    lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
+    with writing(folder):
+        try:
+            lock.acquire()
+        except Timeout:
+            problem = "is in use by another run: wait for its end, or choose another folder"
+            raise InputError(f"{key}: {folder} {problem}") from None
+    try:
+        yield
+    finally:
+        # While the lock is held: who opened this file before sees that it is gone, and makes a new one.
+        with suppress(OSError):  # Windows cannot delete an open file
+            (folder / LOCK).unlink()
+        lock.release()

@@ -21,14 +21,13 @@ PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra", "numpy", "sh
 """Modules whose versions a record names: a nightly build is a distribution of another name."""
 
 
-def write_record(folder: Path, command: str, **entries: Any) -> None:
+def write_record(folder: Path, command: str, resumes: bool = False, **entries: Any) -> None:
     """Write the record of a run that begins; that of a resumed one gets the command in its ``resumed``."""
-    part = {"command": command, "started": datetime.now(UTC).isoformat(timespec="seconds")}
-    if record := read_record(folder):
-        record["resumed"] = [*record.get("resumed", []), part]
+    record = {"command": command, "started": datetime.now(UTC).isoformat(timespec="seconds")}
+    if resumes and (first := read_record(folder)):
+        record = {**first, "resumed": [*first.get("resumed", []), record]}
     else:
-        record = {
-            **part,
+        record |= {
             "damian": damian.__version__,
             "commit": commit(),
             "python": platform.python_version(),
@@ -37,7 +36,7 @@ def write_record(folder: Path, command: str, **entries: Any) -> None:
             **entries,
             "wall_time_s": 0.0,
         }
-    _write(folder, record)
+    write_atomically(folder / RECORD, json.dumps(record, indent=2) + "\n")
 
 
 def commit() -> str | None:
@@ -60,8 +59,8 @@ def timed(folder: Path) -> Iterator[None]:
         yield
     finally:
         if record := read_record(folder):
-            seconds = record["wall_time_s"] + time.monotonic() - begin
-            _write(folder, {**record, "wall_time_s": round(seconds, 1)})
+            record["wall_time_s"] = round(record["wall_time_s"] + time.monotonic() - begin, 1)
+            write_atomically(folder / RECORD, json.dumps(record, indent=2) + "\n")
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -77,11 +76,5 @@ def check_version(folder: Path, key: str) -> None:
     """Check that this minor version of damian wrote a run folder; no version reads files of another one."""
     writer = str(read_record(folder).get("damian", damian.__version__))
     if writer.split(".")[:2] != damian.__version__.split(".")[:2]:
-        here = f"this is damian {damian.__version__}"
-        raise InputError(
-            f"{key}: {folder}: damian {writer} wrote it, and {here}: train again, or use {writer}"
-        )
-
-
-def _write(folder: Path, record: dict[str, Any]) -> None:
-    write_atomically(folder / RECORD, json.dumps(record, indent=2) + "\n")
+        problem = f"damian {writer} wrote it, and this is damian {damian.__version__}"
+        raise InputError(f"{key}: {folder}: {problem}: train again, or use {writer}")

@@ -3,7 +3,7 @@
 import math
 import random
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
 
-from damian.common.errors import InputError
 from damian.learners.schedule import SystemClock
 from damian.runs.checkpoint import read_checkpoint, restore, to_tensordict, write_checkpoint
 from damian.runs.metrics import EpisodeLog, HindsightReturns
@@ -32,10 +31,10 @@ class Progress:
     """Best mean episode return at a checkpoint so far."""
 
     def state_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        return vars(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.frames, self.updates, self.best = int(state["frames"]), int(state["updates"]), state["best"]
+        vars(self).update(state)
 
 
 class TrainingState:
@@ -89,37 +88,27 @@ class TrainingState:
 
     def load(self) -> None:
         """Continue from the checkpoint of the run, and remove what a killed run has left beside it."""
-        path = checkpoint_file(self.folder, "resume")
-        content = _content(path, "resume")
-        restore(self.components, content["components"], path, "resume")
-        restore(self._parts, content["training"], path, "resume")
+        path = self.folder / CHECKPOINT
+        content = read_checkpoint(path, "resume")
+        restore(self.components, content.get("components", {}), path, "resume")
+        restore(self._parts, content.get("training", {}), path, "resume")
         self.saved = self.progress.updates
         self._replay.remove_old()
 
 
 def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> None:
     """Restore some components of a learner in place, such as its actor."""
-    path = checkpoint_file(written, key)
-    restore(components, _content(path, key)["components"], path, key)
+    path = checkpoint_file(written)
+    restore(components, read_checkpoint(path, key).get("components", {}), path, key)
 
 
-def checkpoint_file(written: Path, key: str) -> Path:
+def checkpoint_file(written: Path) -> Path:
     """The file that a run folder, or a file in one, stands for."""
-    path = written if written.is_file() else written / CHECKPOINT
-    if not path.exists():
-        raise InputError(f"{key}: {path}: there is no such file, so there is nothing to load")
-    return path
+    return written if written.is_file() else written / CHECKPOINT
 
 
 def _states(parts: Mapping[str, Any]) -> dict[str, Any]:
     return {name: part.state_dict() for name, part in parts.items()}
-
-
-def _content(path: Path, key: str) -> dict[str, Any]:
-    content = read_checkpoint(path, key)
-    if not all(isinstance(content.get(part), dict) for part in ("components", "training")):
-        raise InputError(f"{key}: {path}: it is not the checkpoint of a training")
-    return content
 
 
 class CarriedStep:

@@ -339,13 +339,9 @@ def empty_window(grid: SourceGrid, longest: int, n_worlds: int, n_agents: int, o
     return Window(belief, same, report, delay, slot)
 
 
-class Beliefs(NamedTuple):
-    """Probability of each cell after the latest step."""
-
-    server: Tensor
-    """As the server believes, [B, K]."""
-    own: Tensor
-    """As each of the other receivers believes, [B, V - 1, K]."""
+Beliefs = tuple[Tensor, Tensor]
+"""Probability of each cell after the latest step, as the server believes, [B, K], and as each of the other
+receivers does, [B, V - 1, K]."""
 
 
 def begin_beliefs(
@@ -364,8 +360,8 @@ def advance_beliefs(
     ``report`` [B, N]: what the messages of this step report (``report_rows``); ``delay`` [B, N]: their delays
     [steps], negative if they never arrive.
     """
-    slot, *beliefs = _advance(*_parts(grid, window), report, delay, region, stepped)
-    return window._replace(slot=slot), Beliefs(*beliefs)
+    slot, on_server, own = _advance(*_parts(grid, window), report, delay, region, stepped)
+    return window._replace(slot=slot), (on_server, own)
 
 
 def latest(window: Window, slot: Tensor) -> Beliefs:
@@ -373,7 +369,7 @@ def latest(window: Window, slot: Tensor) -> Beliefs:
     viewer = torch.arange(window.belief.shape[1], device=slot.device)
     world = torch.arange(len(slot), device=slot.device).unsqueeze(-1)
     row, held = _row(window, slot.unsqueeze(-1), viewer, world), window.belief.flatten(0, 2)
-    return Beliefs(held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:]))
+    return held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:])
 
 
 # Custom operators, because the number of worlds to work on depends on data, which no compiler can trace. An

@@ -38,11 +38,6 @@ class ObservationConfig(Settings):
         False,
         "Whether each UAV knows its own messages at once, not when the server has them, as in the paper.",
     )
-    estimate: str = setting(
-        "mean",
-        "Estimated place of the source: the mean of all UAVs' latest detections, or of the newest of them.",
-        choices=("mean", "newest"),
-    )
     belief: list[str] = setting(
         [], "Where the source is, by Bayes' rule: belief_gain (per action), belief_moments, belief_map."
     )

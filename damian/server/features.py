@@ -156,7 +156,7 @@ class Feature(NamedTuple):
 
 
 def feature(
-    scope: str, width: int | None = 1, low: float = 0.0, high: float = 1.0
+    scope: str, width: int | None = 1, low: float = 0.0, high: float = 1.0, name: str | None = None
 ) -> Callable[[Callable[[FeatureCache], Tensor]], Feature]:
     """Decorator that makes a feature of a function.
 
@@ -172,6 +172,7 @@ def feature(
         width: number of values for each UAV. With 1 the function returns [*, N], with more [*, N, width];
             None if it depends on the number of UAVs.
         low, high: lowest and highest possible value; networks learn best from values about 1 in size.
+        name: a short name under which settings know it, too.
 
     Examples:
         >>> @feature("local")
@@ -179,7 +180,12 @@ def feature(
         ...     return cache.messages.track / (2 * math.pi)
     """
     checks.one_of("scope of a feature", scope, ("local", "global", "belief", "timeline", "actor"))
-    return lambda compute: Feature(compute, scope, width, low, high)
+
+    def declare(compute: Callable[[FeatureCache], Tensor]) -> Feature:
+        declared = Feature(compute, scope, width, low, high)
+        return FEATURES.register(name)(declared) if name else declared
+
+    return declare
 
 
 FEATURES = Registry[Feature](
@@ -250,10 +256,7 @@ def _any_has_detected(v: FeatureCache) -> Tensor:
 
 def _to_source(v: FeatureCache) -> Tensor:
     """Vector from each UAV to the estimated position of the nearest known source [m], [*, N, 2]."""
-    detected_time = v.messages.detected_time
-    counts = detected_time >= 0  # [*, N, K]
-    if v.context.observation.estimate == "newest":
-        counts = counts & (detected_time == detected_time.amax(-2, keepdim=True))
+    counts = v.messages.detected_time >= 0  # [*, N, K]
     weight = counts.to(v.messages.position.dtype)
     total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-3, keepdim=True)
     estimate = total / weight.sum(-2).clamp(min=1)[..., None, :, None]
@@ -300,30 +303,26 @@ def of_others(v: FeatureCache, pairs: Tensor) -> Tensor:
     return different.reshape(*pairs.shape[:-2], n - 1, pairs.shape[-1])
 
 
-@FEATURES.register("source_distance")
-@feature("global")
+@feature("global", name="source_distance")
 def _source_distance(v: FeatureCache) -> Tensor:
     """Distance to the estimated source, over the largest vertex distance; 1 if it is unknown, [*, N]."""
     return torch.where(v(_any_has_detected), v(_raw_source_distance).clamp(max=1), 1.0)
 
 
-@FEATURES.register("source_bearing")
-@feature("global")
+@feature("global", name="source_bearing")
 def _source_bearing(v: FeatureCache) -> Tensor:
     """Bearing of the estimated source, clockwise from north, in turns; 1 if it is unknown, [*, N]."""
     return torch.where(v(_any_has_detected), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
 
 
-@FEATURES.register("source_drift")
-@feature("global")
+@feature("global", name="source_drift")
 def _source_drift(v: FeatureCache) -> Tensor:
     """((bearing - track) wrapped to [-pi, pi) + pi) / 2 pi: 0.5 if the UAV flies straight at the source."""
     turn = (v(_bearing) - v.messages.track) / (2 * math.pi)
     return torch.where(v(_any_has_detected), torch.remainder(turn + 0.5, 1.0), 1.0)
 
 
-@FEATURES.register("source_time")
-@feature("global")
+@feature("global", name="source_time")
 def _source_time(v: FeatureCache) -> Tensor:
     """Time since any UAV detected the source, over ``observation.time_scale``; 1 if unknown, [*, N]."""
     latest = v.messages.detected_time.flatten(-2).amax(-1, keepdim=True)
@@ -331,15 +330,13 @@ def _source_time(v: FeatureCache) -> Tensor:
     return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)
 
 
-@FEATURES.register("agent_distances")
-@feature("global", width=None)
+@feature("global", width=None, name="agent_distances")
 def _agent_distances(v: FeatureCache) -> Tensor:
     """Distances to the other UAVs in their order, over the largest vertex distance, [*, N, N - 1]."""
     return of_others(v, v(_pairwise).unsqueeze(-1)).squeeze(-1).clamp(max=1)
 
 
-@FEATURES.register("coverage")
-@feature("global")
+@feature("global", name="coverage")
 def _coverage(v: FeatureCache) -> Tensor:
     """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
     assert v.context.footprints is not None
@@ -351,15 +348,13 @@ def _coverage(v: FeatureCache) -> Tensor:
     return covered_share(v.context.footprints, trail, gather_rows(points, trail))
 
 
-@FEATURES.register("mean_distance")
-@feature("global")
+@feature("global", name="mean_distance")
 def _mean_distance(v: FeatureCache) -> Tensor:
     """Mean distance to the other UAVs, over the largest vertex distance, [*, N]."""
     return (v(_pairwise).sum(-1) / max(v.messages.time.shape[-1] - 1, 1)).clamp(max=1)
 
 
-@FEATURES.register("mean_distance_not_spotting")
-@feature("global")
+@feature("global", name="mean_distance_not_spotting")
 def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
     """Mean distance to the other UAVs that do not spot; 0 for a spotting UAV, or if there are no others."""
     silent = (~v.messages.spotted).to(v.scale.dtype)
@@ -368,8 +363,7 @@ def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
     return (total / others.clamp(min=1)).clamp(max=1)
 
 
-@FEATURES.register("mean_distance_spotting")
-@feature("global")
+@feature("global", name="mean_distance_spotting")
 def _mean_distance_spotting(v: FeatureCache) -> Tensor:
     """Mean distance of the spotting UAVs to the source; 0 if no UAV spots."""
     spotting = v.messages.spotted.to(v.scale.dtype)
@@ -378,30 +372,26 @@ def _mean_distance_spotting(v: FeatureCache) -> Tensor:
     return mean.clamp(max=1).expand_as(spotting)
 
 
-@FEATURES.register("spotting_agents")
-@feature("global")
+@feature("global", name="spotting_agents")
 def _spotting_agents(v: FeatureCache) -> Tensor:
     """Share of the UAVs that spot the source, N_ss / N."""
     spotting = v.messages.spotted.to(v.scale.dtype)
     return spotting.mean(-1, keepdim=True).expand_as(spotting)
 
 
-@FEATURES.register("battery")
-@feature("local")
+@feature("local", name="battery")
 def _battery(v: FeatureCache) -> Tensor:
     """Level of the battery, as a share, [*, N]."""
     return observed(v.messages.battery, v.context.battery) / 100
 
 
-@FEATURES.register("spotted")
-@feature("local")
+@feature("local", name="spotted")
 def _spotted(v: FeatureCache) -> Tensor:
     """Whether the UAV detects the source, 0 or 1, [*, N]."""
     return v.messages.spotted.to(v.scale.dtype)
 
 
-@FEATURES.register("age")
-@feature("actor")
+@feature("actor", name="age")
 def _age(v: FeatureCache) -> Tensor:
     """Age of the UAV's message on the server, over ten seconds, [*, N]."""
     return (v.messages.age(v.context.now) / v.context.observation.age_scale).clamp(max=1)
@@ -415,8 +405,7 @@ BELIEF_SECTORS = 8
 """Sectors of ``belief_map``; the first one is centred on north, the others follow clockwise."""
 
 
-@FEATURES.register("belief_gain")
-@feature("belief", width=None)
+@feature("belief", width=None, name="belief_gain")
 def _belief_gain(v: FeatureCache) -> Tensor:
     """Probability of detecting the source next from where each discrete action leads, [*, N, A].
 
@@ -437,8 +426,7 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     return torch.where(nearest < 0, second.abs(), nearest).clamp(max=1)
 
 
-@FEATURES.register("belief_moments")
-@feature("belief", width=4, low=-1.0)
+@feature("belief", width=4, low=-1.0, name="belief_moments")
 def _belief_moments(v: FeatureCache) -> Tensor:
     """Way to the mean place (east, north), spread (over the region's size), share of the largest entropy."""
     belief, centres = v.belief, v.grid.centres
@@ -451,8 +439,7 @@ def _belief_moments(v: FeatureCache) -> Tensor:
     return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
 
 
-@FEATURES.register("belief_map")
-@feature("belief", width=(len(BELIEF_RINGS) + 1) * BELIEF_SECTORS)
+@feature("belief", width=(len(BELIEF_RINGS) + 1) * BELIEF_SECTORS, name="belief_map")
 def _belief_map(v: FeatureCache) -> Tensor:
     """Probability that the source is in each sector of three rings about the UAV, [*, N, 24]."""
     position = v.wanted(v.messages.position)

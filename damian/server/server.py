@@ -14,7 +14,7 @@ from torch import Tensor
 from damian import keys
 from damian.common import checks
 from damian.common.tensors import gather_rows, move_attributes
-from damian.server.belief import SourceGrid, build_source_grid, certain_belief
+from damian.server.belief import SourceGrid, build_source_grid
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext, check_features, feature_of, observe, observe_own, stack
 from damian.server.rewards import Counters, final_reward, reward, terms_of
@@ -197,11 +197,6 @@ class Server:
         """The features of these names, or all that an observation or a reward term needs (paper, Table 2)."""
         context = self._known(messages, steps)._replace(coverage=coverage, belief=belief)
         return observe(messages, context, names or self.names)
-
-    def privileged_features(self, messages: Messages, steps: Tensor, source: Tensor) -> Features:
-        """The features of somebody who knows where the sources are, [*, K, 2] metres."""
-        belief = None if self.grid is None else certain_belief(self.grid, source[..., 0, :])
-        return self.features(messages, steps, belief=belief)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
         """Observations of the actors [*, N, F] and of the critic [*, N, G]."""

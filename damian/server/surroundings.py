@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from damian.common.tensors import distances, gather_rows
-from damian.server.features import FEATURES, FeatureCache, feature, of_others
+from damian.server.features import FeatureCache, feature, of_others
 from damian.world.airspace import Airspace
 from damian.world.messages import Messages
 from damian.world.requests import is_open
@@ -48,15 +48,13 @@ def places_inside(airspace: Airspace, radius: float) -> Tensor:
     return torch.from_numpy(np.stack(inside)).float().flatten(0, 1)
 
 
-@FEATURES.register("place")
-@feature("local", width=2, low=-1.0)
+@feature("local", width=2, low=-1.0, name="place")
 def _place(v: FeatureCache) -> Tensor:
     """Where the UAV stands or will land, east and north, over half the largest vertex distance, [*, N, 2]."""
     return (v.messages.target / (v.scale.unsqueeze(-1) / 2)).clamp(-1, 1)
 
 
-@FEATURES.register("number")
-@feature("local", width=OTHERS + 1)
+@feature("local", width=OTHERS + 1, name="number")
 def _number(v: FeatureCache) -> Tensor:
     """Which UAV it is: 1 in one of five columns, in the first one for the first and the sixth, [*, N, 5].
 
@@ -67,24 +65,21 @@ def _number(v: FeatureCache) -> Tensor:
     return F.one_hot(columns, OTHERS + 1).float().expand(*known.shape, OTHERS + 1)
 
 
-@FEATURES.register("kind")
-@feature("local", width=2)
+@feature("local", name="kind", width=2)
 def _kind(v: FeatureCache) -> Tensor:
     """Largest speed and battery capacity of the UAV, over the largest of all UAVs, [*, N, 2]."""
     assert v.context.kinds is not None
     return v.context.kinds.expand(*v.messages.time.shape, 2)
 
 
-@FEATURES.register("time_left")
-@feature("local")
+@feature("local", name="time_left")
 def _time_left(v: FeatureCache) -> Tensor:
     """Time left of ``observation.time_scale``, by default that of an episode, as its share, [*, N]."""
     left = 1 - v.context.now / v.context.time_scale
     return left.clamp(0, 1).unsqueeze(-1).expand(v.messages.time.shape)
 
 
-@FEATURES.register("others")
-@feature("global", width=5 * OTHERS, low=-1.0)
+@feature("global", width=5 * OTHERS, low=-1.0, name="others")
 def _others(v: FeatureCache) -> Tensor:
     """The nearest other UAVs, the nearest first, [*, N, 20]; zeros stand for those that do not exist.
 
@@ -97,16 +92,14 @@ def _others(v: FeatureCache) -> Tensor:
     return _four(torch.cat([ways[..., 0, :2], ways[..., 1, :]], -1))
 
 
-@FEATURES.register("ages")
-@feature("global", width=OTHERS)
+@feature("global", width=OTHERS, name="ages")
 def _ages(v: FeatureCache) -> Tensor:
     """Ages of what is known of the UAVs that ``others`` describes, over ten seconds, [*, N, 4]."""
     age = v.messages.age(v.context.now) / v.context.observation.age_scale
     return _four(_of_nearest(v, age.unsqueeze(-1)).clamp(max=1))
 
 
-@FEATURES.register("timeline")
-@feature("timeline", width=None, low=-1.0)
+@feature("timeline", width=None, low=-1.0, name="timeline")
 def _timeline(v: FeatureCache) -> Tensor:
     """What is known of the four nearest other UAVs by when it was true, [*, N, 4 (3 ``slots`` + 3)].
 
@@ -133,8 +126,7 @@ def known_requests(messages: Messages) -> tuple[Tensor, Tensor]:
     return requests, is_open(requests, messages.served)
 
 
-@FEATURES.register("requests")
-@feature("global", width=4 * REQUESTS, low=-1.0)
+@feature("global", name="requests", width=4 * REQUESTS, low=-1.0)
 def _requests(v: FeatureCache) -> Tensor:
     """The open requests that are nearest to where the UAV stands or will land, the nearest first, [*, N, 16].
 
@@ -153,8 +145,7 @@ def _requests(v: FeatureCache) -> Tensor:
     return F.pad(found, (0, 0, 0, REQUESTS - found.shape[-2])).flatten(-2)
 
 
-@FEATURES.register("served")
-@feature("local")
+@feature("local", name="served")
 def _served(v: FeatureCache) -> Tensor:
     """Whether the UAV serves a request with this message, 0 or 1, [*, N]."""
     return v.messages.serves.sum(-1)
@@ -193,8 +184,7 @@ def _four(described: Tensor) -> Tensor:
     return F.pad(described, (0, 0, 0, OTHERS - described.shape[-2])).flatten(-2)
 
 
-@FEATURES.register("coverage_map")
-@feature("global", width=len(RINGS) * SECTORS)
+@feature("global", width=len(RINGS) * SECTORS, name="coverage_map")
 def _coverage_map(v: FeatureCache) -> Tensor:
     """How new the ground at the places about the UAV is, from 0 (just covered, or outside) to 1, [*, N, 24].
 

@@ -178,13 +178,6 @@ class Episode:
             fixed["region"] = shapely.from_geojson(json.dumps(found["region"]))
             fixed["origin"] = found["origin"] and tuple(found["origin"])
             fixed["landing_points"] = np.asarray(found["landing_points"], float)
-            n_instants = len(columns["time"])
-            for name, values in columns.items():
-                for each in values.values() if isinstance(values, Mapping) else [values]:
-                    if each is not None and name != "cells" and len(each) != n_instants:
-                        raise ValueError(f"{name} has {len(each)} instants, and time has {n_instants}")
-            if (np.diff(columns["time"]) <= 0).any():
-                raise ValueError("time does not increase")
             return cls(**fixed, **columns)
         except (AttributeError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
             problem = f"no {error}" if isinstance(error, KeyError) else one_line(str(error))

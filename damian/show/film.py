@@ -46,6 +46,14 @@ def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
     first.save(path, save_all=True, append_images=others, duration=times, loop=0)
 
 
+def save_picture(episode: Episode, path: Path) -> None:
+    """Write the picture of the instant at which the server was most mistaken about where the UAVs were."""
+    error = np.linalg.norm(episode.true - episode.believed, axis=-1).sum(-1)
+    film = Film(episode)
+    film.draw(int(np.flatnonzero(error == error.max())[-1]))
+    film.figure.savefig(path, dpi=2 * DPI)
+
+
 class Film:
     """Draws the instants of an episode into one figure; ``2d``: from above, ``3d``: in space."""
 

@@ -50,10 +50,9 @@ class Frame:
     """Where the source may well be: polygons or several of them, with their probabilities."""
 
 
-def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
-    """An episode after ``step`` steps; paths reach ``trail`` steps back, or with None to the beginning."""
-    trail = CROWDED_TRAIL if episode.is_crowded else trail
-    begin = 0 if trail is None else max(step - trail, 0)
+def frame_of(episode: Episode, step: int) -> Frame:
+    """An episode after ``step`` steps."""
+    begin = max(step - (CROWDED_TRAIL if episode.is_crowded else TRAIL), 0)
     known, emits, asked = episode.source, episode.emits, episode.requests
     belief = [] if episode.belief is None else episode.belief[step]
     uavs = [

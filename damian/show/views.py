@@ -7,7 +7,7 @@ import shapely
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PatchCollection
-from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
+from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Circle, PathPatch
@@ -37,8 +37,6 @@ _HALO = [withStroke(linewidth=1.8, foreground="white")]
 _NAME = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points", "path_effects": _HALO}
 _AROUND = np.array([(1, 0.5), (1, -0.5), (-1, 0.5), (-1, -0.5), (0, 1), (0, -1), (1, 1), (-1, -1)])
 """Where a name may stand beside its mark."""
-MOST_STEPS, _BINS = 200, 100
-"""Largest number of steps whose messages are drawn one by one, and number of spans of the time beyond it."""
 
 
 class MapView:
@@ -149,12 +147,9 @@ class SpaceView:
 
 
 def draw_messages(axis: Axes, episode: Episode, colours: list[str]) -> None:
-    """Draw a row for each UAV with its messages over the time of sending; shares in spans of a long time."""
-    many = episode.n_steps > MOST_STEPS
+    """Draw a row for each UAV with its messages over the time of sending."""
     dt = float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
-    if many:
-        _draw_shares(axis, episode, colours)
-    for uav, colour in enumerate([] if many else colours):
+    for uav, colour in enumerate(colours):
         sent = np.flatnonzero(episode.sent[:, uav])
         begin, delay = episode.time[sent], episode.delay[sent, uav]
         late, lost = delay > 0, delay < 0
@@ -165,37 +160,17 @@ def draw_messages(axis: Axes, episode: Episode, colours: list[str]) -> None:
         axis.plot(at_once, np.full(len(at_once), uav), ".", color=colour, markersize=3)
         axis.plot(ends[:, 1], np.full(len(ends), uav), ">", color=colour, markersize=3.5)
         axis.plot(begin[lost], np.full(lost.sum(), uav), "x", color=INK, markersize=4.5)
-    name_rows(axis, episode)
-    axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
-    marks = "dots arrive at once, bars are late, crosses are lost"
-    shares = "the stronger the colour, the more are late, the higher the bar, the more are lost"
-    axis.set_xlabel(f"messages over time [s]: {shares if many else marks}")
-
-
-def name_rows(axis: Axes, episode: Episode) -> None:
-    """Name the UAVs at the rows of an axis."""
     size = min(8.0, 50 * height_of_rows(episode.n_agents) / episode.n_agents)
     axis.set_yticks(range(episode.n_agents), [_short(name) for name in episode.names], fontsize=size)
     axis.spines["left"].set_visible(False)
     axis.tick_params(left=False)
+    axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
+    axis.set_xlabel("messages over time [s]: dots arrive at once, bars are late, crosses are lost")
 
 
 def height_of_rows(n_agents: int) -> float:
     """Height of a row for each UAV [inches]."""
     return 0.2 + 0.22 * min(n_agents, 8) + 0.14 * min(max(n_agents - 8, 0), 60)
-
-
-def _draw_shares(axis: Axes, episode: Episode, colours: list[str]) -> None:
-    """Draw the share of late messages (opacity of a cell) and of lost ones (a bar) in each time span."""
-    spans, end = np.arange(episode.n_steps + 1) * _BINS // (episode.n_steps + 1), float(episode.time[-1])
-    places, picture = (np.arange(_BINS) + 0.5) * end / _BINS, np.zeros((len(colours), _BINS, 4))
-    for uav, colour in enumerate(colours):
-        sent = np.maximum(np.bincount(spans, episode.sent[:, uav], _BINS), 1)
-        picture[uav, :, :3] = to_rgb(colour)
-        picture[uav, :, 3] = 0.1 + 0.9 * np.bincount(spans, episode.late[:, uav], _BINS) / sent
-        lost = np.bincount(spans, episode.lost[:, uav], _BINS) / sent
-        axis.bar(places, -0.9 * lost, end / _BINS, uav + 0.45, color=INK)
-    axis.imshow(picture, extent=(0, end, len(colours) - 0.5, -0.5), aspect="auto", interpolation="nearest")
 
 
 def draw_scale(axis: Axes) -> None:

@@ -1,13 +1,12 @@
 """Delays, action histories and slow clocks as TorchRL transforms, on any TorchRL environment."""
 
 from damian.transforms.action import ActionDelay
-from damian.transforms.base import StatefulTransform, check_order, set_seed
+from damian.transforms.base import StatefulTransform, set_seed
 from damian.transforms.channel import Channel
 from damian.transforms.history import ActionHistory
 from damian.transforms.hold import SampleAndHold
 from damian.transforms.observation import ObservationDelay
 from damian.transforms.reward import CumulativeReward, RewardDelay
-from damian.transforms.stored import delay_trajectories
 from damian.transforms.timeline import ObservationTimeline
 
 __all__ = [
@@ -20,7 +19,5 @@ __all__ = [
     "RewardDelay",
     "SampleAndHold",
     "StatefulTransform",
-    "check_order",
-    "delay_trajectories",
     "set_seed",
 ]

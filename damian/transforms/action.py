@@ -1,7 +1,6 @@
 """A transform that delays actions (paper, section 3.3), and what transforms that remember actions share."""
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -90,14 +89,10 @@ class ActionTransform(StatefulTransform):
         """A value of ``actions`` for each of the M rows, [M, ...]."""
         return self.as_rows_of_spec(value, self.env.full_action_spec, self.action_key)
 
-    @cached_property
+    @property
     def actions(self) -> ActionSpecs:
         """Shape, range and default of the actions, by the environment's specs."""
         return read_action_specs(self.env, self.action_key, self.default)
-
-    def empty_cache(self) -> None:
-        super().empty_cache()
-        self.forget_specs()
 
 
 class ActionDelay(ActionTransform):

@@ -13,9 +13,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import (
     Compose,
-    ConditionalSkip,
     EnvBase,
-    NoopResetEnv,
     RandomTruncationTransform,
     StepCounter,
     TerminateTransform,
@@ -207,17 +205,6 @@ class StatefulTransform(Transform):
         """Expand a mask of worlds [B] to a mask of rows [M]."""
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
-    def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        """The memory if only the worlds ``stepped`` [B] have stepped; the others have sent nothing.
-
-        Buffers that a step writes in place are right already, as ``on_step`` knows who has stepped.
-        """
-        rows, merged = self.expand_worlds(stepped), {}
-        for name, new in after.items():
-            old = before[name]
-            merged[name] = new if new is old else torch.where(expand_mask(rows, new), new, old)
-        return merged
-
     def sending_rows(self, entries: Entries) -> Tensor | None:
         """The rows that send a message in this step, [M] bool; None if all do."""
         sending = None if self.sent_key is None else entries[self.sent_key].reshape(-1)
@@ -280,13 +267,16 @@ class StatefulTransform(Transform):
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
     ) -> Change:
-        """Undo a change in the worlds that do not step: ``before`` has their entries, or else ``after``."""
-        memory, entries = change
-        stepped = stepped.reshape(-1)
-        memory = self.merge_worlds(self.memory, memory, stepped)
-        rows = self.expand_worlds(stepped)
+        """Undo a change in the worlds that do not step: ``before`` has their entries, or else ``after``.
+
+        Buffers that a step writes in place are right already, as ``on_step`` knows who has stepped.
+        """
+        rows, memory = self.expand_worlds(stepped.reshape(-1)), self.memory
+        for name, new in change[0].items():
+            if new is not memory[name]:
+                memory[name] = torch.where(expand_mask(rows, new), new, memory[name])
         merged: Entries = {}
-        for key, new in entries.items():
+        for key, new in change[1].items():
             # A later transform that widens an entry restores it itself.
             found = (td.get(key, None) for td in (before, after))
             same_shape = (value for value in found if value is not None and value.shape == new.shape)
@@ -342,7 +332,7 @@ class StatefulTransform(Transform):
         name = type(self).__name__
         raise RuntimeError(
             f"{name} remembers earlier steps, so it works only in an environment, after a reset: "
-            f"TransformedEnv(env, {name}(...)); for stored steps, call damian.delay_trajectories(data, ...)"
+            f"TransformedEnv(env, {name}(...)); for stored steps: examples/transforms/late_replay_buffer.py"
         )
 
     # Copies and checkpoints.
@@ -453,9 +443,8 @@ class StatefulTransform(Transform):
 def check_order(transforms: Sequence[Transform]) -> None:
     """Refuse an order, as outputs pass the transforms, in which one undoes or misses what another does.
 
-    Raises ``InputError`` if a transform reads what one of an earlier stage changes after it, if rewards in
-    transit would be lost at an end of the episode, or if TorchRL's transforms take or skip steps unknown to
-    others.
+    Raises ``InputError`` if a transform reads what one of an earlier stage changes after it, or if rewards in
+    transit would be lost at an end of the episode.
     """
     for first, second in itertools.combinations(transforms, 2):
         problem = None
@@ -473,10 +462,6 @@ def check_order(transforms: Sequence[Transform]) -> None:
             )
         ):
             problem = "what is in transit at the end of an episode would be lost"
-        elif isinstance(first, StatefulTransform) and isinstance(second, NoopResetEnv):
-            problem = "it would remember what was before the idle steps"
-        elif isinstance(first, ConditionalSkip) and isinstance(second, StatefulTransform):
-            problem = "only then do the others know which worlds skip a step"
         if problem:
             names = type(first).__name__, type(second).__name__
             raise InputError(f"order of transforms: {names[0]} must come after {names[1]}: {problem}")

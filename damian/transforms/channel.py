@@ -1,6 +1,5 @@
 """A transform through which agents send messages to each other, which arrive late or are lost."""
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -10,7 +9,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
-from damian.delays.laws import link_sampler, same_size
+from damian.delays.laws import link_sampler
 from damian.delays.line import DelayLine, slot_rows
 from damian.delays.samplers import MessageContext
 from damian.keys import STEPPED
@@ -29,15 +28,15 @@ from damian.transforms.entries import (
 class Channel(StatefulTransform):
     """Lets the agents of a group send messages to each other, which arrive some steps later or are lost.
 
-    In each step an agent sends entries of its own (``in_keys``), or what its policy chooses (``action_key``).
+    In each step an agent sends an entry of its own (``in_key``), or what its policy chooses (``action_key``).
     Each receiver holds, of each sender, the message that was generated last of those that have arrived, and
     observes it, its age, and whether any has arrived in this episode. An agent knows its own message at once.
     The outputs of a reset are sent like those of a step; a chosen message exists from the first step on. No
     gradient flows through the channel.
 
     A ``DelayLine`` delays only the time at which a message was generated, on every link [M]; the latest K
-    messages of each of the S senders lie in a ring (``contents_i`` [K, S, ...]), and what is held in
-    ``held_i`` [M, ...]. The memory also has the ``sender`` of each link, and a ``link`` of each sender.
+    messages of each of the S senders lie in a ring (``contents`` [K, S, ...]), and what is held in ``held``
+    [M, ...]. The memory also has the ``sender`` of each link, and a ``link`` of each sender.
 
     A worked timeline, with a delay of 3 steps: the messages of the reset, t = 0, arrive at t = 3, and those
     of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds their messages of
@@ -47,13 +46,12 @@ class Channel(StatefulTransform):
         delay, dt, seed: as in ``ObservationDelay``, but drawn for each receiver and message; or an N x N
             nested list of delays, ``delay[receiver][sender]``, whose diagonal is not used. With a
             ``position_key``, a law may read ``position`` and ``receiver_position``.
-        in_keys: keys of the entries [*B, N, ...] of a group of agents that every agent sends together; if
-            neither this nor ``action_key`` is given, ``("agents", "observation")``. A bare name for another
-            key means an entry beside these.
-        out_keys: keys under which the received entries are written, [*B, N, N, ...] (receiver, sender); if
-            not given, ``received``, and with several in_keys ``received_`` and the name of each.
-        loss: probability that a message does not reach a receiver, or an N x N nested list of it.
-        hears: which sender each receiver hears, [N, N] of bool; all if not given.
+        in_key: key of the entry [*B, N, ...] of a group of agents that every agent sends; if neither this nor
+            ``action_key`` is given, ``("agents", "observation")``. A bare name for another key means an entry
+            beside it.
+        out_key: key under which the received entries are written, [*B, N, N, ...] (receiver, sender).
+        loss: probability that a message does not reach a receiver, or an N x N nested list of it, 1 where a
+            receiver never hears a sender.
         comm_range: an agent hears only agents within this distance [m] when they send.
         position_key: key of an entry [*B, N, ...] whose first two numbers are the agent's position [m].
         sent_key: key of a flag [*B, N] bool: does the agent send in this step.
@@ -75,11 +73,10 @@ class Channel(StatefulTransform):
     def __init__(
         self,
         delay: Any,
-        in_keys: NestedKey | Sequence[NestedKey] | None = None,
-        out_keys: NestedKey | Sequence[NestedKey] | None = None,
+        in_key: NestedKey | None = None,
+        out_key: NestedKey = "received",
         *,
         loss: Any = 0.0,
-        hears: Any = None,
         comm_range: float | None = None,
         position_key: NestedKey | None = None,
         sent_key: NestedKey | None = None,
@@ -94,29 +91,25 @@ class Channel(StatefulTransform):
     ) -> None:
         if action_key is not None:
             checks.whole("message_size", message_size, 1, unit="numbers")
-            should = "does not go with in_keys or known_at_reset: at a reset no message has been chosen yet"
-            checks.require(in_keys is None and not known_at_reset, "action_key", action_key, should)
+            should = "does not go with in_key or known_at_reset: at a reset no message has been chosen yet"
+            checks.require(in_key is None and not known_at_reset, "action_key", action_key, should)
         placed = position_key is not None
         checks.require(comm_range is None or placed, "comm_range", comm_range, "needs a position_key")
-        sent = None if action_key is not None else in_keys or ("agents", "observation")
-        super().__init__(sent, out_keys, seed=seed)
+        sent = None if action_key is not None else in_key or ("agents", "observation")
+        super().__init__(sent, seed=seed)
         self.action_key = None if action_key is None else unravel_key(action_key)
         self._beside = cast(NestedKey, self.action_key or self.in_keys[0])
         should = "is not in a group of agents, as ('agents', 'observation') is"
-        checks.require(isinstance(self._beside, tuple), "in_keys", self._beside, should)
-        several = [f"received_{key[-1]}" for key in self.in_keys]
-        names = self.out_keys or (several if len(several) > 1 else ["received"])
-        self.out_keys = existing(sibling_key(self._beside, key) for key in names)
-        self.age_key, self.mask_key, self.delay_key, self.sent_key, self.position_key = (
-            sibling_key(self._beside, key) for key in (age_key, mask_key, delay_key, sent_key, position_key)
+        checks.require(isinstance(self._beside, tuple), "in_key", self._beside, should)
+        written, self.age_key, self.mask_key, self.delay_key, self.sent_key, self.position_key = (
+            sibling_key(self._beside, key)
+            for key in (out_key, age_key, mask_key, delay_key, sent_key, position_key)
         )
-        self.out_keys += existing([self.age_key, self.mask_key, self.delay_key])
+        self.out_keys = existing([written, self.age_key, self.mask_key, self.delay_key])
         self.message_size, self.known_at_reset, self.dt = message_size, known_at_reset, dt
         self.comm_range = comm_range
-        self.hears = None if hears is None else torch.as_tensor(hears, dtype=torch.bool).flatten().tolist()
         self.sampler = link_sampler(delay, loss, dt)
-        links = {"delay": delay, "loss": loss} | ({} if hears is None else {"hears": hears})
-        self.n_agents = same_size(links) or getattr(self.sampler, "n_agents", None)
+        self.n_agents = getattr(self.sampler, "n_agents", None)
         """The number of agents for which links are given one by one, if any are."""
         for name in self.sampler.reads:
             given = placed and name in ("position", "receiver_position")
@@ -145,27 +138,22 @@ class Channel(StatefulTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         entries = select_entries(tensordict, self.step_keys)
-        contents = self._contents(entries, next(iter(tensordict.values(True, True))).device)
+        content = self._content(entries, next(iter(tensordict.values(True, True))).device)
         n = self.agents[-1]
-        streams = self.streams(tensordict.batch_size, contents[0].device, self.sampler)
+        streams = self.streams(tensordict.batch_size, content.device, self.sampler)
         links = torch.arange(len(streams), device=streams.device)
         receiver, sender = links // n, links % n
-        hears = receiver % n != sender
-        if self.hears is not None:
-            hears = hears & torch.tensor(self.hears, device=streams.device).repeat(len(streams) // n**2)
-        memory = self.line.init_memory([], streams) | {"sender": receiver // n * n + sender, "hears": hears}
+        memory = self.line.init_memory([], streams)
+        memory |= {"sender": receiver // n * n + sender, "hears": receiver % n != sender}
         memory["link"] = links.view(-1, n, n)[:, -1].flatten()
-        for i, content in enumerate(contents):
-            memory[f"contents_{i}"] = content.new_zeros(self._n_slots, *content.shape)
-            memory[f"held_{i}"] = content.new_zeros(len(links), *content.shape[1:])
+        memory["contents"] = content.new_zeros(self._n_slots, *content.shape)
+        memory["held"] = content.new_zeros(len(links), *content.shape[1:])
         return memory | {"delay": torch.zeros_like(streams)} if self.delay_key else memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        contents = self._contents(entries, mask.device)
-        self._put(memory, contents)
+        self._put(memory, self._content(entries, mask.device))
         begun, _ = self.line.reset(memory, [], mask)
-        for name in (f"held_{i}" for i in range(len(contents))):
-            begun[name] = begun[name].masked_fill(expand_mask(mask, begun[name]), 0)
+        begun["held"] = begun["held"].masked_fill(expand_mask(mask, begun["held"]), 0)
         sending = mask & self._wanted(entries, mask) & (self.action_key is None)
         after = self._send(begun, entries, sending)
         if self.known_at_reset:
@@ -180,39 +168,35 @@ class Channel(StatefulTransform):
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         if self.action_key:
-            self._put(memory, [as_rows(entries[self.action_key], self.agents)])
+            self._put(memory, as_rows(entries[self.action_key], self.agents))
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         if not self.action_key:
-            self._put(memory, self._contents(entries, memory["hears"].device))
+            self._put(memory, self._content(entries, memory["hears"].device))
         active = torch.ones_like(memory["hears"])
         if STEPPED in entries:
             active = self.expand_worlds(entries[STEPPED].reshape(-1))
         memory = memory | self._send(memory, entries, self._wanted(entries, active))
         return memory, self._outputs(memory)
 
-    def _contents(self, entries: Entries, device: torch.device) -> list[Tensor]:
-        """What the agents send at a reset, [B * N, ...] each; zeros for an action that is not chosen yet."""
+    def _content(self, entries: Entries, device: torch.device) -> Tensor:
+        """What the agents send at a reset, [B * N, ...]; zeros for an action that is not chosen yet."""
         if self.message_size:
-            return [torch.zeros(self.agents.numel(), self.message_size, device=device)]
-        return [as_rows(entries[key], self.agents) for key in self.in_keys]
+            return torch.zeros(self.agents.numel(), self.message_size, device=device)
+        return as_rows(entries[self.in_keys[0]], self.agents)
 
-    def _put(self, memory: Memory, contents: list[Tensor]) -> None:
-        """Write what the senders send in the next step, [S, ...] each; the step may send it or not."""
+    def _put(self, memory: Memory, content: Tensor) -> None:
+        """Write what the senders send in the next step, [S, ...]; the step may send it or not."""
         rows = slot_rows((memory["clock"][memory["link"]] + 1) % self._n_slots)
-        for i, content in enumerate(contents):
-            memory[f"contents_{i}"].flatten(0, 1).index_copy_(0, rows, content)
+        memory["contents"].flatten(0, 1).index_copy_(0, rows, content)
 
     def _hold(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [M] is true, hold the messages that were generated at ``generated_at``."""
-        slot, held = memory["generated_at"] % self._n_slots, {}
+        slot, old = memory["generated_at"] % self._n_slots, memory["held"]
         rows = slot * len(memory["link"]) + memory["sender"]
-        for i in range(len(self.in_keys) or 1):
-            old = memory[f"held_{i}"]
-            new = memory[f"contents_{i}"].flatten(0, 1).index_select(0, rows)
-            held[f"held_{i}"] = torch.where(expand_mask(mask, old), new, old)
-        return memory | held
+        new = memory["contents"].flatten(0, 1).index_select(0, rows)
+        return memory | {"held": torch.where(expand_mask(mask, old), new, old)}
 
     def _wanted(self, entries: Entries, active: Tensor) -> Tensor:
         """Links among the active ones [M] on which an agent wants to send, [M] bool."""
@@ -254,13 +238,11 @@ class Channel(StatefulTransform):
         is_own = (agents % n).unsqueeze(-1) == senders
         own_time = now.masked_fill(now == 1, 0) if self.action_key else now  # nothing is chosen at a reset
         time = torch.where(is_own, own_time, time)
-        entries: Entries = {}
         newest = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
-        for i, key in enumerate(self.out_keys[: len(self.in_keys) or 1]):
-            own = memory[f"contents_{i}"].flatten(0, 1).index_select(0, newest)
-            held = memory[f"held_{i}"].unflatten(0, (-1, n))
-            value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
-            entries[key] = value.view(*shape, *value.shape[2:])
+        own = memory["contents"].flatten(0, 1).index_select(0, newest)
+        held = memory["held"].unflatten(0, (-1, n))
+        value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
+        entries: Entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
         if self.age_key is not None:
             entries[self.age_key] = (now - time.clamp(min=1)).to(torch.float32).view(shape)
         if self.mask_key is not None:
@@ -287,11 +269,11 @@ class Channel(StatefulTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         agents = spec_rows(observation_spec, self._beside)
         pairs = (*agents, agents[-1])
-        sent = [observation_spec[key] for key in self.in_keys]
-        kinds = [(spec.shape[len(agents) :], spec.dtype) for spec in sent]
-        kinds += [((self.message_size,), torch.float32)] if self.message_size else []
-        for key, (size, dtype) in zip(self.out_keys, kinds, strict=False):
-            add_spec(observation_spec, key, (*pairs, *size), dtype)
+        if self.message_size:
+            add_spec(observation_spec, self.out_keys[0], (*pairs, self.message_size))
+        else:
+            sent = observation_spec[self.in_keys[0]]
+            add_spec(observation_spec, self.out_keys[0], (*pairs, *sent.shape[len(agents) :]), sent.dtype)
         add_spec(observation_spec, self.age_key, pairs)
         add_spec(observation_spec, self.mask_key, pairs, torch.bool)
         add_spec(observation_spec, self.delay_key, pairs, torch.long)

@@ -30,7 +30,8 @@ class ContextReader:
         beside: NestedKey,
         before_step: bool = False,
     ) -> None:
-        self._sees_context, self._dt, self.keys = sampler.sees_context, dt, dict[str, NestedKey]()
+        self._sees_context, self._dt, self._since_clock = sampler.sees_context, dt, 0 if before_step else 1
+        self.keys: dict[str, NestedKey] = {}
         """Keys of the entries that the law gets, by name."""
         known = dict(context_keys or {}) if sampler.sees_context else {}
         for name in sampler.reads:
@@ -38,7 +39,6 @@ class ContextReader:
             checks.require(name in known, "context_keys", known, should)
         for name, key in known.items():
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(key)))
-        self._since_clock = 0 if before_step else 1
 
     def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:
         """Add what the contexts need to the memory of the transform, M rows of the shape ``rows``."""

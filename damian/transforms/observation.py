@@ -28,8 +28,8 @@ class ObservationDelay(StatefulTransform):
     t = 4 shows observation 1, of age 3.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), a function
-            (``Function``), or a ``Sampler``. A delay is drawn for each world, each agent (under a nested
+        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), a function of a
+            ``MessageContext``, or a ``Sampler``. A delay is drawn for each world, each agent (under a nested
             key) and each step.
         in_keys: keys of the entries that are sent together, or one key. A bare name for another key means an
             entry beside the first one.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from damian import keys
-from damian.common import checks, devices
+from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask, next_true
 from damian.delays.laws import LOSES, sampler_of
@@ -258,7 +258,8 @@ class CumulativeReward(StatefulTransform):
 def discounted_sum(past: Tensor, gamma: float) -> Tensor:
     """The discounted sum (paper, eq. 4) of the latest K rewards, the newest first, [K, ...]."""
     dtype = torch.promote_types(past.dtype, torch.float32)
-    weights = devices.constant(tuple(gamma**age for age in range(len(past))), dtype, past.device)
+    ages = torch.arange(len(past), dtype=torch.float64, device=past.device)
+    weights = (gamma**ages).to(dtype)
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
     weighted = weights.view(-1, *[1] * (past.dim() - 1)) * past
     return weighted.sum(0, dtype=torch.float64).to(dtype)

@@ -17,17 +17,15 @@ def compose_scenario(*overrides: str) -> ScenarioConfig:
     return settings(*overrides)
 
 
-def gymnasium_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavGymEnv:
-    """One UAV in a task, for ``gymnasium.make("damian/Spotting-v0", overrides=["delay.obs=3"])``.
+def gymnasium_env(
+    task: str, overrides: Sequence[str] = (), num_envs: int | None = None, **options: Any
+) -> UavGymEnv | UavVectorEnv:
+    """A task with one UAV, for ``gymnasium.make("damian/Spotting-v0", overrides=["delay.obs=3"])``.
 
-    ``options`` are ``seed``, ``render_mode`` and ``view`` of ``UavGymEnv``.
+    With ``num_envs`` it is many worlds, as ``gymnasium.make_vec("damian/Spotting-v0", num_envs=1024)`` makes
+    them. ``options`` are further ones of ``UavGymEnv`` (``seed``, ``render_mode``, ``view``), or ``seed``.
     """
-    return UavGymEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)
-
-
-def gymnasium_vector_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavVectorEnv:
-    """Many worlds of a task with one UAV, for ``gymnasium.make_vec("damian/Spotting-v0", num_envs=1024)``.
-
-    ``options`` are ``num_envs`` and ``seed`` of ``UavVectorEnv``.
-    """
-    return UavVectorEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)
+    scenario = compose_scenario(f"scenario={task}", "agents=1", *overrides)
+    if num_envs is None:
+        return UavGymEnv(scenario, **options)
+    return UavVectorEnv(scenario, num_envs, **options)

@@ -1,10 +1,7 @@
 """The parts of a training: environment, learner, replay buffer, and batches between ticks of its clock."""
 
-import os
-import sys
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from typing import cast
 
 import torch
@@ -39,31 +36,12 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     messages = backupdates(config) or measures_hindsight(config) or triggered
     privileged = config.critic == "privileged"
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
-    warn_of_memory(config)
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config, config.worlds, config.seed, config.device, extras)
     if config.compiles:
         env.compile()
     env.append_transform(EpisodeTotals())
     return env
-
-
-def warn_of_memory(config: TrainConfig) -> None:
-    """Say on one line if the steps of a batch alone take more memory than there is; small ones never do."""
-    steps = config.worlds * config.update_steps
-    if steps * config.agents < 10**8 or config.device != "cpu" or not hasattr(os, "sysconf"):
-        return
-    region = replace(config.region, pool=1, initial_conditions=1)
-    one = make_env(replace(config, region=region), 1)
-    needed, there = (
-        one.fake_tensordict().bytes() * steps,
-        os.sysconf("SC_PAGESIZE") * os.sysconf("SC_PHYS_PAGES"),
-    )
-    if needed > there:
-        what = (
-            f"the steps of {config.worlds} worlds of {config.agents} UAVs take at least {needed / 1e9:.0f} GB"
-        )
-        print(f"worlds: {what}, and this machine has {there / 1e9:.0f} GB: choose fewer", file=sys.stderr)
 
 
 def own_code(learner: str) -> AbstractContextManager[None]:

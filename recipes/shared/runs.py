@@ -1,13 +1,12 @@
 """Runs in their folders: starting and resuming them, and taking settings and policy of a stored one."""
 
-import copy
 import json
 import random
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +20,11 @@ from omegaconf import DictConfig
 from damian.common.atomic_files import remove_unfinished, write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.fields import default_of, filled, has, leaves, nested, set_at, value_at
-from damian.common.registry import IMPORTED, stored_settings
+from damian.common.registry import stored_settings
 from damian.common.text_files import read_text, show
-from damian.envs.config import ScenarioConfig
 from damian.learners.config import LearnerConfig
 from damian.runs.checkpoint import digest
-from damian.runs.run_folder import CHECKPOINT, CONFIG, FAILED, RESULTS, check_no_links
-from damian.runs.run_lock import locked
+from damian.runs.run_folder import CHECKPOINT, CONFIG, FAILED, RESULTS, check_no_links, locked
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
 
@@ -43,24 +40,22 @@ JOB, SEED = "job", "seed"
 POLICY = "policy_sha256"
 """Entry of a run that begins with a stored policy: the SHA-256 of its checkpoint."""
 
-# ------------------------------------------------------------------------------------------ starting
 
-
-def start(work: Work, given: DictConfig, program: str = "train", again: bool = False) -> None:
+def start(work: Work, given: DictConfig, program: str = "train") -> None:
     """Do the work of a program with what Hydra has composed, in the folder that Hydra has made.
 
-    With ``again`` the same command in the same folder goes on with what is there. A run of a sweep always
-    does, and keeps what goes wrong in its folder, so that the others go on.
+    A run of a sweep goes on with what is there, and keeps what goes wrong in its folder, so that the others
+    go on.
     """
     running = HydraConfig.get()
     folder, words = short(Path(running.runtime.output_dir)), [*running.overrides.task]
     if running.mode is not RunMode.MULTIRUN:
         with one_line_errors(program):
-            _carry_out(work, plain(given, words, program), words, program, folder, again)
+            _carry_out(work, plain(given, words, program), words, program, folder)
         return
     try:
         (folder / FAILED).unlink(missing_ok=True)
-        _carry_out(work, plain(given, words, program), words, program, folder, sweeps=True)
+        _carry_out(work, plain(given, words, program), words, program, folder, of_sweep=True)
     except Exception as error:  # a run of a sweep stands alone, whatever its settings and the user's code do
         if not isinstance(error, (InputError, RunError, OSError, *ERRORS)):
             traceback.print_exc()
@@ -70,40 +65,27 @@ def start(work: Work, given: DictConfig, program: str = "train", again: bool = F
 
 
 def _carry_out(
-    work: Work,
-    values: Any,
-    words: list[str],
-    program: str,
-    folder: Path,
-    again: bool = False,
-    sweeps: bool = False,
+    work: Work, values: Any, words: list[str], program: str, folder: Path, of_sweep: bool = False
 ) -> None:
     with only_named_code(values):
         resumes = program == "train" and values["resume"] is not None
         if resumes:
             folder = short(Path(values["resume"]))
             config: Any = resumed(folder, values, words)
-        elif values.get("checkpoint") is None or again:
+        elif values.get("checkpoint") is None:
             config = filled(SCHEMAS[program], values)
         else:
             config = with_policy_of(values, words, program)
-        if program == "compare":
-            only_reads = config.report_only  # a comparison may be reported on while it runs
-        else:
-            config.overrides, only_reads = words, False
-            check_components(config)
-        if sweeps and not resumes and (config := left_to_do(config, folder)) is None:
-            return
-        if not (again or sweeps or resumes) and (folder / CONFIG).exists():
-            remedy = f"choose another folder, or continue the run with resume={folder}"
-            raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
-        key = "resume" if resumes else "hydra.run.dir"
-        check_no_links(folder, key)
-        with nullcontext() if only_reads else locked(folder, key):
-            if again:
-                work(config, folder)
-            else:
-                perform(config, folder, work)
+        config.overrides = words
+        check_components(config)
+        if not resumes and (folder / CONFIG).exists():
+            if not of_sweep:
+                remedy = f"choose another folder, or continue the run with resume={folder}"
+                raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
+            check_stored(config, folder)
+            if finished(config, folder):
+                return
+        perform(config, folder, work, "resume" if resumes else "hydra.run.dir")
 
 
 def only_named_code(values: Mapping[str, Any]) -> AbstractContextManager[None]:
@@ -122,32 +104,21 @@ def texts(values: Any) -> Iterator[str]:
             yield from texts(each)
 
 
-def left_to_do(config: TrainConfig, folder: Path) -> TrainConfig | None:
-    """The settings of a run that goes on in its folder, or begins; None if it is finished.
+def finished(config: TrainConfig, folder: Path) -> bool:
+    """Whether a folder holds the results of a run, and of the policy that its checkpoint holds now."""
+    return (folder / RESULTS).exists() and _same_policy(config, folder)
 
-    Raises:
-        InputError: the folder holds another run.
-    """
-    if not (folder / CONFIG).exists():
-        return config
-    check_stored(config, folder)
-    if (folder / RESULTS).exists():
-        policy = read_record(folder).get(POLICY)
-        if policy and policy != digest(checkpoint_file(Path(str(config.checkpoint)), "checkpoint")):
-            problem = f"its results are not of the policy that {config.checkpoint} holds now"
-            raise InputError(f"checkpoint: {folder}: {problem}: delete the folder")
-        return None
-    return replace(config, resume=str(folder)) if (folder / CHECKPOINT).exists() else config
+
+def _same_policy(config: TrainConfig, folder: Path) -> bool:
+    policy = read_record(folder).get(POLICY)
+    return policy is None or policy == digest(checkpoint_file(Path(str(config.checkpoint))))
 
 
 def check_stored(config: TrainConfig, folder: Path) -> None:
     """Check that a run folder is empty or holds a run with the same settings."""
     if not (folder / CONFIG).exists():
         return
-    try:
-        stored = stored_values(folder, "hydra.run.dir")
-    except InputError as error:
-        raise InputError(f"{error}; delete the folder") from error
+    stored = stored_values(folder, "hydra.run.dir")
     for key, new in leaves(config):
         old = value_at(stored, key)
         if old != new and key not in ("resume", "checkpoint", "learner.teacher", "trust"):
@@ -157,13 +128,21 @@ def check_stored(config: TrainConfig, folder: Path) -> None:
             )
 
 
-def perform(config: TrainConfig, folder: Path, work: Work) -> None:
-    """Do the work of a program in one thread with the seed of its settings."""
+def perform(config: TrainConfig, folder: Path, work: Work, key: str = "hydra.run.dir") -> None:
+    """Do the work of a program in one thread with the seed of its settings; a run goes on that has begun.
+
+    ``key`` is the setting that names the folder.
+    """
     torch.set_num_threads(1)
     seed_generators(config.seed)
-    remove_unfinished(folder)
-    with timed(folder):
-        work(config, folder)
+    with locked(folder, key):
+        if (folder / CONFIG).exists() and (folder / CHECKPOINT).exists() and _same_policy(config, folder):
+            config = replace(config, resume=str(folder))
+        if not config.resume:
+            (folder / RESULTS).unlink(missing_ok=True)  # those of a policy that is not there any more
+        remove_unfinished(folder)
+        with timed(folder):
+            work(config, folder)
     print(f"results: {folder}")
 
 
@@ -182,12 +161,9 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     if HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN:
         entries[JOB] = HydraConfig.get().job.num
     if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
-        entries[POLICY] = digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
-    write_record(folder, command(), **entries)
+        entries[POLICY] = digest(checkpoint_file(Path(config.checkpoint)))
+    write_record(folder, command(), config.resume is not None, **entries)
     write_atomically(folder / CONFIG, yaml.safe_dump(nested(config), sort_keys=False, allow_unicode=True))
-
-
-# ------------------------------------------------------------------------------------------ stored runs
 
 
 def run_folder(written: Path) -> Path:
@@ -229,11 +205,6 @@ COMMON = {each.name for each in fields(TrainConfig)}
 """Settings that the runs of all programs have."""
 
 
-def names_own_code(config: TrainConfig) -> bool:
-    """Do the settings name components of your own, which a program imports only with ``trust=true``?"""
-    return not IMPORTED.isdisjoint(texts(asdict(config)))
-
-
 def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> TrainConfig:
     """The settings of a run to resume; only ``frames`` and ``episodes`` may change."""
     allowed, stored = ("resume", "frames", "episodes", "trust"), read_record(folder).get(OVERRIDES) or ()
@@ -242,12 +213,8 @@ def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> Tr
         problem += f"{folder} {refused[0]} begins a new run with its policy"
         raise InputError(f"{refused[0]}: {problem}")
     config = stored_config(folder, "resume")
-    checkpoint_file(folder, "resume")
     changed = {key: values[key] for key in ("frames", "episodes") if key in map(key_of, words)}
     return replace(config, resume=str(folder), **changed)
-
-
-# ------------------------------------------------------------------------------------------ flying
 
 
 def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = "train") -> Any:
@@ -258,7 +225,7 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
     """
     folder = run_folder(Path(values["checkpoint"]))
     stored = stored_config(folder, "checkpoint")
-    merged = copy.deepcopy(nested(stored))
+    merged = nested(stored)
     common = [(each.name, default_of(each)) for each in fields(TrainConfig)]
     own = {f.name for f in fields(SCHEMAS[program]) if (f.name, default_of(f)) not in common}
     kept = {key: value_at(merged, key) for key in ("delay.history", "delay.messages")}
@@ -271,8 +238,6 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
             set_at(merged, key, value)
     config = filled(SCHEMAS[program], merged)
     check_policy_fits(config, stored)
-    if changed := changes(config, stored):
-        print(f"changed since the training: {changed}")
     return config
 
 
@@ -305,31 +270,17 @@ def any_number_of_uavs(config: TrainConfig) -> bool:
 
 def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
-    observation, actions, model = config.observation, config.actions, config.model
-    discrete, learner = actions.kind == "discrete", config.learner
+    observation, learner, settings = config.observation, config.learner, dict(leaves(config))
     own_actor = type(learner).make_actor is not LearnerConfig.make_actor
+    sees_all = learner.actor_follows_critic or not observation.ctde
+    discrete = config.actions.kind == "discrete"
+    keys = ["observation.ctde", "observation.local_features", "observation.belief", "observation.age"]
+    keys += ["observation.timeline", "delay.history", "delay.messages", "actions.kind"]
     return {
         "learner": learner.name if own_actor else "an actor as mappo and sac have",
-        "observation.ctde": observation.ctde,
-        "observation.local_features": [*observation.local_features],
-        "observation.global_features": [*observation.global_features]
-        * (learner.actor_follows_critic or not observation.ctde),
-        "observation.belief": [*observation.belief],
-        # After the features, from which it follows: a policy with other features does not lack UAVs.
+        **{key: settings[key] for key in (*keys, *(key for key in settings if key.startswith("model.")))},
+        "observation.global_features": [*observation.global_features] * sees_all,
         "agents": "any number of UAVs" if any_number_of_uavs(config) else config.agents,
-        "observation.age": observation.age,
-        "delay.history": config.delay.history,
-        "delay.messages": config.delay.messages,
-        "actions.kind": actions.kind,
-        "number of actions.distances": discrete and len(actions.distances),
-        "number of actions.headings": discrete and len(actions.headings),
-        **{f"model.{each.name}": getattr(model, each.name) for each in fields(model)},
+        "number of actions.distances": discrete and len(config.actions.distances),
+        "number of actions.headings": discrete and len(config.actions.headings),
     }
-
-
-def changes(config: TrainConfig, stored: TrainConfig) -> str:
-    """The settings of the scenario that differ between a stored run and a new one, on one line."""
-    names = {each.name for each in fields(ScenarioConfig)}
-    old, new = ({k: v for k, v in leaves(each) if k.split(".")[0] in names} for each in (stored, config))
-    differ = [key for key in new if key not in old or old[key] != new[key]]
-    return ", ".join(f"{key}: {show(old.get(key, 'none'))} -> {show(new[key])}" for key in differ)

@@ -4,7 +4,7 @@ from damian import keys
 from damian.common import checks
 from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
-from damian.runs.loggers import check_loggers
+from damian.runs.metrics_log import check_loggers
 from damian.server.features import check_features
 from damian.server.rewards import terms_of
 from damian.world.regions.sources import REGION_SOURCES

@@ -18,7 +18,6 @@ from damian.common.text_files import read_text
 from damian.compare.figures import plot_means
 from damian.compare.paired import as_table, means
 from damian.runs.run_folder import (
-    CONFIG,
     DETERMINISTIC,
     FAILED,
     RANDOM,
@@ -32,29 +31,21 @@ from damian.runs.run_record import read_record
 
 from ..cli import short
 from ..known import key_of
-from .comparison_results import FIGURE, MARKDOWN, ROWS
+from .comparison_runs import FIGURE, MARKDOWN, ROWS
 from .runs import JOB, OVERRIDES, SEED
 
 
 class SweepReport(Callback):
-    """Reports on a sweep when all of its runs have ended, whichever processes or machines they were in."""
+    """Reports on a sweep when all of its runs have ended, wherever they were; exit code 1 if one failed."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        str(config.hydra.sweep.subdir)  # the names of the runs' folders need the words of the whole sweep
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        end(short(Path(config.hydra.sweep.dir)))
-
-
-def end(folder: Path) -> None:
-    """Report on a sweep that has ended; the exit code says if something failed, and if nothing began."""
-    failed = [*folder.rglob(FAILED)]
-    if failed and not any(folder.rglob(CONFIG)):  # wrong input of every run: nothing is kept of it
-        for file in failed:
-            file.unlink()
-            with suppress(OSError):
-                file.parent.rmdir()
-        sys.exit(2)
-    print(f"\nresults of the sweep:\n\n{report(folder)}\n\nresults: {folder}")
-    if failed:
-        sys.exit(1)
+        folder = short(Path(config.hydra.sweep.dir))
+        print(f"\nresults of the sweep:\n\n{report(folder)}\n\nresults: {folder}")
+        if any(folder.rglob(FAILED)):
+            sys.exit(1)
 
 
 def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
@@ -66,50 +57,36 @@ def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
         check_no_links(run, "folders")
     records = {run: read_record(run) for run in runs}
     runs.sort(key=lambda run: records[run].get(JOB, 0))  # as the command line names them
-    swept, given = _differing([records[run].get(OVERRIDES, []) for run in runs])
+    words = [[word.partition("=") for word in records[run].get(OVERRIDES, [])] for run in runs]
+    given = pd.DataFrame([{key_of(key): value for key, _, value in line} for line in words]).fillna("")
+    given = given[[key for key in given if given[key].nunique() > 1 and key != "seed"]]
+    for key in given:
+        with suppress(ValueError):  # a setting that is no number
+            given[key] = pd.to_numeric(given[key])
     tables = []
-    for run, settings in zip(runs, given, strict=True):
-        labels = {**settings, "seed": records[run].get(SEED)}
-        labels["folder"] = str(run.relative_to(folder))
+    for run, settings in zip(runs, given.to_dict("records"), strict=True):
+        labels = {**settings, "seed": records[run].get(SEED), "folder": str(run.relative_to(folder))}
         rows = read_results(run / RESULTS)
         tables.append(rows.assign(**labels)[[*labels, *rows.columns]])
-    return swept, pd.concat(tables, ignore_index=True)
-
-
-def _differing(words: Sequence[Sequence[str]]) -> tuple[list[str], list[dict[str, Any]]]:
-    """The keys, without the seed, that are not the same in all command lines, and their values in each."""
-    given = pd.DataFrame([{key_of(word): word.partition("=")[2] for word in line} for line in words])
-    given = given.fillna("")
-    keys = [str(key) for key in given if given[key].nunique() > 1 and key != "seed"]
-    return keys, [{key: _value(line[key]) for key in keys} for _, line in given.iterrows()]
-
-
-def _value(text: str) -> int | float | str:
-    """A swept value as a number if it is one."""
-    try:
-        return int(text) if text.lstrip("-").isdecimal() else float(text)
-    except ValueError:
-        return text
+    return [*given], pd.concat(tables, ignore_index=True)
 
 
 def report(folder: Path) -> str:
     """Write rows, table and figure of a sweep into its folder; returns the table."""
-    for each in {folder, *(file.parent for file in folder.rglob(FAILED))}:
+    failed = [file.parent for file in sorted(folder.rglob(FAILED))]
+    for each in (folder, *failed):
         check_no_links(each, "folders")
-    failed = {file.parent: json.loads(read_text(file)) for file in sorted(folder.rglob(FAILED))}
-    errors = pd.DataFrame(
-        [{"folder": str(run.relative_to(folder)), "error": each["error"]} for run, each in failed.items()]
-    )
-    parts, rows = [], errors
-    if any(folder.rglob(RESULTS)):
-        groups, rows = sweep_rows(folder)
-        lines = means(rows, groups)
+    errors = [[str(run.relative_to(folder)), json.loads(read_text(run / FAILED))["error"]] for run in failed]
+    parts, rows = [], pd.DataFrame(errors, columns=["folder", "error"])
+    if any(folder.rglob(RESULTS)) or not failed:
+        groups, finished = sweep_rows(folder)
+        lines = means(finished, groups)
         parts.append(as_table(lines, groups))
         drawn = lines["policy"].isin((TRAINED, TRAINED + DETERMINISTIC, SCRIPT, RANDOM))
         plot_means(lines[drawn], "return", folder / FIGURE)
-        rows = pd.concat([rows, errors], ignore_index=True)
+        rows = pd.concat([finished, rows], ignore_index=True) if failed else finished
     if failed:
-        parts.append(markdown_table(["failed", "why"], errors.to_numpy().tolist(), left=2))
+        parts.append(markdown_table(["failed", "why"], errors, left=2))
     write_csv(folder / ROWS, rows)
     write_atomically(folder / MARKDOWN, "\n\n".join(parts) + "\n")
     return "\n\n".join(parts)

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from streams import overlaps
-from torch.func import vmap
 
 from damian.common import counter_rng
 
@@ -62,13 +61,3 @@ def test_no_stream_is_a_section_of_another():
     assert overlaps(counter_rng.bits64(keys.unsqueeze(-1), torch.arange(500))) == 0
     shifted = torch.arange(4096) * 100  # what the check would find otherwise
     assert overlaps(counter_rng.bits64(torch.tensor(0), shifted.unsqueeze(-1) + torch.arange(500))) > 1000
-
-
-@pytest.mark.slow
-def test_compiled_and_batched_draws_are_the_same():
-    keys, counters = counter_rng.world_seeds(5, 100), torch.arange(100)
-    eager = counter_rng.bits64(keys, counters)
-    assert torch.compile(counter_rng.bits64, fullgraph=True)(keys, counters).equal(eager)
-    assert vmap(counter_rng.bits64)(keys, counters).equal(eager)
-    alone = [counter_rng.bits64(key, counter) for key, counter in zip(keys, counters, strict=True)]
-    assert torch.stack(alone).equal(eager)

@@ -1,13 +1,9 @@
 """Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables of them."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from matplotlib.figure import Figure
-from scipy.stats import trim_mean
 
 from damian.compare.comparison import (
     MEASURED,
@@ -19,7 +15,7 @@ from damian.compare.comparison import (
     Comparison,
     shown,
 )
-from damian.compare.figures import look, plot_matrix
+from damian.compare.figures import plot_matrix
 from damian.compare.report import markdown
 
 ARMS = {
@@ -84,24 +80,6 @@ def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_
     assert str(lines["blind"]) == str(alone["blind"])  # an unfinished arm changes no other one
     lines = compared(comparison([row for row in rows if (row["arm"], row["seed"]) != ("blind", 0)]))
     assert [lines[arm]["compared_seeds"] for arm in ("blind", "flown", "aware")] == [2] * 3
-
-
-def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
-    rows, norms = [], []
-    for task, best in (("t", [9.0, 11.0, 10.0]), ("u", [3.0, 5.0, 7.0])):
-        for delay, aware in (("late", [6.0, 1.0, 2.0]), ("later", [2.0, 0.0, 1.0])):
-            rows += rows_of(task, delay, {"blind": [0.0] * 3, "aware": aware})
-            norms += [x / np.mean(best) for x in aware]
-        rows += rows_of(task, "none", {"best": best})
-    overall = comparison(rows).overall()
-    assert overall["aware"]["seeds"] == 3
-    assert overall["aware"]["J_norm"] == pytest.approx(trim_mean(norms, 0.25), abs=1e-12)
-    assert overall["aware"]["J_norm_low"] < overall["aware"]["J_norm"] < overall["aware"]["J_norm_high"]
-    assert overall["blind"]["J_norm"] == 0
-    assert comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")]).overall()
-    held_out = rows_of("t@other", "late", {"best": [1.0] * 3, "aware": [9.0] * 3})
-    assert comparison(rows + held_out).overall() == overall
-    assert comparison(rows_of("t", "late", SCORES)).overall() == {}
 
 
 def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
@@ -189,11 +167,3 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     assert aware["compared_seeds"] == 0  # only the trained policy of an arm is compared with others
     assert prior["J_norm"] == pytest.approx(2.5 / 10)
     assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
-
-
-def test_methods_of_an_experiment_look_different():
-    for path in Path("conf/experiment").glob("*.yaml"):
-        arms = {name: Arm(**given) for name, given in yaml.safe_load(path.read_text())["arms"].items()}
-        looks = [look(arms, name) for name in arms]
-        for style in ("linestyle", "marker"):
-            assert len({(each["color"], each[style]) for each in looks}) == len(arms)

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import pytest
 from delay_twin import ACTION, Crowd, delayed, trace
+from helpers import square
 
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.laws import LONGEST, Burst, Lag, Law, Uniform
 from damian.delays.samplers import TableSampler
 from damian.delays.scenario import ScenarioDelays
+from damian.envs.pipeline import make_env
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 
@@ -28,6 +30,7 @@ INVALID_LAWS = [
     ({"law": "uniform", "low": 4, "high": 2}, ".low: 4 and high=2 are not two steps or two times"),
     ({"law": "burst", "bad": {"law": "burst"}}, ".bad: {'law': 'burst'} is not a memoryless law"),
     ({"law": "distance", "speed": math.nan}, ".speed: nan m/s is not above 0 m/s"),
+    ("7..1", ": 7..1 is not a range of two numbers of steps"),
 ]
 
 
@@ -39,18 +42,11 @@ def test_an_invalid_law_raises_one_line_that_names_its_key(setting, error):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("settings", "error"),
-    [
-        ({"delay": 3}, "links.delay: 3 means nothing with links=server"),
-        ({"kind": "matrix", "delay": [[0, 1], [1, 0]]}, "links.delay: [[0, 1], [1, 0]] is not 3 lists"),
-    ],
-    ids=str,
-)
-def test_an_invalid_setting_of_links_raises_an_error_that_names_its_key(settings, error):
-    with pytest.raises(InputError) as caught:
-        LinkConfig(**settings).check_pairs(3)
-    assert str(caught.value).startswith(error)
+def test_links_that_do_not_fit_are_refused():
+    with pytest.raises(InputError, match=r"links.delay: 3 means nothing with links=server"):
+        LinkConfig(delay=3)
+    with pytest.raises(InputError, match=r"the links are given for 2 agents, but .* is of 3"):
+        make_env(square(agents=3, links=LinkConfig("matrix", delay=[[0, 1], [1, 0]])))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Comparison with runs recorded from the original implementation in which messages were late.
 
-The recorded messages pass an ``ObservationDelay`` with the recorded times of arrival, and the server node
+The recorded messages pass a ``DelayLine`` with the recorded times of arrival, and the server node
 computes features from what it then holds (rewards and ends: ``tests/server/test_golden_rewards.py``). A
 recorded value that this project computes differently is left out only for a named reason, whose condition is
 checked in the record itself. Each test pins how many values were compared, and how many were left out for
@@ -10,7 +10,6 @@ each reason.
 import itertools
 import json
 from collections import Counter
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -18,16 +17,13 @@ import pytest
 import torch
 from golden_records import FEATURES, close, converted
 from helpers import DATA, GOLDEN, usecase
-from tensordict import TensorDict
 from torch import Tensor
 
-from damian import keys
-from damian.delays.laws import Law
-from damian.delays.samplers import ContextSampler, MessageContext, Sampler
+from damian.delays.line import DelayLine
+from damian.delays.samplers import ContextSampler, MessageContext
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
 from damian.server.server import Server
-from damian.transforms import ObservationDelay, delay_trajectories
 from damian.world.messages import Messages
 
 RUNS = json.loads((DATA / "delayed_runs.json").read_text())
@@ -73,17 +69,6 @@ class Step(NamedTuple):
         return any(map(self.reset_came_last, self.uavs))
 
 
-@dataclass(frozen=True)
-class Arrivals(Law):
-    """The delay of each message is an entry of the environment."""
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return ContextSampler(self.delays, LONGEST, loss, loses=False, reads=["late"])
-
-    def delays(self, context: MessageContext) -> Tensor:
-        return context.entries["late"][:, 0]
-
-
 def sent_messages(case: int, run: dict[str, Any]) -> Messages:
     """What the UAVs of a run sent at its reset and in each step, [1 + T, N].
 
@@ -117,23 +102,16 @@ def sent_messages(case: int, run: dict[str, Any]) -> Messages:
 
 def received_messages(case: int, run: dict[str, Any]) -> Messages:
     """What the server holds after each step of a run, [T, N]: messages arrive as recorded."""
-    message = sent_messages(case, run).pack().unsqueeze(0)
-    n_steps, n_uavs = message.shape[1] - 1, message.shape[2]
-    delay = torch.tensor(run["arrives_at"]) - torch.arange(n_steps).unsqueeze(-1)
-    late = torch.cat([torch.zeros(1, n_uavs), delay]).view(1, -1, n_uavs, 1)
-
-    def agents(shift: int) -> TensorDict:
-        part = {"message": message[:, shift:][:, :n_steps], "late": late[:, shift:][:, :n_steps]}
-        return TensorDict(part, [1, n_steps, n_uavs])
-
-    going_on = torch.zeros(1, n_steps, 1, dtype=torch.bool)
-    ends = {"done": going_on, "terminated": going_on}
-    after = TensorDict({keys.AGENTS: agents(1), **ends}, [1, n_steps])
-    steps = TensorDict({keys.AGENTS: agents(0), **ends, "next": after}, [1, n_steps])
-    uplink = ObservationDelay(
-        Arrivals(), keys.MESSAGE, keys.RECEIVED, order="arrival", context_keys={"late": "late"}
-    )
-    return Messages.unpack(delay_trajectories(steps, uplink)["next"][keys.RECEIVED][0])
+    first, *sent = sent_messages(case, run).pack()
+    arrivals = ContextSampler(lambda context: context.entries["late"], LONGEST, loses=False)
+    line, none = DelayLine(arrivals, "arrival"), torch.zeros(len(first), dtype=torch.long)
+    memory, held = line.init_memory([first], none), []
+    for t, message in enumerate(sent):
+        late = {"late": torch.tensor(run["arrives_at"][t]) - t}
+        context = MessageContext(none, none, none, none, none, 1.0, late)
+        memory, delivery = line.step(memory, [message], None, context)
+        held.append(delivery.held[0])
+    return Messages.unpack(torch.stack(held))
 
 
 @cache
@@ -172,6 +150,10 @@ def test_the_server_holds_the_recorded_messages_but_for_late_ones_of_the_reset(c
 
 
 LATE_RESET = "a late message of the reset came last"
+NOTHING_COVERED = "the newest position always covers nothing"
+DIVIDED = "divided again for every further UAV"
+ONCE = "a place that several UAVs report counts once"
+NO_BEARING = "no bearing to where it stands"
 
 
 def make_server(case: int) -> Server:
@@ -187,16 +169,16 @@ def reason_for_other_feature(step: Step, name: str, uav: int) -> str | None:
     if step.lost_in_reset:
         return LATE_RESET
     if name == "coverage":
-        return "the newest position always covers nothing"
+        return NOTHING_COVERED
     if name == "source_time" and uav > 0 and step.recorded("last_time") not in (None, step.number - 1):
-        return "divided again for every further UAV"
+        return DIVIDED
     detected = step.held.detected_time >= 0
     places = {tuple(place) for place in step.held.detected_position[detected].tolist()}
     if name in ESTIMATED and len(places) < detected.sum():
-        return "a place that several UAVs report counts once"
+        return ONCE
     at_estimate = step.recorded("est_pos") == pytest.approx(step.recorded("server_agent_pos")[uav], abs=1e-2)
     if name in ("source_bearing", "source_drift") and at_estimate:
-        return "no bearing to where it stands"
+        return NO_BEARING
     return None
 
 
@@ -207,26 +189,8 @@ ESTIMATED = ("source_distance", "source_bearing", "source_drift", "mean_distance
 @pytest.mark.parametrize(
     ("case", "compared", "reasons"),
     [
-        (
-            1,
-            974,
-            {
-                "the newest position always covers nothing": 181,
-                "no bearing to where it stands": 112,
-                LATE_RESET: 14,
-            },
-        ),
-        (
-            2,
-            4593,
-            {
-                "a place that several UAVs report counts once": 672,
-                "the newest position always covers nothing": 603,
-                LATE_RESET: 270,
-                "divided again for every further UAV": 136,
-                "no bearing to where it stands": 26,
-            },
-        ),
+        (1, 974, {NOTHING_COVERED: 181, NO_BEARING: 112, LATE_RESET: 14}),
+        (2, 4593, {ONCE: 672, NOTHING_COVERED: 603, LATE_RESET: 270, DIVIDED: 136, NO_BEARING: 26}),
     ],
 )
 def test_the_server_computes_the_recorded_features(case, compared, reasons):

@@ -24,12 +24,12 @@ def linked(motion: str = "instant", **links):
 
 LINKS = {
     "updown": {"kind": "updown", "delay": LATE, "loss": 0.1},
-    "matrix": {"kind": "matrix", "delay": LATE, "loss": 0.1, "limit": 2},
+    "matrix": {"kind": "matrix", "delay": LATE, "loss": 0.1},
     "range": {"kind": "matrix", "delay": {"law": "distance", "speed": 40.0}, "range": 120.0},
-    "a law for each pair": {"kind": "matrix", "delay": [[0, 1, 2], [3, 0, LATE], [1, 1, 0]], "loss": 0.0},
-    "whom each hears": {
+    "a law for each pair": {
         "kind": "matrix",
-        "hears": [[True, True, False], [False, True, True], [True, False, True]],
+        "delay": [[0, 1, 2], [3, 0, LATE], [1, 1, 0]],
+        "loss": [[0, 0, 1]] * 3,
     },
 }
 every_link = pytest.mark.parametrize("links", LINKS.values(), ids=LINKS)

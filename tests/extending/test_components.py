@@ -9,7 +9,7 @@ from extensions import TINY
 from helpers import SQUARE, check_refused, everything
 from torchrl.envs.utils import check_env_specs
 
-from damian import UavEnv, make_env
+from damian import make_env
 from damian.common.errors import InputError
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
@@ -89,10 +89,6 @@ import torch
 from damian import feature, reward_term, sensor
 
 @feature("local")
-def wide(cache):
-    return cache.messages.position
-
-@feature("local")
 def radians(cache):
     return cache.messages.track + 4
 
@@ -122,7 +118,6 @@ def seen(name: str) -> dict[str, ObservationConfig]:
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
-        (seen("wide"), r"feature lies:wide: shape: \[20, 3, 2\] is not \[20, 3\]"),
         (seen("radians"), r"feature lies:radians: 4 is not between 0 and 1"),
         (seen("leaks"), "lies:leaks: local changes with the messages of other UAVs: make it glob"),
         (
@@ -147,12 +142,6 @@ def test_a_component_that_does_not_keep_what_it_declares_is_one_line_before_anyt
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=20)
     with pytest.raises(InputError, match=message):
         make_env(everything(region=region, **sections), 2)
-
-
-def test_a_region_of_ones_own_is_flown_over(folder):
-    env = UavEnv(everything(region=RegionConfig("region:yard", options={"side": 200.0}, lattice_step=40.0)))
-    assert env.simulation.airspace.regions[0].name == "L-shaped yard"
-    assert env.simulation.airspace.regions[0].polygon.area == pytest.approx(0.75 * 200**2)
 
 
 @pytest.mark.slow

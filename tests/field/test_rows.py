@@ -42,7 +42,6 @@ def test_times_follow_from_what_a_row_says():
 
 REFUSED = {
     "out of range": ({"battery": 101}, "battery: 101: Input should be less than or equal to 100"),
-    "no place": ({"lat": None, "lon": None}, "Value error, places are pairs"),
     "no time": ({"time": "noon"}, "time: 'noon': Value error, Invalid isoformat string"),
     "an ID that is a formula": ({"ID": "=1+1"}, "id: '=1+1': String should match pattern"),
 }

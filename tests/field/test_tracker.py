@@ -113,8 +113,8 @@ def test_a_table_is_answered_as_the_policy_acts_in_the_simulation(policy_of):
             shown = policy(shown)
         answers = next_landings(read_json(rows), node, policy_of(node.env), START)
         goals = env.uav_env.simulation.decide(env.uav_env.state, shown[keys.ACTION], None).goal[0]
-        assert [(each.lat, each.lon) for each in answers] == [*map(node.ground.place, goals.tolist())]
-        n_moved += sum(each.state == "fly" for each in answers)
+        assert [*zip(answers.lat, answers.lon, strict=True)] == [*map(node.ground.place, goals.tolist())]
+        n_moved += (answers.state == "fly").sum()
         shown = env.step(shown)["next"]
         reporter.send(shown, step + 1)
     assert n_moved > 0
@@ -127,9 +127,8 @@ def test_who_is_in_flight_is_not_advised():
         row["lat"], row["lon"] = node.ground.place(point)
     rows[1]["FLA"] = 20
     answers = next_landings(read_json(rows), node, greedy_policy(node.env), START)
-    assert [each.state == "in flight" for each in answers] == [False, True, False]
-    assert [each.lat is None for each in answers] == [False, True, False]
-    assert {each.age for each in answers} == {1.0}
+    assert [*(answers.state == "in flight")] == [*answers.lat.isna()] == [False, True, False]
+    assert {*answers.age} == {1.0}
 
 
 def told(uav: str, time: float, point: int, received: float | None = None, **more) -> dict[str, Any]:
@@ -176,6 +175,7 @@ def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
     [
         ({"uav": "d"}, "ID: 'd' is not a UAV of this fleet: a, b, c"),
         ({"time": START + 60}, "time: 1700000060 s is 59.9 s after it came in"),
+        ({"source_lat": 52.8}, "places are pairs lat, lon [deg], or all of them x, y [m]"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
         ({"time": START + 2e6, "receive_time": START + 2e6}, "time: the first reports are more than 1e+06 s"),
     ],

@@ -44,26 +44,19 @@ def test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys)
     assert "Passed Parallel API test" in capsys.readouterr().out
 
 
-def test_gymnasiums_environment_does_what_torchrls_does():
+def test_gymnasiums_environment_is_pettingzoos_of_one_uav():
     scenario = compose_scenario("scenario=tracking", "agents=1", "delay=paper", "episode.max_steps=12")
-    env = UavGymEnv(scenario, seed=3)
-    reference = make_env(scenario, 1, seed=3)
-    reference.seed_worlds(torch.tensor([7]))
-    now = reference.reset()
-    observation, info = env.reset(seed=7)
-    ended = False
-    while not ended:
-        assert np.array_equal(observation, now[keys.OBSERVATION][0, 0].numpy())
-        assert np.array_equal(info["action_mask"], now[keys.ACTION_MASK][0, 0].numpy())
+    env, other = UavGymEnv(scenario, seed=3), UavParallelEnv(scenario, seed=3)
+    (observation, info), (observations, _) = env.reset(seed=7), other.reset(seed=7)
+    told = [0.0, False, False]
+    while not any(told[1:]):
+        assert np.array_equal(observation, observations["uav_0"])
         action = env.action_space.sample(info["action_mask"])
-        now[keys.ACTION] = torch.tensor([[action]])
-        now = reference.step(now)["next"]
-        observation, reward, terminated, truncated, info = env.step(action)
-        assert reward == now[keys.REWARD].item()
-        assert (terminated, truncated) == (now["terminated"].item(), now["truncated"].item())
-        ended = terminated or truncated
-    assert truncated
-    assert not terminated
+        observation, *told, info = env.step(action)
+        observations, *others, infos = other.step({"uav_0": action})
+        assert told == [each["uav_0"] for each in others]
+        assert info["action_mask"].tolist() == infos["uav_0"]["action_mask"].tolist()
+    assert told[1:] == [False, True]
 
 
 def test_pettingzoos_environment_does_what_torchrls_does():

@@ -80,20 +80,19 @@ class RecordingSac(Sac):
         return super().update(drawn)
 
 
-def two_decisions(flight: TensorDictBase, world: int, begin: int, agent: int, last: int) -> Tensor | None:
-    """Transition of a UAV over two decisions, the first at step ``begin``, as a row of numbers (``ROW``).
+def decision(flight: TensorDictBase, world: int, begin: int, agent: int, last: int) -> Tensor | None:
+    """Transition of a UAV over a decision at step ``begin``, as a row of numbers (``ROW``).
 
     None if the UAV was not ready, or if the outcome is not known by the last step.
     """
     agents, next_agents, ends = flight["agents"], flight["next", "agents"], flight["next"]
     if not agents["ready"][world, begin, agent]:
         return None
-    earned, left = 0.0, 2
+    earned = 0.0
     for t in range(begin, last + 1):
         earned += 0.8 ** (t - begin) * next_agents["reward"][world, t, agent]
         ready, over = next_agents["ready"][world, t, agent], ends["done"][world, t]
-        left -= int(ready | over)
-        if over or left == 0:
+        if ready | over:
             break
     else:
         return None
@@ -117,7 +116,7 @@ ROW += [("next", "done"), ("next", "terminated"), "steps_to_next_obs"]
 def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_holds():
     scenario = everything("polynomial", episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["privileged"])
-    config = SacConfig(gamma=0.8, n_steps=2, updates=2, batch_size=600, warm_up=0)
+    config = SacConfig(gamma=0.8, updates=2, batch_size=600, warm_up=0)
     buffer = ReplayBuffer(storage=TimeStorage(24 * 4))
     learner = RecordingSac(env, config, learning(SMALL, 3, critic_key=PRIVILEGED_OBSERVATION), buffer)
     flight = fly(env, learner.actor, 40)
@@ -127,7 +126,7 @@ def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_ho
         learner.learn(part)
     assert [len(drawn) for drawn in learner.drawn] == [600, 600]
     candidates = itertools.product(range(4), range(16, 37), range(3))  # world, first step, agent
-    rows = (two_decisions(flight, *candidate, last=36) for candidate in candidates)
+    rows = (decision(flight, *candidate, last=36) for candidate in candidates)
     expected = torch.stack([row for row in rows if row is not None])
     assert 0 < expected[:, -2].sum() < expected[:, -3].sum() < len(expected)  # terminated, done
     drawn = torch.cat(learner.drawn)

@@ -1,22 +1,22 @@
-"""The training recipe, started as from the command line."""
+"""The programs, started as from the command line."""
 
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from damian.recipes.train import main
-
 
 @pytest.fixture
 def run(tmp_path, monkeypatch) -> Callable[..., Path]:
-    """Run the recipe with overrides in an empty folder; returns its run folder."""
+    """Run a program with words in an empty folder; returns its run folder."""
     monkeypatch.chdir(tmp_path)
 
-    def run_recipe(*overrides: str, folder: str = "run") -> Path:
-        monkeypatch.setattr(sys, "argv", ["damian train", *overrides, f"hydra.run.dir={folder}"])
-        main()
+    def start(*words: str, program: str = "train", folder: str = "run") -> Path:
+        words = (*words, *[f"hydra.run.dir={folder}"] * bool(folder))
+        monkeypatch.setattr(sys, "argv", [f"damian {program}", *words])
+        import_module(f"damian.recipes.{program}").main()
         return tmp_path / folder
 
-    return run_recipe
+    return start

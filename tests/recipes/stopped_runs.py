@@ -21,13 +21,8 @@ from damian.runs.metrics_log import MetricsLog
 
 TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "checkpoint_every=3"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]
-SAC = [
-    "learner=sac",
-    "learner.updates=1",
-    "learner.batch_size=16",
-    "learner.warm_up=40",
-    "learner.buffer_steps=160",
-]
+SAC = ["learner=sac", "learner.updates=1", "learner.batch_size=16", "learner.warm_up=40"]
+SAC += ["learner.buffer_steps=160"]
 FINISHED = {"config.yaml", "run.json", "metrics.csv", "checkpoint.pt", "best.pt", "learning_curve.png"}
 FINISHED |= {"result.csv", "result.md"}
 
@@ -37,32 +32,40 @@ class Killed(BaseException):
 
 
 @contextmanager
-def killed_after(rows: int) -> Iterator[None]:
-    """Stop the run inside when it has logged so many updates in all; its files stay as they are."""
+def at_each_update(act: Callable[[MetricsLog], None]) -> Iterator[None]:
+    """Act when the run inside has logged an update."""
     add = MetricsLog.add
 
-    def add_or_stop(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
+    def add_and_act(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
         add(log, frames, numbers)
+        act(log)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MetricsLog, "add", add_and_act)
+        yield
+
+
+@contextmanager
+def killed_after(rows: int) -> Iterator[None]:
+    """Stop the run inside when it has logged so many updates in all."""
+
+    def stop(log: MetricsLog) -> None:
         if len(log.rows) == rows:
             raise Killed
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MetricsLog, "add", add_or_stop)
-        with pytest.raises(Killed):
-            yield
+    with at_each_update(stop), pytest.raises(Killed):
+        yield
 
 
 @contextmanager
 def counted_updates() -> Iterator[list[int]]:
     """Count the updates that the run inside logs itself, without those of its checkpoint."""
-    add, count = MetricsLog.add, [0]
+    count = [0]
 
-    def add_and_count(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
+    def add_one(_: MetricsLog) -> None:
         count[0] += 1
-        add(log, frames, numbers)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MetricsLog, "add", add_and_count)
+    with at_each_update(add_one):
         yield count
 
 

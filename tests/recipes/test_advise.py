@@ -2,14 +2,11 @@
 
 import csv
 import json
-import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 from helpers import check_refused
-
-from damian.recipes.advise import main
-from damian.recipes.train import main as train
 
 HEAD = "ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"
 TABLE = f"""{HEAD}
@@ -21,28 +18,17 @@ SCRIPT = ["policy=script", "actions.distances=[0,30,60]", "region.initial_condit
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
-    """Run the program with overrides in an empty folder; returns its run folder."""
-    monkeypatch.chdir(tmp_path)
+def advise(run):
+    """Run the program on a table in an empty folder; returns its run folder."""
     Path("table.csv").write_text(TABLE, encoding="utf-8")
-
-    def run_recipe(*overrides: str) -> Path:
-        monkeypatch.setattr(sys, "argv", ["advise.py", *overrides, "hydra.run.dir=run"])
-        main()
-        return tmp_path / "run"
-
-    return run_recipe
+    return partial(run, program="advise")
 
 
-def test_a_table_is_answered_with_landing_points_as_csv_and_json(run, capsys):
-    folder = run(*SCRIPT, "table=table.csv")
+def test_a_table_is_answered_with_landing_points_as_csv_and_json(advise, capsys):
+    folder = advise(*SCRIPT, "table=table.csv")
     printed = capsys.readouterr().out
-    assert {path.name for path in folder.iterdir()} == {
-        "config.yaml",
-        "run.json",
-        "advice.csv",
-        "advice.json",
-    }
+    files = {"config.yaml", "run.json", "advice.csv", "advice.json"}
+    assert {path.name for path in folder.iterdir()} == files
     table = (folder / "advice.csv").read_text()
     assert printed.startswith(table)
     rows = list(csv.DictReader(table.splitlines()))
@@ -55,20 +41,16 @@ def test_a_table_is_answered_with_landing_points_as_csv_and_json(run, capsys):
     assert rows[2]["state"] == "hold", "who hears the source stays"
 
 
-def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
+def test_a_trained_policy_answers_as_it_was_trained(run, advise, capsys):
     words = ["agents=2", "frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "eval_episodes=2"]
     words += ["actions.distances=[0,30,60]", "episode.max_steps=6", "delay.obs=2", "delay.history=2"]
-    monkeypatch.setattr(sys, "argv", ["train.py", *words, "hydra.run.dir=trained"])
-    train()
+    run(*words, folder="trained")
     rows = TABLE.splitlines()
     Path("two.csv").write_text("\n".join(rows[:3]), encoding="utf-8")
+    words = ["checkpoint=trained", "table=two.csv"]
     for word in ("motion=instant", "motion=polynomial"):  # what is given now does not change the training
-        check_refused(
-            lambda word=word: run("checkpoint=trained", "table=two.csv", word), "motion: instant: ", capsys
-        )
-    answer = json.loads(
-        (run("checkpoint=trained", "table=two.csv", "instant=true") / "advice.json").read_text()
-    )
+        check_refused(lambda word=word: advise(*words, word), "motion: instant: ", capsys)
+    answer = json.loads((advise(*words, "instant=true") / "advice.json").read_text())
     assert [each["ID"] for each in answer] == ["A", "B"]
     assert all(each["state"] in ("fly", "hold") for each in answer)
 
@@ -82,7 +64,7 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(("words", "message"), REFUSALS, ids=[" ".join(words) for words, _ in REFUSALS])
-def test_what_cannot_be_is_refused_in_one_line(run, capsys, words, message):
+def test_what_cannot_be_is_refused_in_one_line(advise, capsys, words, message):
     Path("far.csv").write_text("ID,lat,lon\nA,48,11\n", encoding="utf-8")
-    check_refused(lambda: run(*words), message, capsys)
+    check_refused(lambda: advise(*words), message, capsys)
     assert {path.name for path in Path().iterdir()} <= {"table.csv", "far.csv", "run"}

@@ -5,22 +5,19 @@ import json
 import re
 import shlex
 import shutil
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from helpers import check_refused
-from hydra import initialize_config_dir
 
 from damian.compare.comparison import TRAINED, Arm
 from damian.compare.config import CompareConfig, Experiment, HeldOut
-from damian.recipes.compare import includes, main, plan
-from damian.recipes.known import CONF
-from damian.recipes.shared import many_runs
+from damian.recipes.compare import includes
+from damian.recipes.shared.comparison_runs import plan
 from damian.recipes.shared.runs import POLICY
 from damian.runs.checkpoint import digest
-from damian.runs.run_lock import locked
+from damian.runs.run_folder import locked
 from damian.runs.run_record import read_record
 
 ROOT = Path(__file__).parents[2]
@@ -44,16 +41,9 @@ TWO = [*ONE, "seeds=2", "arms=[undelayed,naive]", listed(*SMALL)]
 
 
 @pytest.fixture
-def compare(tmp_path, monkeypatch):
-    """Run the recipe with overrides in an empty folder; returns the folder of the experiment."""
-    monkeypatch.chdir(tmp_path)
-
-    def run_recipe(*overrides: str) -> Path:
-        monkeypatch.setattr(sys, "argv", ["damian compare", *overrides])
-        main()
-        return tmp_path / "runs" / "usecases"
-
-    return run_recipe
+def compare(run):
+    """Run the program with words in an empty folder; returns the folder of the use cases."""
+    return lambda *words: run(*words, program="compare", folder="") / "runs" / "usecases"
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -120,22 +110,6 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert stamps(folder) == after
 
 
-def test_an_interrupted_comparison_has_stored_the_rows_of_the_runs_that_were_finished(compare, monkeypatch):
-    perform = many_runs.perform_run
-
-    def interrupted(run: many_runs.Run) -> None:
-        if run.arm == "naive":
-            raise KeyboardInterrupt
-        perform(run)
-
-    monkeypatch.setattr(many_runs, "perform_run", interrupted)
-    with pytest.raises(SystemExit):
-        compare(*ONE, "seeds=1", *TWO[3:])
-    rows = table(Path("runs/usecases/results.csv"))
-    assert {row["arm"] for row in rows} == {"undelayed"}
-    assert len(rows) == 6
-
-
 LEARNING_FROM_OTHERS = """\
 tasks: {tracking: [scenario=tracking]}
 delays: {paper: [delay=paper]}
@@ -188,17 +162,12 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
         (kept / name).write_bytes((folder / name).read_bytes())
     stored = ["report_only=true", f"hydra.run.dir={kept}"]
     compare(*words, *stored)
-    assert {path.name for path in kept.iterdir()} == {path.name for path in folder.iterdir()} - {"usecase2"}
     for name in ("table.csv", "figure.png", "curves.png"):
         assert (kept / name).read_bytes() == (folder / name).read_bytes()
-    texts = [(place / "table.md").read_text() for place in (folder, kept)]
-    assert len({re.sub("`damian compare .*`", "", text) for text in texts}) == 1
     compare(*words[:3], "arms=[undelayed]", *stored)
     assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "script"}
     late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
     check_refused(lambda: compare(*words, *late), problem, capsys)
-    (kept / "results.csv").write_text("seed\nx\n")
-    check_refused(lambda: compare(*words[:2], *stored), "it is not a table of numbers", capsys)
 
 
 @pytest.mark.slow
@@ -240,89 +209,72 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
     assert "missing: usecase2/none/undelayed/seed_8" in (folder / "other" / "table.md").read_text()
 
 
-@pytest.mark.sample(3)
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ([listed("framess=3")], "usecase2/none/undelayed: framess: unknown setting; did you mean frames?"),
-        (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
-        (["tasks=[spotting]"], "tasks: spotting is not one of usecase1, usecase2"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
-    compare, capsys, tmp_path, overrides, message
-):
-    check_refused(lambda: compare(*TWO[:3], *overrides), message, capsys)
-    assert list(tmp_path.iterdir()) == []
+FITS_NOT = """\
+tasks: {spotting: []}
+delays: {late: [delay.obs=2]}
+arms:
+  undelayed: {delayed: false}
+  both: {overrides: [aware=both]}
+  flown: {policy_of: both}
+"""
 
 
-@pytest.mark.sample(3)
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "words", "message"),
     [
-        ("tasks: {spotting: []}", "experiment.arms: it is missing or empty"),
-        (
-            "tasks: {spotting: []}\ndelays: {late: [delay.obs=2]}\narms: {undelayed: {delayed: false}, "
-            "both: {overrides: [aware=both]}, flown: {policy_of: both}}",
-            "spotting/late/flown: observation.age: the policy was trained with True, so it cannot fly with",
-        ),
+        ("", [listed("framess=3")], "usecase2/none/undelayed: framess: unknown setting"),
+        ("", ["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
+        ("tasks: {spotting: []}", ["experiment=mine"], "experiment.arms: it is missing or empty"),
+        (FITS_NOT, ["experiment=mine"], "flown: observation.age: the policy was trained with True"),
     ],
+    ids=["words", "arms", "empty", "fits not"],
 )
-def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp_path, text, message):
+def test_a_mistake_is_one_line_and_leaves_no_folder(compare, capsys, tmp_path, text, words, message):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     (tmp_path / "own" / "experiment" / "mine.yaml").write_text(text)
-    check_refused(lambda: compare("--config-dir=own", "experiment=mine"), message, capsys)
-    assert [path.name for path in tmp_path.iterdir()] == ["own"]
+    words = words if text else [*TWO[:3], *words]
+    check_refused(lambda: compare("--config-dir=own", *words), message, capsys)
+    assert [*tmp_path.glob("runs/*")] == []
+
+
+HELD_OUT = """\
+tasks: {follow: [scenario=delaybench/tracking]}
+delays: {late: [delay.obs=2]}
+arms: {best: {delayed: false}, naive: {naive: true}}
+held_out: {two: {overrides: [agents=2], tasks: [follow]}}
+"""
 
 
 @pytest.mark.slow
 def test_a_comparison_flies_policies_in_held_out_tasks(compare, tmp_path):
     (tmp_path / "mine/experiment").mkdir(parents=True)
-    (tmp_path / "mine/experiment/script.yaml").write_text(
-        """tasks:
-  follow: [scenario=delaybench/tracking]
-delays: {late: [delay.obs=2]}
-arms: {best: {delayed: false}, naive: {naive: true}}
-held_out: {two: {overrides: [agents=2], tasks: [follow]}}
-"""
-    )
+    (tmp_path / "mine/experiment/script.yaml").write_text(HELD_OUT)
     words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
     compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
-    text = (tmp_path / "runs/script/table.md").read_text()
-    assert "## follow@two, delay late\n\nPolicies of another task." in text
     results = tmp_path / "runs/script"
-    for delay, arm in (("none", "best"), ("late", "naive")):
-        flown = results / "follow@two" / delay / arm / "seed_0"
+    assert "## follow@two, delay late\n\nPolicies of another task." in (results / "table.md").read_text()
+    for arm in ("none/best", "late/naive"):
+        flown = results / "follow@two" / arm / "seed_0"
         config = (flown / "config.yaml").read_text()
-        assert re.search(f"checkpoint: .*/follow/{delay}/{arm}/seed_0", config)
+        assert re.search(f"checkpoint: .*/follow/{arm}/seed_0", config)
         assert "agents: 2" in config
         assert not (flown / "metrics.csv").exists()
 
 
-def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
+def test_runs_go_seed_by_seed_and_a_held_out_delay_replaces_the_one_of_the_training():
     arms = {"best": Arm(delayed=False), "naive": Arm(naive=True, tasks=["a"])}
     arms["flown"] = Arm(policy_of="best", tasks=["b"])
     tasks = {task: ["scenario=delaybench/tracking"] for task in ("a", "b")}
-    experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, arms, first_seed=3)
-    with initialize_config_dir(str(CONF), version_base=None):
-        runs = plan(CompareConfig(experiment, seeds=2), Path("runs"))
+    held_out = {"six": HeldOut(["delay.obs=6"], ["a"]), "burst": HeldOut(["delay=burst"], ["a"])}
+    experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, arms, held_out, first_seed=3)
+    config = CompareConfig(experiment, seeds=2)
+    runs = plan(config, Path("runs"))
     trained = [
         f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
     ]
-    assert [run.name for run in runs] == [*trained, "b/late/flown/seed_3", "b/late/flown/seed_4"]
-
-
-def test_a_held_out_delay_replaces_the_one_of_the_training():
-    arms = {"best": Arm(delayed=False), "naive": Arm(naive=True)}
-    delays = {"constant": ["delay.obs=2"], "paper": ["delay=paper"]}
-    held_out = {"six": HeldOut(["delay.obs=6"]), "burst": HeldOut(["delay=burst"])}
-    experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms, held_out)
-    config = CompareConfig(experiment, seeds=1)
-    with initialize_config_dir(str(CONF), version_base=None):
-        runs = plan(config, Path("runs"))
-    delay = {(run.task, run.delay): run.config.delay.obs for run in runs if run.arm == "naive"}
-    assert delay["a", "constant"] == 2
-    assert delay["a@six", "constant"] == delay["a@six", "paper"] == 6
-    assert delay["a@burst", "constant"]["law"] == delay["a@burst", "paper"]["law"] == "burst"
-    stored = pd.DataFrame({"task": ["a@six", "a@seven"], "delay": "paper", "arm": "naive", "seed": 0})
+    assert [run.name for run in runs if run.trains] == trained
+    flown = {(run.task, run.arm): run.config.delay.obs for run in runs if not run.trains}
+    assert flown.keys() == {("b", "flown"), ("a@six", "naive"), ("a@burst", "naive")}
+    assert (flown["a@six", "naive"], flown["a@burst", "naive"]["law"]) == (6, "burst")
+    stored = pd.DataFrame({"task": ["a@six", "a@seven"], "delay": "late", "arm": "naive", "seed": 3})
     assert includes(config, stored).tolist() == [True, False]  # of an experiment that had another one

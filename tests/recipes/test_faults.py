@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 from helpers import check_refused
-from stopped_runs import TINY, ended, files, forked, killed_after
+from stopped_runs import TINY, at_each_update, ended, files, forked, killed_after
 
 from damian.learners.mappo import Mappo
 from damian.recipes import train
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.metrics_log import MetricsLog
-from damian.runs.run_lock import locked
+from damian.runs.run_folder import locked
 
 
 @pytest.fixture(scope="module")
@@ -49,36 +49,21 @@ def test_a_folder_in_use_is_refused_and_stays_as_it_is(run, capsys, copied):
     assert contents(copied) == before
 
 
-# Full disks and folders that cannot be written.
-
-
-def limit_files_to(n_bytes: int) -> None:
-    """Let this process write no file beyond a size, as a full disk would; Python ignores the signal."""
-    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
-
-
 def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
     before = contents(copied)
     n_bytes = len(before["checkpoint.pt"]) // 2
-    assert ended(forked(["resume=run", "hydra.run.dir=unused"], lambda: limit_files_to(n_bytes))) == 3
-    errors = [
-        line
-        for line in Path("output.txt").read_text(encoding="utf-8").splitlines()
-        if "error" in line.lower()
-    ]
-    assert len(errors) == 1
-    assert errors[0].startswith("error: run/checkpoint.pt: it cannot be written: File too large")
-    assert "Traceback" not in Path("output.txt").read_text(encoding="utf-8")
+
+    def fill() -> None:  # no file may grow beyond a size; Python ignores the signal
+        resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
+
+    assert ended(forked(["resume=run", "hydra.run.dir=unused"], fill)) == 3
+    output = Path("output.txt").read_text(encoding="utf-8")
+    (error,) = [line for line in output.splitlines() if "error" in line.lower()]
+    assert error.startswith("error: run/checkpoint.pt: it cannot be written: File too large")
+    assert "Traceback" not in output
     after = contents(copied)
-    assert {name for name in after if after[name] != before.get(name)} <= {
-        "metrics.csv",
-        "run.json",
-        "config.yaml",
-    }
-    assert after["checkpoint.pt"] == before["checkpoint.pt"]
-
-
-# Learners that diverge.
+    changed = {name for name in after if after[name] != before.get(name)}
+    assert changed <= {"metrics.csv", "run.json", "config.yaml"}
 
 
 def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatch):
@@ -112,32 +97,28 @@ def bad(features, counters):
 """
 
 
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("observation.local_features=[spotted,late:late]", "feature late:late: a value is nan or infinite"),
-        ("reward.custom=[{term: late:bad}]", "reward term bad: a value is nan or infinite"),
-    ],
-)
-def test_a_nan_is_blamed_on_what_made_it_and_not_on_the_learner(
-    run, capsys, tmp_path, monkeypatch, word, message
-):
+NAN = {
+    "observation.local_features=[spotted,late:late]": "feature late:late: a value is nan or infinite",
+    "reward.custom=[{term: late:bad}]": "reward term bad: a value is nan or infinite",
+}
+
+
+@pytest.mark.parametrize("word", NAN)
+def test_a_nan_is_blamed_on_what_made_it_and_not_on_the_learner(run, capsys, tmp_path, monkeypatch, word):
     (tmp_path / "late.py").write_text(LATE)
     monkeypatch.delitem(sys.modules, "late", raising=False)
     with pytest.raises(SystemExit) as stopped:
         run(*TINY, word, "episode.max_steps=60", "frames=4000", folder="bad")
     assert stopped.value.code == 3
     line = capsys.readouterr().err.splitlines()[-1]
-    assert re.fullmatch(rf"error: update \d+: {message}; bad/checkpoint.pt is of update \d+ and intact", line)
-
-
-# Damaged folders.
+    intact = r"bad/checkpoint.pt is of update \d+ and intact"
+    assert re.fullmatch(rf"error: update \d+: {NAN[word]}; {intact}", line)
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda f: (f / "checkpoint.pt").unlink(), "checkpoint.pt: there is no such file"),
+        (lambda f: (f / "checkpoint.pt").unlink(), "checkpoint.pt: it cannot be read: No such file"),
         (lambda f: (f / "config.yaml").write_text("agents: [\n"), "config.yaml: "),
         (lambda f: (f / "run.json").write_text('{"damian": "0.4.0"}'), "resume: run: damian 0.4.0 wrote it"),
     ],
@@ -149,19 +130,12 @@ def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, me
     assert files(copied) == names
 
 
-# Signals.
-
-
-def test_sigterm_stops_a_run_after_its_update(run, capsys, monkeypatch):
-    add = MetricsLog.add
-
-    def signalled(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
-        if len(log.rows) == 1:
+def test_sigterm_stops_a_run_after_its_update(run, capsys):
+    def signalled(log: MetricsLog) -> None:
+        if len(log.rows) == 2:
             os.kill(os.getpid(), signal.SIGTERM)
-        add(log, frames, numbers)
 
-    monkeypatch.setattr(MetricsLog, "add", signalled)
-    with pytest.raises(SystemExit) as stopped:
+    with at_each_update(signalled), pytest.raises(SystemExit) as stopped:
         run(*TINY)
     assert stopped.value.code == 143
     assert capsys.readouterr().err.splitlines()[-1] == "interrupted; continue with resume=run"

@@ -1,7 +1,6 @@
 """The program that flies shows the flight of a journal of real UAVs instead."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,23 +8,13 @@ import pytest
 from PIL import Image
 from reports import write_journal
 
-from damian.recipes.fly import main
 from damian.show.episode import Episode
 
-WORDS = ["region=llanbedr", "delay=paper"]
+PLACE = {"lon": -4.1290, "source spotted": False}
 LINES = [
     {
         "received": 1.7e9 + second + late,
-        "reports": [
-            {
-                "ID": uav,
-                "time": 1.7e9 + second,
-                "source spotted": second == 3,
-                "lat": 52.811 + 1e-4 * second,
-                "lon": -4.1290,
-                "battery": 100 - second,
-            }
-        ],
+        "reports": [PLACE | {"ID": uav, "time": 1.7e9 + second, "lat": 52.811 + 1e-4 * second}],
     }
     for second in range(6)
     for uav, late in (("A", 0.2), ("B", 1.2))
@@ -33,24 +22,11 @@ LINES = [
 """Two UAVs that report their places for six seconds, the second one a second late."""
 
 
-@pytest.fixture
-def show(tmp_path, monkeypatch):
-    """Run the program on a journal of two UAVs in an empty folder; returns its run folder."""
-    monkeypatch.chdir(tmp_path)
-    write_journal(tmp_path / "north.jsonl", *LINES, uavs=["A", "B"])
-
-    def run(*overrides: str) -> Path:
-        words = ["journal=north.jsonl", "formats=[]", *WORDS, *overrides, "hydra.run.dir=run"]
-        monkeypatch.setattr(sys, "argv", ["fly.py", *words])
-        main()
-        return tmp_path / "run"
-
-    return run
-
-
 @pytest.mark.slow
-def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
-    folder = show("formats=[gif,geojson]", "clock.simulation=0.5s")
+def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(run):
+    write_journal(Path("north.jsonl"), *LINES, uavs=["A", "B"])
+    words = ["journal=north.jsonl", "region=llanbedr", "delay=paper", "clock.simulation=0.5s"]
+    folder = run(*words, "formats=[gif,geojson]", program="fly")
     episode = Episode.load(folder / "episode_0.json")
     assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
     assert np.diff(episode.time) == pytest.approx(0.5)

@@ -1,7 +1,6 @@
 """Reference arms: messages held back to a constant delay (``delay.hold``), and a privileged critic."""
 
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -17,19 +16,15 @@ from helpers import (
     square,
 )
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from twin import GLOBAL, LOCAL
 
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.keys import PRIVILEGED_OBSERVATION
-from damian.learners.mappo import Mappo, MappoConfig
-from damian.learners.networks import ModelConfig
-from damian.learners.sac import Sac, SacConfig
+from damian.keys import PRIVILEGED_OBSERVATION as PRIVILEGED
+from damian.learners.config import MappoConfig, ModelConfig, SacConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.server.features import ObservationConfig
@@ -37,56 +32,30 @@ from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.state import Truth
 
-PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
-BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}
-LAWS: dict[str, Any] = {
-    "uniform": (PAPER, 7),
-    "geometric": ({"law": "geometric", "mean": 2, "longest": 6}, 6),
-    "burst": (BURST | {"bad_loss": 0.0}, 4),
-}
-"""Laws without losses, and the longest delay [steps] of each."""
-
-PRIVILEGED = PRIVILEGED_OBSERVATION
+UNIFORM = {"law": "uniform", "low": 1, "high": 3, "probability": 0.3}
+BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.0}
+LATE = {"delay": DelayConfig(obs=BURST, loss=0.3, history=2, rew=1), "clock": ClockConfig(server="2s")}
 
 
-def actions_for(env: DelayedEnv, n_steps: int) -> list[Tensor]:
-    generator = torch.Generator().manual_seed(3)
-    return [random_actions(env.uav_env, generator) for _ in range(n_steps)]
-
-
-def rollout_of(
-    scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS, n_steps: int = 20
-) -> list[TensorDictBase]:
+def rollout_of(scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS) -> list[TensorDictBase]:
     """Outputs of the environment for random actions, which are the same at each call."""
-    env = make_env(scenario, 4, extras=extras)
-    return play(env, actions_for(env, n_steps))
-
-
-# Held messages.
+    env, generator = make_env(scenario, 4, extras=extras), torch.Generator().manual_seed(3)
+    return play(env, [random_actions(env.uav_env, generator) for _ in range(20)])
 
 
 @pytest.mark.sample(2)
 @both_motions
-@pytest.mark.parametrize("law", LAWS)
-def test_held_messages_arrive_as_with_a_constant_delay(law, motion):
-    obs, longest = LAWS[law]
+@pytest.mark.parametrize(("obs", "longest"), [(UNIFORM, 3), (BURST, 4)], ids=["uniform", "burst"])
+def test_held_messages_arrive_as_with_a_constant_delay(obs, longest, motion):
     held = rollout_of(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
     assert all_same(held, rollout_of(everything(motion, delay=DelayConfig(obs=longest, history=2))))
 
 
-# The privileged observation.
-
-
 @both_motions
-@pytest.mark.parametrize("order", ["generation", "arrival"])
-def test_delays_and_losses_do_not_change_the_privileged_observation(motion, order):
-    late = {
-        "delay": DelayConfig(obs=BURST, loss=0.3, order=order, history=2, rew=1),
-        "clock": ClockConfig(server="2s"),
-    }
+def test_delays_and_losses_do_not_change_the_privileged_observation(motion):
     same = {"episode": KEEPS_GOING, "observation": ObservationConfig(LOCAL, GLOBAL)}
     undelayed, delayed = (
-        rollout_of(everything(motion, **same, **sections), ("privileged",)) for sections in ({}, late)
+        rollout_of(everything(motion, **same, **sections), ("privileged",)) for sections in ({}, LATE)
     )
     held = ("agents", "global_observation")
     assert not all(one[held].equal(other[held]) for one, other in zip(undelayed, delayed, strict=True))
@@ -108,30 +77,18 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
         torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)
 
 
-# The privileged critic.
-
-
-def settings(**changed: Any) -> TrainConfig:
-    """Settings of a tiny run with a privileged critic, in which 30 % of the messages are late."""
-    obs = PAPER | {"low": 1, "high": 3, "probability": 0.3}
-    sections = vars(everything(delay=DelayConfig(obs=obs, history=2)))
-    tiny = {"worlds": 4, "learner": MappoConfig(steps=12, minibatches=2), "model": ModelConfig([16])}
-    return TrainConfig(**(sections | tiny | {"critic": "privileged"} | changed))
-
-
-def learner_of(config: TrainConfig) -> tuple[Mappo | Sac, DelayedEnv]:
-    env = learning_env(config)
-    return make_learner(config, env, replay_buffer(config, env)), env
-
-
 @both_kinds
-@pytest.mark.parametrize("config", [MappoConfig(steps=12, minibatches=2), SacConfig()])
-def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(config, kind):
-    learner, env = learner_of(settings(learner=config, actions=ActionConfig(kind=kind)))
-    assert PRIVILEGED not in learner.actor.in_keys
+@pytest.mark.parametrize("learner", [MappoConfig(steps=12, minibatches=2), SacConfig()])
+def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(learner, kind):
+    late = vars(everything(delay=DelayConfig(obs=UNIFORM, history=2), actions=ActionConfig(kind=kind)))
+    tiny = {"worlds": 4, "learner": learner, "model": ModelConfig([16])}
+    config = TrainConfig(**late, **tiny, critic="privileged")
+    env = learning_env(config)
+    actor = make_learner(config, env, replay_buffer(config, env)).actor
+    assert PRIVILEGED not in actor.in_keys
     td = env.reset()
     other = td.clone()
     other[PRIVILEGED] = -td[PRIVILEGED]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        actions = [learner.actor(each)["agents", "action"] for each in (td, other)]
+        actions = [actor(each)["agents", "action"] for each in (td, other)]
     assert actions[0].equal(actions[1])

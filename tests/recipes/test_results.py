@@ -1,6 +1,5 @@
 """``damian.load`` reads trained policies, ``damian.results`` the results of runs, sweeps and comparisons."""
 
-import csv
 import os
 import subprocess
 import sys
@@ -23,19 +22,13 @@ def trained(request, tmp_path_factory) -> Path:
     return folder
 
 
-def stored(run: Path, policy: str) -> dict[str, float]:
-    """The measures of one policy in ``result.csv``."""
-    with (run / "result.csv").open(newline="") as file:
-        rows = {row.pop("policy"): row for row in csv.DictReader(file)}
-    return {name: float(x) for name, x in rows[policy].items()}
-
-
 def test_a_loaded_policy_flies_as_it_was_evaluated(trained):
     policy, env = damian.load(trained, worlds=8, deterministic=True)
     env.set_seed(3 + 10_000)
     rollout = env.rollout(10, policy, break_when_any_done=False)
     perceived = rollout["next", *keys.REWARD].sum(1).mean().item()
-    assert perceived == pytest.approx(stored(trained, "trained, deterministic")["perceived_return"])
+    rows = damian.results(trained).set_index("policy")
+    assert perceived == pytest.approx(rows.at["trained, deterministic", "perceived_return"])
 
 
 def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):

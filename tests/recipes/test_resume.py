@@ -12,8 +12,6 @@ from typing import Any
 import pytest
 from stopped_runs import SAC, TINY, check_equal, counted_updates, ended, files, forked, killed_after
 
-from damian.runs import replay_memory
-
 WHOLE = [
     "delay=paper",
     "delay.obs.high=9s",
@@ -43,8 +41,7 @@ QUICK = ("sac",)
 @pytest.mark.parametrize(
     "case", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in CASES]
 )
-def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case, monkeypatch):
-    monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1000)  # else a short run has no segments
+def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case):
     words = [*TINY, *CASES[case]]
     whole = run(*words, folder="whole")
     with killed_after(2):
@@ -54,9 +51,8 @@ def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case, monke
     with counted_updates() as updates:
         other = run("resume=other", folder="unused").with_name("other")
     check_equal(whole, other)
-    assert (
-        updates[0] <= len((whole / "metrics.csv").read_text().splitlines()) - 1 - 6
-    )  # 6 were in the checkpoint
+    made = len((whole / "metrics.csv").read_text().splitlines()) - 1
+    assert updates[0] <= made - 6  # 6 were in the checkpoint
     has_memory = case in ("recurrent", "sac", "sac bursts", "everything")
     assert any(name.startswith("replay/") for name in files(whole)) == has_memory
 
@@ -73,19 +69,11 @@ SMALL = [*TINY, "frames=512", "checkpoint_every=4", "episode.max_steps=6"]
 LEARNERS = {"mappo": ["delay.obs=2", "aware=backupdate"], "sac": [*SAC, "delay.obs=2"]}
 STOPPED = (0, 130, 143, -signal.SIGTERM, -signal.SIGKILL)
 """Exit codes of a run that has ended, or that a signal has stopped before, in or after its training."""
-
-
 STOPS, STOPS_PER_RUN = 20, 5
 
 
 def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int]) -> int:
-    """Start and resume a run until it is finished; returns how often it was stopped.
-
-    Args:
-        words: of the command line.
-        folder: the run folder.
-        stop: starts the recipe with words, and may stop it; returns the exit code.
-    """
+    """Start a run and resume it until it is finished; returns how often ``stop``, which starts it, did so."""
     for stops in range(STOPS_PER_RUN + 1):
         begun = Path(folder, "config.yaml").exists()
         again = [f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"]
@@ -96,21 +84,19 @@ def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int])
     raise AssertionError("a run that nothing stops does not end")
 
 
-def check_stopped_runs(words: list[str], whole: Path, stop: Callable[[list[str]], int]) -> str:
-    """Stop runs until enough were stopped, and compare each with one that never was; returns how many."""
-    stops, runs = 0, 0
+def check_stopped_runs(words: list[str], whole: Path, stop: Callable[[list[str]], int]) -> None:
+    """Stop runs until enough were stopped, and compare each with one that never was."""
+    stops = runs = 0
     while stops < STOPS:
         stops += run_through(words, f"run_{runs}", stop)
         check_equal(whole, whole.with_name(f"run_{runs}"))
         runs += 1
-    return f"{stops} stops in {runs} runs"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name)
-def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, number, monkeypatch):
-    monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1000)
+def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, number):
     words, moments = [*SMALL, *LEARNERS[learner]], random.Random(f"{learner} {number}")
     begin = time.monotonic()
     whole = run(*words, folder="whole")
@@ -122,20 +108,19 @@ def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, numb
         os.kill(child, number)
         return ended(child)
 
-    print(f"{learner}, {number.name}: {check_stopped_runs(words, whole, stop)} of {longest:.1f} s")
+    check_stopped_runs(words, whole, stop)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_a_run_killed_in_the_middle_of_writing_loses_nothing(run, learner, monkeypatch):
-    monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1000)
+def test_a_run_killed_in_the_middle_of_writing_loses_nothing(run, learner):
     words, moments = [*SMALL, *LEARNERS[learner]], random.Random(learner)
 
     def stop(words: list[str]) -> int:
         return ended(forked(words, lambda: kill_at_write(moments.randrange(40))))
 
     whole = run(*words, folder="whole")
-    print(f"{learner}: {check_stopped_runs(words, whole, stop)} in the middle of writing")
+    check_stopped_runs(words, whole, stop)
 
 
 def kill_at_write(number: int) -> None:

@@ -13,7 +13,7 @@ from damian.common.errors import InputError
 from damian.common.fields import set_at
 from damian.recipes.command import main
 from damian.recipes.shared.runs import stored_config
-from damian.runs.loggers import LOGGERS
+from damian.runs.metrics_log import LOGGERS
 
 TINY = ["frames=64", "worlds=2", "learner.steps=16", "eval_episodes=2", "model.hidden=[4]", "logger=csv"]
 TINY += ["region.lattice_step=90", "episode.max_steps=8", "learner.minibatches=1"]
@@ -47,13 +47,7 @@ SETTINGS = {
 """Settings that name code, by their keys."""
 WORDS = [f"{key}={name}" for key in ("learner", "motion", "logger.custom") for name in SPELLINGS]
 WORDS += ["hydra.searchpath=['file://evil']", "hydra.callbacks.x._target_=evilmod.X", "+hydra/launcher=evil"]
-WORDS += [
-    "region.path=${oc.env:SECRET}",
-    "scenario=../../evil",
-    "trust=true",
-    "agents=2",
-    "delay@hydra.x=paper",
-]
+WORDS += ["region.path=${oc.env:SECRET}", "scenario=../../evil", "trust=true", "agents=2"]
 PROGRAMS = {
     "load": lambda: damian.load("run"),
     "export": lambda: main(["export", "run"]),
@@ -135,17 +129,13 @@ def test_no_program_imports_what_a_stored_run_names(store, name, capsys):
     check_refuses(PROGRAMS[name], capsys, "this run uses code outside DAMIAN (evilmod:X)")
 
 
-def test_stored_words_are_only_shown(store, monkeypatch):
+def test_stored_words_are_only_shown_and_stored_settings_not_resolved(store, monkeypatch):
     monkeypatch.setenv("SECRET", "secret")
     record = json.loads(Path("run/run.json").read_text(encoding="utf-8"))
     Path("run/run.json").write_text(json.dumps({**record, "overrides": WORDS}), encoding="utf-8")
     _, env = damian.load("run")
     assert env.uav_env.scenario.agents == 3
     check_nothing_ran()
-
-
-def test_a_stored_setting_is_not_resolved(store, monkeypatch):
-    monkeypatch.setenv("SECRET", "secret")
     store("region", {"kind": "geojson", "path": "${oc.env:SECRET}"})
     assert stored_config(Path("run"), "checkpoint").region.path == "${oc.env:SECRET}"
 
@@ -184,7 +174,7 @@ def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(stor
     def imported(start) -> bool:
         """Is the module imported, as if it never was before?"""
         sys.modules.pop("mine", None)
-        LOGGERS._imported.pop("mine:X", None)
+        LOGGERS._components.pop("mine:X", None)
         Path("imported").unlink(missing_ok=True)
         start()
         return Path("imported").exists()
@@ -201,8 +191,8 @@ def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(stor
 
 
 def test_a_value_with_a_colon_is_no_name(store):
-    park = {"type": "Feature", "properties": {"name": "park"}}
     corners = [[8, 45], [8.01, 45], [8.01, 45.008], [8, 45.008], [8, 45]]
+    park = {"type": "Feature", "properties": {"name": "park"}}
     park["geometry"] = {"type": "Polygon", "coordinates": [corners]}
     Path("park.geojson").write_text(json.dumps(park), encoding="utf-8")
     store("region", {"kind": "geojson", "path": "park.geojson", "where": "name:park"})

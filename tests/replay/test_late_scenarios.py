@@ -158,16 +158,11 @@ def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happe
     assert corrected["next", "done"][corrected["reset_after"]].all()
 
 
-@pytest.mark.parametrize("as_files", [False, True])
-def test_a_saved_storage_continues_in_the_same_way(tmp_path, as_files):
+def test_a_saved_storage_continues_in_the_same_way():
     env = training_env(everything(episode=EpisodeConfig(max_steps=9), delay=DelayConfig(obs=LATE)))
     late, (one, other) = fly(env), (buffer_of(env, ["reward", "critic"]) for _ in range(2))
     one.extend(late[:25].transpose(0, 1))
-    if as_files:
-        one.dumps(tmp_path)
-        other.loads(tmp_path)
-    else:
-        other.load_state_dict(one.state_dict())
+    other.load_state_dict(one.state_dict())
     assert other.storage.latest().equal(one.storage.latest())
     for buffer in (one, other):
         buffer.extend(late[25:].transpose(0, 1))

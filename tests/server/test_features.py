@@ -22,17 +22,13 @@ shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
     n_agents=st.integers(1, 6),
     heard=shares,
     spots=shares,
-    newest=st.booleans(),
 )
-def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
-    seed, n_agents, heard, spots, newest
-):
+def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(seed, n_agents, heard, spots):
     worlds = random_worlds(seed, n_agents, heard, spots)
     messages, server = messages_of(worlds)
-    observation = ObservationConfig(estimate="newest" if newest else "mean")
-    ours = observe(messages, server._replace(observation=observation), NAMES)
+    ours = observe(messages, server, NAMES)
     for b, (now, uavs) in enumerate(worlds):
-        for name, values in twin.features(uavs, now, SCALE, TIME_SCALE, newest=newest).items():
+        for name, values in twin.features(uavs, now, SCALE, TIME_SCALE).items():
             difference = ours[name][b].double() - torch.tensor(values, dtype=torch.float64)
             if name in ("source_bearing", "source_drift"):  # 0 and 1 are the same angle.
                 difference = difference - difference.round()

@@ -42,13 +42,3 @@ def test_each_of_many_uavs_and_rings_has_a_mark_and_a_name_beside_the_others(vie
     assert [name.get_text() for name in names] == texts
     assert len({tuple(np.round((*name.xy, *name.xyann), 2)) for name in names}) == 40
     assert len({(uav.colour, uav.edge) for uav in frame_of(film.episode, 0).uavs}) == 20
-
-
-def test_rows_of_a_long_episode_show_the_shares_of_late_and_of_lost_messages():
-    delay = np.zeros((400, 20), int)
-    delay[:200, 3], delay[200:, 4] = 1, -1
-    lanes = Film(crowd(399, sent=np.ones((400, 20), bool), delay=delay)).lanes
-    strength = np.asarray(lanes.images[0].get_array())[..., 3]
-    assert strength[3] == pytest.approx(np.repeat([1.0, 0.1], 50))
-    bars = np.array([bar.get_height() for bar in lanes.patches]).reshape(20, -1)
-    assert bars[3:5] == pytest.approx(np.stack([np.zeros(100), np.repeat([0, -0.9], 50)]))

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from control import Task, draw, evaluate_under, make_env, make_learner, train
-from torch import nn
+from control import Task, draw, make_env, make_learner, train
 from tqdm import tqdm
 
 from damian import keys, set_seed
@@ -12,19 +11,19 @@ from damian.learners.sac import Sac
 DELAY = 3
 
 
-def trained(task: Task, bpql: bool, steps: int, total: int = 1000, width: int = 8) -> Sac:
-    """The learner of an arm after some of its steps; the first ones have random actions."""
+def trained(task: Task, bpql: bool) -> Sac:
+    """The learner of an arm after 20 steps with random actions."""
     torch.manual_seed(0)
     env = make_env(task)
     set_seed(env, 0)
-    learner = make_learner(env, bpql, total, task.longest, width)
-    train(env, learner, steps, tqdm(disable=True))
+    learner = make_learner(env, bpql, 1000, task.longest, 8)
+    train(env, learner, 20, tqdm(disable=True))
     return learner
 
 
 @pytest.mark.parametrize(("bpql", "waits"), [(False, 0), (True, DELAY)])
 def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(bpql, waits):
-    learner = trained(Task(shortest=DELAY, longest=DELAY, history=DELAY), bpql, 20)
+    learner = trained(Task(shortest=DELAY, longest=DELAY, history=DELAY), bpql)
     learner.buffer.storage.steps["next", *keys.REWARD][:20] = torch.arange(20.0).view(20, 1, 1)
     drawn = draw(learner)["next", *keys.REWARD].unique()
     assert drawn.tolist() == [*range(20 - waits)]
@@ -34,7 +33,7 @@ def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(bpql, w
 
 def test_critics_of_timelines_read_what_was_true_when_and_actors_what_had_arrived_of_it():
     slots = DELAY + 1
-    learner = trained(Task(shortest=1, longest=DELAY, history=DELAY, slots=slots), True, 20)
+    learner = trained(Task(shortest=1, longest=DELAY, history=DELAY, slots=slots), True)
     steps = learner.buffer.storage.steps[: 20 - DELAY, 0]
     sent = torch.cat([steps["observation"][:1], steps["next", "observation"]])
     critic, actor = (
@@ -53,21 +52,3 @@ def test_critics_of_timelines_read_what_was_true_when_and_actors_what_had_arrive
 def test_a_jitter_buffer_shows_observations_as_old_as_the_longest_delay():
     steps = make_env(Task(shortest=1, longest=DELAY, buffer=True)).rollout(8)["next"]
     assert steps["age"].flatten().tolist() == [1, 2, 3, 3, 3, 3, 3, 3]
-
-
-@pytest.mark.slow
-def test_delay_lowers_the_return_and_the_action_history_restores_it():
-    def late(delay: int, history: int = 0) -> Task:
-        return Task(shortest=delay, longest=delay, history=history)
-
-    def learn(task: Task, steps: int, bpql: bool = False) -> nn.Module:
-        return trained(task, bpql, steps, steps, 128).actor
-
-    undelayed = learn(late(0), 9_000)
-    returns = {delay: evaluate_under(late(delay), undelayed, 20) for delay in (0, 6)}
-    assert returns[0] > -300
-    assert returns[6] < returns[0] - 300
-    naive = evaluate_under(late(6), learn(late(6), 12_000), 20)
-    for bpql, steps in ((False, 12_000), (True, 8_000)):
-        aware = evaluate_under(late(6, 6), learn(late(6, 6), steps, bpql), 20)
-        assert aware > naive + 300, bpql

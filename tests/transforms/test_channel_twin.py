@@ -178,13 +178,6 @@ def test_a_flag_chooses_who_sends():
     check_against_twin(counting(channel), make, wants)
 
 
-def test_a_matrix_says_who_hears_whom():
-    hears = [[False, True, False], [False, True, True], [True, False, False]]
-    env = counting(Channel(Uniform(0, 3), hears=hears))
-    links = {(i, j) for i, j in ALL if hears[i][j]}
-    check_against_twin(env, twin_of(Uniform(0, 3)), lambda *_: links)
-
-
 def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
     file = tmp_path / "trace.csv"
     file.write_text("\n".join(["delay", *"140203", "lost", "6"]))

@@ -73,7 +73,6 @@ CASES = {
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
     "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
     "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
-    "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),
     "ActionHistory, agents": Case(
         uavs, lambda: ActionHistory(2, ACTION, append_to=OBSERVATION, recorded_key="ready")
     ),
@@ -81,22 +80,18 @@ CASES = {
     "SampleAndHold, agents": Case(
         uavs, lambda: SampleAndHold("2s", [OBSERVATION], [ACTION], ready_key=("agents", "ready"))
     ),
-    "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
     "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),
     "ObservationTimeline, one world": Case(cartpole, lambda: ObservationTimeline(3)),
-    "ObservationTimeline, worlds": Case(Drift, lambda: ObservationTimeline(2)),
     "ObservationTimeline, agents": Case(
         uavs,
         lambda: ObservationTimeline(3, ("agents", "message"), sent_key="message_sent", group=True, own=True),
     ),
-    "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
     "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"})),
     "ObservationDelay, agents": Case(
         uavs,
         lambda: ObservationDelay(LATE, [OBSERVATION], loss=0.2, delay_key="delay", sent_key="message_sent"),
     ),
     "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
-    "RewardDelay, worlds": Case(Drift, lambda: RewardDelay({"law": "geometric"})),
     "RewardDelay, agents": Case(uavs, lambda: RewardDelay(LATE, REWARD)),
     "Channel, links": Case(
         uavs,

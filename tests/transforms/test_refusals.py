@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from delay_twin import Counting
-from environments import ACTION, LATE, OBSERVATION, Drift, uavs
+from environments import LATE, OBSERVATION, Drift, uavs
 from tensordict import TensorDict
-from torchrl.envs import Compose, ConditionalSkip, GymEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import Compose, GymEnv, StepCounter, Transform, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.transforms import (
@@ -15,7 +14,6 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    delay_trajectories,
 )
 
 MISSING = {
@@ -45,7 +43,7 @@ def test_an_entry_that_there_is_already_is_not_replaced(transforms):
 
 MISTAKES = {
     "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
-    "delay 2 x 2, hears 3 x 3: these are of": lambda: Channel([[0, 1], [1, 0]], hears=[[True] * 3] * 3),
+    "delay 2 x 2, loss 3 x 3: these are of": lambda: Channel([[0, 1], [1, 0]], loss=[[0.5] * 3] * 3),
     "comm_range: 5 needs a position_key": lambda: Channel(1, comm_range=5),
 }
 
@@ -56,21 +54,9 @@ def test_a_wrong_argument_is_one_line(line):
         MISTAKES[line]()
 
 
-CHANGES = {
-    "ActionDelay changes which actions": lambda: ActionDelay(3, ACTION),
-    "SampleAndHold changes which actions": lambda: SampleAndHold(3, [], ACTION),
-}
-
-
-@pytest.mark.parametrize("text", CHANGES)
-def test_stored_steps_refuse_what_would_have_changed_what_happened(text):
-    with pytest.raises(InputError, match=f"transform: {text}"):
-        delay_trajectories(Counting([3, 5]).rollout(8, break_when_any_done=False), CHANGES[text]())
-
-
 @pytest.mark.parametrize("use", [lambda t: t, Compose])
 def test_outside_an_environment_the_error_says_what_to_do(use):
-    with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*delay_trajectories"):
+    with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*late_replay_buffer"):
         use(ObservationDelay(2))(TensorDict({"observation": torch.zeros(3, 1)}, [3]))
 
 
@@ -89,7 +75,6 @@ WRONG = {
     "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
     "an observation delay after a history that appends": (appending, delay),
     "a time limit after a reward delay": (lambda: RewardDelay(2), lambda: StepCounter(max_steps=5)),
-    "skipped steps before a delay": (lambda: ConditionalSkip(lambda td: td["done"]), delay),
 }
 
 

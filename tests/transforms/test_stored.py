@@ -1,6 +1,8 @@
 """Delays of stored steps equal those that the same transforms make in the environment."""
 
+import runpy
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,16 +22,20 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from damian.common.errors import InputError
 from damian.delays.laws import Uniform
 from damian.transforms import (
+    ActionDelay,
     ActionHistory,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    delay_trajectories,
     set_seed,
 )
+
+EXAMPLE = runpy.run_path(str(Path(__file__).parents[2] / "examples/transforms/late_replay_buffer.py"))
+delay_trajectories: Callable[..., TensorDictBase] = EXAMPLE["delay_trajectories"]
 
 LATE = Uniform(0, 3)
 
@@ -38,18 +44,12 @@ ROOT = ("observation", "action", "reward")
 AGENTS = (OBSERVATION, ACTION, REWARD)
 KINDS: dict[str, tuple[Callable[[], EnvBase], Any]] = {
     "Pendulum": (lambda: GymEnv("Pendulum-v1"), ROOT),
-    "CartPole": (lambda: GymEnv("CartPole-v1"), ROOT),
     "CartPole, two": (lambda: SerialEnv(2, lambda: GymEnv("CartPole-v1")), ROOT),
     "counting": (lambda: Counting(WORLDS), AGENTS),
-    "counting, continuous": (lambda: Counting(WORLDS, continuous=True), AGENTS),
     "VMAS": (vmas, AGENTS),
 }
 CHAINS: dict[str, Callable[[Any, Any, Any], Transform]] = {
     "observation": lambda o, a, r: ObservationDelay(LATE, [o], loss=0.1, delay_key="d", seed=1),
-    "reward": lambda o, a, r: RewardDelay(LATE, r, seed=1),
-    "sum": lambda o, a, r: CumulativeReward(3, 0.9, r),
-    "clock": lambda o, a, r: SampleAndHold(3, [o]),
-    "history": lambda o, a, r: ActionHistory(2, a, append_to=o),
     "all": lambda o, a, r: Compose(
         ObservationDelay(LATE, [o], order="arrival", seed=1),
         Compose(RewardDelay(LATE, r, seed=2), CumulativeReward(2, 0.9, r)),
@@ -92,3 +92,8 @@ def test_the_number_of_the_trajectory_tells_where_an_episode_begins():
     ages = delay_trajectories(data, ObservationDelay(2, [OBSERVATION]))["agents", "age"]
     assert ages[0, :, 0, 0].tolist() == [0, 1, 0, 1, 2, 2, 2, 2]
     assert ages[3, :, 0, 0].tolist() == [0, 1, *[2] * 6]
+
+
+def test_stored_steps_refuse_what_would_have_changed_what_happened():
+    with pytest.raises(InputError, match="transform: ActionDelay changes which actions"):
+        delay_trajectories(Counting([3, 5]).rollout(8, break_when_any_done=False), ActionDelay(3, ACTION))

@@ -9,7 +9,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
 from damian import keys
-from damian.delays.laws import Function
+from damian.delays.samplers import ContextSampler
 from damian.envs.uav_env import UavEnv
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms import Channel, ObservationDelay, ObservationTimeline, set_seed
@@ -117,9 +117,7 @@ def test_the_worked_timeline_of_the_docstring():
     def delay(context):
         return delays[context.time.long() - 1].float()
 
-    late = ObservationDelay(
-        Function(delay, longest=3, loses=True), "observation", "received", delay_key="delay"
-    )
+    late = ObservationDelay(ContextSampler(delay, longest=3), "observation", "received", delay_key="delay")
     env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(late, ObservationTimeline(4, delay_key="delay")))
     steps = env.rollout(4)
     sent = [steps["observation"][0], *steps["next", "observation"]]

@@ -10,7 +10,8 @@ from torchrl.envs import SerialEnv
 
 def run(name: str) -> dict[str, Any]:
     """Run an example; its globals."""
-    return runpy.run_path(str(Path(__file__).parents[2] / "examples" / "transforms" / f"{name}.py"))
+    path = Path(__file__).parents[2] / "examples" / "transforms" / f"{name}.py"
+    return runpy.run_path(str(path), run_name="__main__")
 
 
 def test_a_late_pendulum_prints_the_age_of_what_it_observes(capsys):

@@ -24,7 +24,7 @@ OBSERVED = [*TWIN_FEATURES, *LOCAL]
 """Features in the order of the critic's observation."""
 
 
-def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> ScenarioConfig:
+def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
     """Every reward term and feature except the coverage; uneven distances, so that no two points tie."""
     task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0, "served": 0.0, "individual": 0.8, "system": 1.5}
     task |= {"drift": "printed" if since else "smooth", "desired_spotting": 0.7, "desired_distance": 0.4}
@@ -38,9 +38,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> Scena
             distances=[0.0, 33.3, 71.9, 118.4],
             headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4],
         ),
-        observation=ObservationConfig(
-            local_features=LOCAL, global_features=TWIN_FEATURES, time_scale=9.0, estimate=estimate
-        ),
+        observation=ObservationConfig(local_features=LOCAL, global_features=TWIN_FEATURES, time_scale=9.0),
         reward=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
         episode=EpisodeConfig(5, since_detection=since, success_share=None if since else 0.5),
         clock=clock("2s"),
@@ -64,7 +62,6 @@ def twins(env: UavEnv) -> list[twin.World]:
             task=env.scenario.reward,
             episode=env.scenario.episode,
             uavs=[twin.Uav(tuple(points[p]), p) for p in first.tolist()],
-            newest=env.scenario.observation.estimate == "newest",
         )
         world.begin()
         worlds.append(world)
@@ -85,11 +82,11 @@ def check_observation(world: twin.World, observation: torch.Tensor):
 
 
 @pytest.mark.sample(2)
-@pytest.mark.parametrize(("since", "estimate"), [(False, "mean"), (True, "newest")])
+@pytest.mark.parametrize("since", [False, True])
 @both_kinds
 @pytest.mark.parametrize("n_agents", [1, 2, 4])
-def test_rollouts_equal_those_of_the_twin(n_agents, kind, since, estimate):
-    env = UavEnv(twin_scenario(n_agents, kind, since, estimate), num_worlds=12, seed=n_agents)
+def test_rollouts_equal_those_of_the_twin(n_agents, kind, since):
+    env = UavEnv(twin_scenario(n_agents, kind, since), num_worlds=12, seed=n_agents)
     table = action_table(env.scenario.actions)
     generator = torch.Generator().manual_seed(n_agents)
     compared = ended = spotted = 0

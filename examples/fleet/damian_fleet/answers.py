@@ -1,7 +1,9 @@
 """What the service tells UAVs and what they say of it, as pydantic models; and what is known of a fleet."""
 
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
 
+import pandas as pd
 from pydantic import BaseModel, BeforeValidator, Field
 
 from damian.common.errors import InputError
@@ -103,3 +105,15 @@ def acknowledgements_of(found: Found) -> list[Acknowledgement]:
 def ignored(rows: Rows) -> list[str]:
     """Names of the columns that are not understood."""
     return sorted({name for _, report in rows for name in report.model_extra or ()})
+
+
+def as_rows(answers: Sequence[BaseModel]) -> list[dict[str, Any]]:
+    """Answers as rows of JSON; only the columns of places that were not given are left out."""
+    return [answer.model_dump(exclude_unset=True) for answer in answers]
+
+
+def as_csv(answers: Sequence[BaseModel]) -> str:
+    """A CSV table of answers with the same columns; what is not known is ``NA``."""
+    rows = as_rows(answers)
+    table = pd.DataFrame(rows, columns=list(rows[0]) if rows else ["ID"], dtype=object)
+    return table.to_csv(index=False, na_rep="NA", lineterminator="\n")

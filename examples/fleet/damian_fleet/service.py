@@ -24,8 +24,6 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 from damian.field.rows import (
-    as_csv,
-    as_rows,
     parsed_json,
     reports_of,
     rows_of_csv,
@@ -35,7 +33,7 @@ from damian.field.rows import (
 )
 from damian.show.geojson import on_earth
 from damian_fleet import api
-from damian_fleet.answers import acknowledgements_of, ignored
+from damian_fleet.answers import acknowledgements_of, as_csv, as_rows, ignored
 from damian_fleet.clock import Clock
 from damian_fleet.fleet import Waiting
 from damian_fleet.journal import Change, Command

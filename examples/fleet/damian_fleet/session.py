@@ -20,7 +20,7 @@ from damian.common.atomic_files import UNFINISHED, writing
 from damian.common.errors import InputError, RunError, described
 from damian.common.text_files import named, show
 from damian.field.rows import Report, Rows, validated
-from damian.runs.run_lock import locked
+from damian.runs.run_folder import locked
 from damian_fleet.answers import Acknowledgement, Advice
 from damian_fleet.fleet import Fleet
 from damian_fleet.journal import (
