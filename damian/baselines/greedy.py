@@ -12,7 +12,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import distances, expand_mask, gather_rows, tree_map
+from damian.common.tensors import distances, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import chance_of_staying, detection_chance, report_rows
@@ -33,6 +33,8 @@ PROBABLE = 0.1
 """If a UAV detects the source with this probability somewhere in the next step, it leaves its own ground."""
 WORTH = 0.3
 """Least share of the highest probability of a detection for which a UAV flies to a landing point."""
+SEARCH_STEPS, GOLDEN = 4, (math.sqrt(5) - 1) / 2
+"""A UAV that searches several sources flies to another place after so many steps, by the golden ratio."""
 MAX_PAIRS = 400_000_000
 """Most pairs of landing points: the script weighs each of them against every other one of its region."""
 
@@ -235,13 +237,15 @@ class Coverer(Greedy):
 
         Where each UAV knows its own messages, ``own_message`` [B, N, M] are these.
         """
-        held = self.unpack(message)
-        own = held if own_message is None else self.unpack(own_message)
+        held = own = self.unpack(message)
         region, actions = self.region_of(held), []
         near = self.footprints(region)
         claimed = torch.zeros(len(region), near.shape[-1], device=message.device)
         for uav in range(message.shape[1]):  # what a UAV chooses depends on those before it
             legal = None if mask is None else mask[:, uav : uav + 1]
+            if own_message is not None:
+                itself = torch.arange(message.shape[1], device=message.device) == uav
+                own = self.unpack(torch.where(itself.unsqueeze(-1), own_message, message))
             action, point = self.choose_new(own, uav, claimed, near, legal)
             actions.append(action)
             if own_message is not None:  # the others do not know where it is
@@ -261,24 +265,24 @@ class Coverer(Greedy):
 
 
 class Rescuer(Coverer):
-    """UAVs are assigned to known sources, the nearest pair first; the others search new ground."""
+    """UAVs are assigned to known sources, the nearest pair first; the others search all over the region."""
 
     def choose_new(
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        searched = super().choose_new(known, uav, claimed, near, mask)
         heard = known.detected_time >= 0  # [B, N, K]
-        place = (known.detected_position * heard.unsqueeze(-1)).sum(1) / heard.sum(1).clamp(min=1).unsqueeze(
-            -1
-        )
+        times = heard.sum(1).clamp(min=1).unsqueeze(-1)
+        place = (known.detected_position * heard.unsqueeze(-1)).sum(1) / times
         goal, assigned = _assigned(known.target, place, heard.any(1), uav)
         region = self.region_of(known)
-        close = (-distances(goal.unsqueeze(1), self.points[region]) / self.radius).exp()
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        followed = self.choose_landing(alone, close, region, mask)
-        return tuple(
-            torch.where(expand_mask(assigned, a), a, b) for a, b in zip(followed, searched, strict=True)
-        )
+        # A sequence of landing points that leaves no gap: each lies far from those before it.
+        turn = (alone.time / self.dt / SEARCH_STEPS).floor() * known.time.shape[1] + uav
+        searched = (turn * GOLDEN % 1 * self.real[region].sum(-1, keepdim=True)).long()
+        searched = _places_at(self.points[region], searched).squeeze(1)
+        goal = torch.where(assigned.unsqueeze(-1), goal, searched)
+        close = (-distances(goal.unsqueeze(1), self.points[region]) / self.radius).exp()
+        return self.choose_landing(alone, close, region, mask)
 
 
 class Dispatcher(Coverer):
