@@ -42,6 +42,9 @@ class ModelConfig(Settings):
         choices=("none", "gru"),
     )
     skip: bool = setting(False, "The actor begins by preferring actions of high ``belief_gain``.")
+    shared: bool = setting(
+        True, "All UAVs share one actor; if not, each has one of its own, for unequal UAVs."
+    )
     shared_value: bool = setting(
         False, "MAPPO's critic gives one value for all UAVs of a world; faster, but it learns less."
     )
@@ -54,6 +57,9 @@ class ModelConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse(self.recurrent and not self.hidden, "hidden", "needs a layer for model.rnn=gru")
+        simple = self.rnn == "none" and not self.skip and self.init == "default"
+        problem = "goes with model.rnn=none model.skip=false model.init=default only"
+        self.refuse(not self.shared and not simple, "shared", problem)
 
     @property
     def recurrent(self) -> bool:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, PopArtValueNorm, ProbabilisticActor, TanhNormal
+from torchrl.modules import MLP, MultiAgentMLP, PopArtValueNorm, ProbabilisticActor, TanhNormal
 from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
@@ -156,7 +156,13 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
         return TensorDictModule(module, in_keys=[in_key], out_keys=list(out_keys))
 
     if not config.recurrent:
-        return head(make_mlp(config, n_features, n_out, env.device, POLICY_GAIN), keys.OBSERVATION)
+        if config.shared:
+            return head(make_mlp(config, n_features, n_out, env.device, POLICY_GAIN), keys.OBSERVATION)
+        options = {"num_cells": config.hidden, "activation_class": _ACTIVATIONS[config.activation]}
+        n_agents = env.observation_spec[keys.OBSERVATION].shape[-2]
+        shape = {"n_agent_inputs": n_features, "n_agent_outputs": n_out, "n_agents": n_agents}
+        network = MultiAgentMLP(**shape, centralized=False, share_params=False, device=env.device, **options)
+        return head(network, keys.OBSERVATION)
     linear = initialized(config, nn.Linear(config.hidden[-1], n_out, device=env.device), POLICY_GAIN)
     *widths, n_hidden = config.hidden
     encoder = hidden_layers(config, n_features, widths, env.device) if widths else nn.Identity()
