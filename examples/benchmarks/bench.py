@@ -79,7 +79,7 @@ def scenarios() -> Scenarios:
         battery=BatteryConfig(enabled=True),
         actions=replace(paper.actions, mask=True),
         observation=ObservationConfig(["battery", "spotted"], TABLE_2, ctde=True),
-        reward=RewardConfig(**dict.fromkeys(BUILT_IN, 1.0)),
+        reward=RewardConfig(**dict.fromkeys(BUILT_IN, 1.0) | {"served": 0.0}),
         episode=EpisodeConfig(max_steps=100),
     )
     return {"use case 2": paper, "everything": full}
