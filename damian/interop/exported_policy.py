@@ -42,12 +42,13 @@ class ExportedPolicy(nn.Module):
             entries.set(key, value)
         for layer in self.layers:
             entries = layer(entries)
+        checked = Distribution._validate_args  # noqa: SLF001 (TorchRL's import has set it)
         Distribution.set_default_validate_args(False)  # no program can contain checks of parameters
         try:
             action = self.last(entries)[keys.ACTION]
             shown = [self.last.get_dist(entries).probs] if self.discrete else []
         finally:
-            Distribution.set_default_validate_args(True)
+            Distribution.set_default_validate_args(checked)
         shown = shown or [entries[key] for key in self.parameter_keys]
         return action, *shown, *([entries[keys.HIDDEN]] if self.recurrent else [])
 
