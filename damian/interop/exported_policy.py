@@ -42,7 +42,7 @@ class ExportedPolicy(nn.Module):
             entries.set(key, value)
         for layer in self.layers:
             entries = layer(entries)
-        checked = Distribution._validate_args  # noqa: SLF001 (TorchRL's import has set it)
+        checked = Distribution._validate_args
         Distribution.set_default_validate_args(False)  # no program can contain checks of parameters
         try:
             action = self.last(entries)[keys.ACTION]
