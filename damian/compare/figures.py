@@ -16,7 +16,7 @@ from matplotlib.ticker import EngFormatter
 from damian.common.plotting import COLOURS, STYLE
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Arm, Comparison
 from damian.compare.statistics import Floats, bootstrap
-from damian.runs.run_folder import RANDOM, SCRIPT
+from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
 
 Panel = TypeVar("Panel")
 
@@ -95,7 +95,7 @@ def plot_matrix(comparison: Comparison, path: Path) -> None:
 
 def _matrix(comparison: Comparison, task: str) -> pd.DataFrame:
     """Lines of the table with the delay in which they were ``flown``, and a ``label`` for each training."""
-    table = comparison.table[comparison.table["policy"] == comparison.policy]
+    table = comparison.table[comparison.table["policy"] == TRAINED]
     away = table[table["task"].str.startswith(f"{task}{_DELAY}")]
     flown, label = (
         away["task"].str.removeprefix(f"{task}{_DELAY}"),
