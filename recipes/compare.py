@@ -27,7 +27,7 @@ from damian.common.errors import InputError
 from damian.common.tables import write_csv
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, RUN, Comparison
 from damian.compare.config import SEEDS, CompareConfig
-from damian.compare.figures import plot_curves, plot_matrix, plot_norms
+from damian.compare.figures import plot_curves, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.processes import end_interrupted
@@ -51,7 +51,7 @@ from .shared.comparison_runs import (
 from .shared.runs import check_stored
 from .train import train
 
-TABLE, CURVES, MATRIX = "table.csv", "curves.png", "matrix.png"
+TABLE, CURVES = "table.csv", "curves.png"
 EPISODES = 100
 """A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
 
@@ -70,8 +70,8 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     comparison = Comparison(*results, config.chosen("arms"), config.score)
     write_csv(folder / TABLE, comparison.table, unknown="")
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results.rows, missing)))
-    for plot, name in ((plot_curves, CURVES), (plot_norms, FIGURE), (plot_matrix, MATRIX)):
-        plot(comparison, folder / name)
+    plot_curves(comparison, folder / CURVES)
+    plot_norms(comparison, folder / FIGURE)
 
 
 def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) -> list[str]:

@@ -148,17 +148,11 @@ class FlyConfig(FlownPolicyConfig):
     journal: str | None = setting(
         None, "Journal of a fleet whose flight to show, instead of flying, with the settings given here."
     )
-    span: list[float] | None = setting(
-        None, "First and last time of the journal to show, since every UAV had reported.", unit="s"
-    )
     replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
-        if self.span is not None:
-            good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal
-            self.refuse(not good, "span", "is not [FIRST, LAST], two times of a journal [s]")
 
 
 @dataclass
