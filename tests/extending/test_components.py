@@ -46,7 +46,7 @@ def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
     [
         (["delay.obs={law: law:Satelite}"], "delay.obs.law: law:Satelite: the module law has no Satelite"),
         (["sensors=[{sensor: sensor:wind, strenght: 3}]"], "sensors[0].strenght: 3 is not a parameter of"),
-        ([*REGION[:2], "region.options={sid: 50}"], "region.options.sid: 50 is not one of its"),
+        ([*REGION[:2], "region.options={sid: 50}"], "region.options: sid is not one of side"),
     ],
 )
 def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
