@@ -1,20 +1,28 @@
-"""Draws the figures of docs/concepts.md: what a delay is, and what the laws do (make pictures).
+"""Draws the figures of docs/concepts.md, what a delay is and what the laws do, and one of delaybench.
 
-python docs/figures.py
+python docs/figures.py    (make pictures)
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torchrl.envs import GymEnv, TransformedEnv
 
 from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
+from damian.compare.comparison import TRAINED, Comparison
+from damian.compare.figures import draw_groups, save, style_of
+from damian.recipes import cli
+from damian.recipes.compare import includes
+from damian.recipes.shared.comparison_runs import stored_results
 
 IMAGES = Path(__file__).parent / "images"
+DELAYBENCH = Path(__file__).parent / "results" / "delaybench"
 STEPS = 24
 LAWS = {
     "constant: 3": Constant(3),
@@ -24,6 +32,13 @@ LAWS = {
     "burst: at times 6 steps, half of them lost": Burst(enter=0.05, leave=0.2, bad=6, bad_loss=0.5),
     "lag: for 20 steps the same, 0 to 6": Lag(Uniform(0, 6), update_period=20),
 }
+_DELAY, _FLOWN = "@delay_", 4
+"""Mark of the tasks of held-out delays; least number of them under which a policy flew, to be drawn."""
+_SPECIALISTS = ", trained at each delay"
+"""End of the label of a line of policies that fly under the delay at which they were trained."""
+SHOWN = ["experiment=delaybench", "tasks=[crowded]", "delays=['4','5',lag,0-7]"]
+SHOWN += ["arms=[undelayed,backupdate+gru,timeline,timeline+gru]"]
+"""What the figure of delaybench shows."""
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 
 
@@ -73,7 +88,7 @@ def plot_model(axes: tuple[Axes, Axes], drawn: Drawn) -> None:
 
 
 def main() -> None:
-    """Draw and write both figures."""
+    """Draw and write the figures."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots(2, 1, sharex=True)
     plot_model((axes[0], axes[1]), draw_messages(Uniform(1, 7, probability=0.6), STEPS, seed=3, loss=0.12))
@@ -89,6 +104,48 @@ def main() -> None:
     for panel in panels[-1]:
         panel.set_xlabel("step", fontsize=8)
     figure.savefig(IMAGES / "delay_laws.png", dpi=110)
+    plot_matrix(DELAYBENCH / "matrix.png")
+
+
+def plot_matrix(path: Path) -> None:
+    """Draw delaybench: scores over the held-out delays under which policies flew, a line for each training.
+
+    Held-out tasks of delays have names that begin with ``delay_``; a policy must have flown under four.
+    Dashed, an arm that was trained at several constant delays: at each one, the policies trained there.
+    """
+    config = cli.settings(*SHOWN, program="compare")
+    results = stored_results(path.parent).only(partial(includes, config))
+    comparison = Comparison(*results, config.chosen("arms"))
+    drawn = {task: lines for task in comparison.tasks() if len(lines := _matrix(comparison, task))}
+
+    def panel(axis: Axes, task: str) -> None:
+        names = sorted(drawn[task]["flown"].unique(), key=lambda x: (not x.isdecimal(), x.zfill(9)))
+        styles = {label: style_of(n) for n, label in enumerate(drawn[task]["label"].unique())}
+        for label, style in styles.items():
+            style["linestyle"] = "--" if label.endswith(_SPECIALISTS) else "-"
+        draw_groups(axis, drawn[task], ("flown", "label", comparison.score), names, styles)
+        axis.tick_params(axis="x", rotation=90)
+        axis.set(title=task, xlabel="delay of the flight [steps], or its law", ylabel=comparison.score)
+
+    save(path, [*drawn], panel, (6.4, 3.6))
+
+
+def _matrix(comparison: Comparison, task: str) -> pd.DataFrame:
+    """Lines of the table with the delay in which they were ``flown``, and a ``label`` for each training."""
+    table = comparison.table[comparison.table["policy"] == TRAINED]
+    away = table[table["task"].str.startswith(f"{task}{_DELAY}")]
+    flown, label = (
+        away["task"].str.removeprefix(f"{task}{_DELAY}"),
+        away["arm"] + ", trained at " + away["delay"],
+    )
+    away = away.assign(flown=flown, label=label)
+    away = away[away.groupby("label")["flown"].transform("size") >= _FLOWN]
+    constant = [name for name in flown.unique() if name.isdecimal()]
+    trained = [name for name, arm in comparison.arms.items() if arm.policy_of is None]
+    own = table[(table["task"] == task) & table["delay"].isin(constant) & table["arm"].isin(trained)]
+    own = own.assign(flown=own["delay"], label=own["arm"] + _SPECIALISTS)
+    own = own[own.groupby("label")["flown"].transform("size") > 1]
+    return pd.concat([away, own]) if len(away) else away
 
 
 if __name__ == "__main__":

@@ -25,16 +25,9 @@ from omegaconf import DictConfig
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import write_csv
-from damian.compare.comparison import (
-    HELD_OUT_MARK,
-    NOT_LATE,
-    RUN,
-    TRAINED,
-    TRAINED_DETERMINISTIC,
-    Comparison,
-)
+from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, RUN, Comparison
 from damian.compare.config import SEEDS, CompareConfig
-from damian.compare.figures import plot_curves, plot_matrix, plot_norms
+from damian.compare.figures import plot_curves, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.processes import end_interrupted
@@ -58,10 +51,9 @@ from .shared.comparison_runs import (
 from .shared.runs import check_stored
 from .train import train
 
-TABLE, CURVES, MATRIX = "table.csv", "curves.png", "matrix.png"
+TABLE, CURVES = "table.csv", "curves.png"
 EPISODES = 100
 """A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
-POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}
 
 
 def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
@@ -75,11 +67,11 @@ def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
 
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
     """Write the tables and the figures."""
-    comparison = Comparison(*results, config.chosen("arms"), config.score, POLICIES[config.policy])
+    comparison = Comparison(*results, config.chosen("arms"), config.score)
     write_csv(folder / TABLE, comparison.table, unknown="")
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results.rows, missing)))
-    for plot, name in ((plot_curves, CURVES), (plot_norms, FIGURE), (plot_matrix, MATRIX)):
-        plot(comparison, folder / name)
+    plot_curves(comparison, folder / CURVES)
+    plot_norms(comparison, folder / FIGURE)
 
 
 def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) -> list[str]:
@@ -92,7 +84,7 @@ def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) ->
         f"{seeds.nunique()} seeds ({seeds.min()} to {seeds.max()}), "
         f"{' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: bootstrap over seeds, widened for few seeds; none below "
-        f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
+        f"{FEWEST}]; J: {config.score} of the sampled policy; perceived: as far as the server knew, "
         "else as it truly was; age in steps; backupdated: share of the rewards in training; n: seeds",
         "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (R0, or R1 "
         "and R2), 1 undelayed, not shown where "

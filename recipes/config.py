@@ -5,7 +5,7 @@ from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, rules, setting
-from damian.compare.config import SCORES, STORED
+from damian.compare.config import STORED
 from damian.envs.config import ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.runs.config import LoggerConfig
@@ -148,17 +148,11 @@ class FlyConfig(FlownPolicyConfig):
     journal: str | None = setting(
         None, "Journal of a fleet whose flight to show, instead of flying, with the settings given here."
     )
-    span: list[float] | None = setting(
-        None, "First and last time of the journal to show, since every UAV had reported.", unit="s"
-    )
     replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
-        if self.span is not None:
-            good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal
-            self.refuse(not good, "span", "is not [FIRST, LAST], two times of a journal [s]")
 
 
 @dataclass
@@ -191,11 +185,8 @@ class ExportConfig(Settings):
 class ResultsConfig(Settings):
     """All settings of ``damian results``."""
 
-    folders: list[str] = setting([], "Folder of a run, a sweep or a comparison; or two folders to compare.")
-    score: str = setting(
-        "return", "The measure whose differences the table of two folders has.", choices=SCORES
-    )
+    folder: str | None = setting(None, "Folder of a run, a sweep or a comparison.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.refuse(len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare")
+        self.refuse(self.folder is None, "folder", "is missing: that of a run, a sweep or a comparison")

@@ -2,12 +2,11 @@
 
 damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
 damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"   (in one page, side by side)
-damian fly journal=north.jsonl "span=[600,900]" "formats=[html]"               (the flight of real UAVs)
+damian fly journal=north.jsonl "formats=[html]"    (the flight of real UAVs)
 """
 
 __package__ = "damian.recipes"  # also of a script: python recipes/fly.py
 
-import math
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -63,9 +62,7 @@ def episodes_of_journal(config: FlyConfig) -> list[Episode]:
     def node_of(n_uavs: int) -> Node:
         return Node(for_uavs(config, n_uavs), config.seed, reward_terms=True)
 
-    first, last = config.span or (0.0, math.inf)
-    about = {"overrides": list(config.overrides)}
-    return episodes_of(Path(str(config.journal)), node_of, about, (first, last))
+    return episodes_of(Path(str(config.journal)), node_of, {"overrides": list(config.overrides)})
 
 
 def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:

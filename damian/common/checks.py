@@ -6,7 +6,7 @@ long before a computer refuses a number.
 
 import math
 import string
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeGuard
 
 from damian.common.errors import InputError
@@ -94,17 +94,6 @@ def names(key: str, given: Any, known: Sequence[str]) -> frozenset[Any]:
     for name in found:
         one_of(key, name, known)
     return frozenset(found)
-
-
-def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
-    """Require a mapping without unknown keys, such as the options of your own component; None is empty."""
-    known = list(known)
-    given = {} if given is None else given
-    if not isinstance(given, Mapping):
-        raise InputError(f"{key}: {given} is not a mapping such as {{{known[0]}: 1}}")
-    for name, value in given.items():
-        require(name in known, f"{key}.{name}", value, f"is not one of its options: {', '.join(known)}")
-    return dict(given)
 
 
 def distinct(key: str, values: Sequence[Any]) -> None:

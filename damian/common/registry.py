@@ -19,8 +19,6 @@ from damian.common.errors import InputError, described
 
 T = TypeVar("T")
 Component = TypeVar("Component")
-IMPORTED: set[str] = set()
-"""Every path that a registry of this process has imported."""
 
 
 class _Door(NamedTuple):
@@ -94,7 +92,6 @@ class Registry(Generic[T]):
         good = isinstance(component, fits) if isinstance(fits, type) else fits(component)
         checks.require(good, key, name, self._problem)
         self._components[name] = component
-        IMPORTED.add(name)
         return component
 
     def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:

@@ -19,10 +19,9 @@ from damian.compare.statistics import (
 )
 from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED
 
-TRAINED_DETERMINISTIC = TRAINED + DETERMINISTIC
 SCRIPTED = (RANDOM, SCRIPT)
 """Policies that fly the same episodes beside each arm, and learn nothing."""
-OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED + DETERMINISTIC)
+OF_ARM = (TRAINED, TRAINED + DETERMINISTIC, UNTRAINED, UNTRAINED + DETERMINISTIC)
 """Policies of an arm: its network after the training and before the first update."""
 HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
@@ -114,8 +113,6 @@ class Comparison:
     arms: Mapping[str, Arm]
     score: str = "return"
     """Measure that is the J of J_norm and recovery."""
-    policy: str = TRAINED
-    """Policy with which the arms are compared, ``TRAINED`` or ``TRAINED_DETERMINISTIC``."""
 
     def tasks(self) -> list[str]:
         """Tasks with a finished run."""
@@ -136,7 +133,7 @@ class Comparison:
 
     def policy_of(self, arm: str) -> str:
         """The policy with which an arm is compared; an untrained arm has none but its untrained network."""
-        return self.policy.replace(TRAINED, UNTRAINED) if self.arms[arm].untrained else self.policy
+        return UNTRAINED if self.arms[arm].untrained else TRAINED
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -172,7 +169,7 @@ class Comparison:
         The first columns are the undelayed arm and the random policy, without delay.
         """
         undelayed = next((name for name, arm in self.arms.items() if not arm.delayed), "")
-        of = {undelayed: (NOT_LATE, undelayed, self.policy), RANDOM: (NOT_LATE, undelayed, RANDOM)}
+        of = {undelayed: (NOT_LATE, undelayed, TRAINED), RANDOM: (NOT_LATE, undelayed, RANDOM)}
         of |= {arm: (delay, arm, self.policy_of(arm)) for arm in self._present(task, delay)}
         none = pd.DataFrame({self.score: []}, dtype=float)
         found = {name: self._runs.get((task, *key), none)[self.score] for name, key in of.items()}

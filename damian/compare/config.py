@@ -20,8 +20,6 @@ SEEDS = 10
 """Seeds of a comparison, if their number is not given; with fewer, a report is marked as developing."""
 SET_BY_COMPARISON = ("seed", "resume", "checkpoint", "logger", "hydra")
 """Keys that a comparison sets for each of its runs."""
-SCORE_MEANS = "The measure that counts, of what truly happened, or as the server perceived it."
-POLICY_MEANS = "The evaluated policy: actions drawn (sampled), or the most likely ones (deterministic)."
 
 
 @dataclass
@@ -116,8 +114,11 @@ class CompareConfig(Settings):
     delays: list[str] | None = setting(None, "Delays to run; all of the experiment's if not given.")
     arms: list[str] | None = setting(None, "Arms to run; all of the experiment's if not given.")
     overrides: list[str] = setting([], "Further overrides of ``damian train`` for every run.")
-    score: str = setting("return", SCORE_MEANS, choices=SCORES)
-    policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
+    score: str = setting(
+        "return",
+        "The measure that counts, of what truly happened, or as the server perceived it.",
+        choices=SCORES,
+    )
     report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
     keep: bool = setting(
         False, "Keep the stored results of runs whose folders are gone, and run only the others."

@@ -1,4 +1,4 @@
-"""Figures of a comparison: learning curves, J_norm of each arm, and the matrix of held-out tasks."""
+"""Figures of a comparison: learning curves, and J_norm of each arm."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -30,10 +30,6 @@ ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", 
 """Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
 _POINTS = 200
 """Number of points of a learning curve."""
-_DELAY, _FLOWN = "@delay_", 4
-"""Mark of the tasks of held-out delays; least number of them under which a policy flew, to be drawn."""
-_SPECIALISTS = ", trained at each delay"
-"""End of the label of a line of policies that fly under the delay at which they were trained."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
@@ -53,7 +49,7 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
         for delay in comparison.delays(task) or [NOT_LATE]
         for measure in (LABELS if succeeds else ["hindsight_return"])  # else episodes end at their limit
     ]
-    _save(path, panels, partial(_curve_panel, comparison), (3.2, 2.6), width=3)
+    save(path, panels, partial(_curve_panel, comparison), (3.2, 2.6), width=3)
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
@@ -64,67 +60,29 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
 
     def panel(axis: Axes, task: str) -> None:
         lines = known[known["task"] == task]
-        _draw_groups(axis, lines, ("delay", "arm", "J_norm"), comparison.delays(task), styles, spread=0.7)
+        draw_groups(axis, lines, ("delay", "arm", "J_norm"), comparison.delays(task), styles, spread=0.7)
         title = task.replace(HELD_OUT_MARK, ", held-out ")
         axis.set(title=title, xlabel="delay", ylabel="J_norm (dashed: undelayed 1, random 0)")
         for level in (0, 1):
             axis.axhline(level, **_LEVEL)
 
-    _save(path, [*known["task"].unique()], panel, (3.0, 3.0), width=4, sharey=True)
-
-
-def plot_matrix(comparison: Comparison, path: Path) -> None:
-    """Draw the scores of policies over the held-out delays under which they flew, a line for each training.
-
-    Held-out tasks of delays have names that begin with ``delay_``; a policy must have flown under four.
-    Dashed, an arm that was trained at several constant delays: at each one, the policies trained there.
-    """
-    drawn = {task: lines for task in comparison.tasks() if len(lines := _matrix(comparison, task))}
-
-    def panel(axis: Axes, task: str) -> None:
-        names = sorted(drawn[task]["flown"].unique(), key=lambda x: (not x.isdecimal(), x.zfill(9)))
-        styles = {label: _style(n) for n, label in enumerate(drawn[task]["label"].unique())}
-        for label, style in styles.items():
-            style["linestyle"] = "--" if label.endswith(_SPECIALISTS) else "-"
-        _draw_groups(axis, drawn[task], ("flown", "label", comparison.score), names, styles)
-        axis.tick_params(axis="x", rotation=90)
-        axis.set(title=task, xlabel="delay of the flight [steps], or its law", ylabel=comparison.score)
-
-    _save(path, [*drawn], panel, (6.4, 3.6))
-
-
-def _matrix(comparison: Comparison, task: str) -> pd.DataFrame:
-    """Lines of the table with the delay in which they were ``flown``, and a ``label`` for each training."""
-    table = comparison.table[comparison.table["policy"] == comparison.policy]
-    away = table[table["task"].str.startswith(f"{task}{_DELAY}")]
-    flown, label = (
-        away["task"].str.removeprefix(f"{task}{_DELAY}"),
-        away["arm"] + ", trained at " + away["delay"],
-    )
-    away = away.assign(flown=flown, label=label)
-    away = away[away.groupby("label")["flown"].transform("size") >= _FLOWN]
-    constant = [name for name in flown.unique() if name.isdecimal()]
-    trained = [name for name, arm in comparison.arms.items() if arm.policy_of is None]
-    own = table[(table["task"] == task) & table["delay"].isin(constant) & table["arm"].isin(trained)]
-    own = own.assign(flown=own["delay"], label=own["arm"] + _SPECIALISTS)
-    own = own[own.groupby("label")["flown"].transform("size") > 1]
-    return pd.concat([away, own]) if len(away) else away
+    save(path, [*known["task"].unique()], panel, (3.0, 3.0), width=4, sharey=True)
 
 
 def plot_means(table: pd.DataFrame, name: str, path: Path) -> None:
     """Draw a column of a table of means by groups of runs, for each policy."""
     groups, policies = table["group"].unique().tolist(), table["policy"].unique().tolist()
-    styles = {policy: _style(n) | {"linestyle": ""} for n, policy in enumerate(policies)}
+    styles = {policy: style_of(n) | {"linestyle": ""} for n, policy in enumerate(policies)}
 
     def panel(axis: Axes, _: None) -> None:
-        _draw_groups(axis, table, ("group", "policy", name), groups, styles, spread=0.5)
+        draw_groups(axis, table, ("group", "policy", name), groups, styles, spread=0.5)
         axis.tick_params(axis="x", rotation=90)
         axis.set_ylabel(name)
 
-    _save(path, [None], panel, (0.4 * len(groups) + 1.4, 5.2))
+    save(path, [None], panel, (0.4 * len(groups) + 1.4, 5.2))
 
 
-def _draw_groups(
+def draw_groups(
     axis: Axes,
     lines: pd.DataFrame,
     columns: tuple[str, str, str],
@@ -151,10 +109,10 @@ def _draw_groups(
 def look(arms: Mapping[str, Arm], arm: str) -> dict[str, Any]:
     """Style of an arm by its place among all; dotted lines are of arms that train nothing."""
     trains = arms[arm].policy_of is None and not arms[arm].untrained
-    return _style([*arms].index(arm)) | {"linestyle": "-" if trains else ":"}
+    return style_of([*arms].index(arm)) | {"linestyle": "-" if trains else ":"}
 
 
-def _style(number: int) -> dict[str, Any]:
+def style_of(number: int) -> dict[str, Any]:
     """Colour, and a marker and a width, which tell from others of this colour."""
     again, colour = divmod(number, len(ARM_COLOURS))
     return {
@@ -164,7 +122,7 @@ def _style(number: int) -> dict[str, Any]:
     }
 
 
-def _save(
+def save(
     path: Path,
     panels: Sequence[Panel],
     draw: Callable[[Axes, Panel], None],

@@ -27,47 +27,25 @@ from damian.field.tracker import Tracker
 from damian.show.episode import Episode, Floats, at_instant, episode_of
 from damian.world.state import Truth
 
-MOST_STEPS = 20_000
-"""Most steps of an episode that is made from a journal."""
 
-
-def episodes_of(
-    path: Path,
-    node_of: Callable[[int], Node],
-    about: Mapping[str, Any],
-    span: tuple[float, float] = (0.0, math.inf),
-) -> list[Episode]:
+def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, Any]) -> list[Episode]:
     """The flight of a journal as episodes; ``source`` and ``emits`` are None.
 
     An episode begins when all UAVs of the fleet have reported; when UAVs join or leave, another one does.
-    ``node_of`` gives a node for a number of UAVs, which writes the terms of the reward; ``span`` is the first
-    and last time to keep, since the first episode began [s].
+    ``node_of`` gives a node for a number of UAVs, which writes the terms of the reward.
     """
     head, lines = read_journal(path)
     told = {"policy": head.about.get("policy"), "checkpoint": head.about.get("checkpoint")}
-    episodes, zero, end = [], None, math.nan
+    episodes = []
     for uavs, part in _parts(head.uavs, lines):
         rows = [(where, report) for where, line in part for report in line.reports]
         if {*uavs} - {report.id for _, report in rows}:
             continue  # not every UAV has reported
-        tracker, end = Tracker(node_of(len(uavs)), uavs, rows), part[-1][1].time
-        dt, last = tracker.node.dt, tracker.step_of(end)
-        zero = tracker.start + tracker.first_step * dt if zero is None else zero
-        kept = [
-            step
-            for step in range(tracker.first_step, last + 1)
-            if span[0] <= round(tracker.start + step * dt - zero, 3) <= span[1]
-        ]
-        if len(kept) > MOST_STEPS:
-            problem = f"it has more than {MOST_STEPS} steps of {dt:g} s: give FIRST and LAST [s]"
-            raise InputError(f"span: {problem}")
-        if kept:
-            episodes.append(_episode(tracker, rows, kept, {**told, **about, "fleet": head.fleet}))
-    if zero is None:
-        raise InputError(f"{path}: the fleet never began: not every UAV has reported")
+        tracker = Tracker(node_of(len(uavs)), uavs, rows)
+        steps = range(tracker.first_step, tracker.step_of(part[-1][1].time) + 1)
+        episodes.append(_episode(tracker, rows, steps, {**told, **about, "fleet": head.fleet}))
     if not episodes:
-        whole = f"the journal covers 0 to {end - zero:g} s"
-        raise InputError(f"span: no step lies between {span[0]:g} and {span[1]:g} s: {whole}")
+        raise InputError(f"{path}: the fleet never began: not every UAV has reported")
     return episodes
 
 
@@ -86,10 +64,9 @@ def _parts(
 
 def _episode(tracker: Tracker, rows: Rows, steps: Sequence[int], about: Mapping[str, Any]) -> Episode:
     """The flight of these steps."""
-    node, numbers, known = tracker.node, np.array(steps), []
-    for outputs in tqdm(tracker.steps(tracker.start + steps[-1] * node.dt), unit=" steps", delay=1):
-        if tracker.step >= steps[0]:
-            known.append(outputs[0])
+    node, numbers, known = tracker.node, np.array(steps), list[Any]()
+    taken = tracker.steps(tracker.start + steps[-1] * node.dt)
+    known += [outputs[0] for outputs in tqdm(taken, unit=" steps", delay=1)]
     reports = {uav: [each for _, each in rows if each.id == uav] for uav in tracker.uavs}
     flown = [_hindsight(tracker, own, numbers) for own in reports.values()]
     columns = {name: np.stack([each[name] for each in flown], 1) for name in flown[0]}

@@ -48,18 +48,12 @@ class ModelConfig(Settings):
     shared_value: bool = setting(
         False, "MAPPO's critic gives one value for all UAVs of a world; faster, but it learns less."
     )
-    init: str = setting(
-        "default",
-        "Initial weights: PyTorch's (default), or orthogonal matrices and biases of 0 (Saxe et al. 2014).",
-        choices=("default", "orthogonal"),
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse(self.recurrent and not self.hidden, "hidden", "needs a layer for model.rnn=gru")
-        simple = self.rnn == "none" and not self.skip and self.init == "default"
-        problem = "goes with model.rnn=none model.skip=false model.init=default only"
-        self.refuse(not self.shared and not simple, "shared", problem)
+        problem = "goes with model.rnn=none model.skip=false only"
+        self.refuse(not self.shared and (self.recurrent or self.skip), "shared", problem)
 
     @property
     def recurrent(self) -> bool:
@@ -172,9 +166,6 @@ class MappoConfig(LearnerConfig):
     lmbda: float = setting(0.9, "Lambda of the generalised advantage estimate.", low=0, high=1)
     clip_epsilon: float = setting(0.2, "Clipping of the importance ratio.", low=0, high=1)
     entropy_coeff: float = setting(0.01, "Weight of the entropy bonus.", low=0)
-    entropy_coeff_end: float | None = setting(
-        None, "Weight of the entropy bonus after ``frames`` steps; constant if not given.", low=0
-    )
     critic_coeff: float = constant(0.5, "Weight of the critic's loss, which Adam cancels.", low=0)
     max_grad_norm: float = setting(0.5, "Largest norm of the gradient, which is scaled down.", above=0)
     epochs: int = setting(4, "Passes over the batch per update.", low=1, high=checks.STEPS)

@@ -19,7 +19,6 @@ from damian.learners.base import LearningSetup
 from damian.learners.config import MappoConfig
 from damian.learners.networks import COMPILE_OPTIONS, NormalizedValue, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
-from damian.learners.schedule import LinearSchedule
 from damian.replay.backupdate import BackupdateStorage
 
 LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
@@ -51,24 +50,19 @@ class Mappo:
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
-        last = config.entropy_coeff if config.entropy_coeff_end is None else config.entropy_coeff_end
-        self.entropy_coeff = LinearSchedule(config.entropy_coeff, last, setup.frames, env.device)
         # Compiling a recurrent actor, whose loop over time becomes one graph, takes many minutes.
         compiles = setup.compile and not setup.model.recurrent
         self.losses = compiled(self._losses, options=COMPILE_OPTIONS) if compiles else self._losses
 
     def components(self) -> dict[str, Any]:
-        """What a checkpoint stores: networks, optimiser and, if it is annealed, the entropy coefficient."""
-        networks = {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
-        anneals = self.config.entropy_coeff_end is not None
-        return {**networks, "entropy_coeff": self.entropy_coeff} if anneals else networks
+        """What a checkpoint stores: networks and optimiser."""
+        return {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Make one update from a batch [B, T]; also logs ``explained_variance`` and ``backupdated``."""
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
         numbers = self.optimize(corrected)
-        self.entropy_coeff.advance(batch.numel())
         numbers["explained_variance"] = explained_variance(corrected).item()
         if self.buffer is None:
             return numbers
@@ -96,7 +90,7 @@ class Mappo:
         """Make ``epochs`` passes over a batch [B, T]; means of ``LOSSES``, ``NUMBERS``, ``gradient_norm``."""
         terms = []
         for entries in self._minibatches(batch):
-            losses, numbers = self.losses(entries, self.entropy_coeff.value)
+            losses, numbers = self.losses(entries)
             self.optimizer.zero_grad()
             losses.sum().backward()
             norm = torch.nn.utils.clip_grad_norm_(self.weights, self.config.max_grad_norm)
@@ -120,8 +114,8 @@ class Mappo:
             for i in range(n_minibatches):
                 yield {key: part[i] for key, part in parts.items()}
 
-    def _losses(self, entries: dict[NestedKey, Tensor], entropy_coeff: Tensor) -> tuple[Tensor, Tensor]:
-        return mappo_losses(entries, self.actor, self.critic, self.config, entropy_coeff)
+    def _losses(self, entries: dict[NestedKey, Tensor]) -> tuple[Tensor, Tensor]:
+        return mappo_losses(entries, self.actor, self.critic, self.config)
 
 
 def mappo_losses(
@@ -129,7 +123,6 @@ def mappo_losses(
     actor: ProbabilisticActor,
     critic: TensorDictModule,
     config: MappoConfig,
-    entropy_coeff: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
 
@@ -152,7 +145,7 @@ def mappo_losses(
     error = smooth_l1_loss(critic(steps)[keys.STATE_VALUE] / scale, entries[keys.VALUE_TARGET] / scale)
     losses = [
         -(objective * ready).sum() / n_decisions,
-        -entropy_coeff * mean_entropy,
+        -config.entropy_coeff * mean_entropy,
         config.critic_coeff * error,
     ]
     with torch.no_grad():

@@ -1,8 +1,7 @@
 """Actors and critics: all UAVs share one network, so that a policy works with any number of UAVs."""
 
-import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey
@@ -26,21 +25,15 @@ COMPILE_OPTIONS = {
 """Options of ``torch.compile`` for networks."""
 FIRST_WEIGHT, LEAST = 8.0, 1e-3
 """Initial weight of a skip connection, and the lower bound of the probabilities of which it takes the log."""
-POLICY_GAIN = 0.01
-"""Gain of the policy's output layer, if its initial weights are orthogonal."""
 FORGETTING = 0.99
 """Share of the running statistics of values that an update keeps: they reflect about the last 100 updates."""
-Network = TypeVar("Network", bound=nn.Module)
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
-def make_mlp(
-    config: ModelConfig, n_in: int, n_out: int, device: torch.device | None, gain: float = 1.0
-) -> MLP:
-    """Make a multilayer perceptron; ``gain`` is that of the output layer, if ``init`` is orthogonal."""
+def make_mlp(config: ModelConfig, n_in: int, n_out: int, device: torch.device | None) -> MLP:
+    """Make a multilayer perceptron."""
     activation = _ACTIVATIONS[config.activation]
-    network = MLP(n_in, n_out, num_cells=config.hidden, activation_class=activation, device=device)
-    return initialized(config, network, gain)
+    return MLP(n_in, n_out, num_cells=config.hidden, activation_class=activation, device=device)
 
 
 def hidden_layers(config: ModelConfig, n_in: int, widths: Sequence[int], device: torch.device | None) -> MLP:
@@ -49,20 +42,6 @@ def hidden_layers(config: ModelConfig, n_in: int, widths: Sequence[int], device:
     kind = _ACTIVATIONS[config.activation]
     options: dict[str, Any] = {"activation_class": kind, "activate_last_layer": True, "device": device}
     return MLP(n_in, n_out, num_cells=inner, **options)
-
-
-def initialized(config: ModelConfig, network: Network, gain: float) -> Network:
-    """Initialise the weights as the setting ``init`` says, with ``gain`` in the last layer."""
-    if config.init != "orthogonal":
-        return network
-    layers = [each for each in network.modules() if isinstance(each, nn.Linear | nn.GRUCell)]
-    for layer in layers:
-        for weights in layer.parameters():
-            if weights.ndim == 1:
-                nn.init.zeros_(weights)
-            else:
-                nn.init.orthogonal_(weights, gain if layer is layers[-1] else math.sqrt(2))
-    return network
 
 
 class LegalCategorical(Distribution):
@@ -157,17 +136,17 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
 
     if not config.recurrent:
         if config.shared:
-            return head(make_mlp(config, n_features, n_out, env.device, POLICY_GAIN), keys.OBSERVATION)
+            return head(make_mlp(config, n_features, n_out, env.device), keys.OBSERVATION)
         options = {"num_cells": config.hidden, "activation_class": _ACTIVATIONS[config.activation]}
         n_agents = env.observation_spec[keys.OBSERVATION].shape[-2]
         shape = {"n_agent_inputs": n_features, "n_agent_outputs": n_out, "n_agents": n_agents}
         network = MultiAgentMLP(**shape, centralized=False, share_params=False, device=env.device, **options)
         return head(network, keys.OBSERVATION)
-    linear = initialized(config, nn.Linear(config.hidden[-1], n_out, device=env.device), POLICY_GAIN)
+    linear = nn.Linear(config.hidden[-1], n_out, device=env.device)
     *widths, n_hidden = config.hidden
     encoder = hidden_layers(config, n_features, widths, env.device) if widths else nn.Identity()
     gru = AgentGRU(encoder, widths[-1] if widths else n_features, n_hidden, env.device)
-    return TensorDictSequential([initialized(config, gru, 1.0), head(linear, keys.HIDDEN)])  # type: ignore[list-item]
+    return TensorDictSequential([gru, head(linear, keys.HIDDEN)])  # type: ignore[list-item]
 
 
 class SkipConnection(nn.Module):

@@ -1,9 +1,8 @@
-"""What changes with time: the period between two updates (paper, section 3.6), and annealed coefficients."""
+"""The system clock: the period between two updates (paper, section 3.6)."""
 
 import math
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from damian.common import checks
@@ -40,24 +39,3 @@ class SystemClock:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.period = int(state["period"])
-
-
-class LinearSchedule:
-    """A coefficient that goes linearly from one value to another in the ``frames`` of a run."""
-
-    def __init__(self, first: float, last: float, frames: int, device: torch.device | None = None) -> None:
-        self.first, self.last, self.frames, self.learnt = first, last, frames, 0
-        self.value = torch.tensor(first, device=device)
-        """The coefficient, []; always this tensor, so that a function that gets it stays compiled."""
-
-    def advance(self, n_steps: int) -> None:
-        """Count environment steps that have been learnt from, over all worlds."""
-        self.learnt += n_steps
-        self.value.fill_(self.first + (self.last - self.first) * min(self.learnt / self.frames, 1.0))
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"learnt": self.learnt}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.learnt = 0
-        self.advance(int(state["learnt"]))

@@ -25,7 +25,9 @@ class WindyFlight(PolynomialFlight):
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         super().__init__(config, airspace, dt)
-        options = checks.known_keys("motion.options", config.motion.options, ["wind", "bearing"])
+        options = config.motion.options or {}
+        for name in options:
+            checks.one_of("motion.options", name, ["wind", "bearing"])
         speed, bearing = options.get("wind", 3.0), math.radians(options.get("bearing", 270.0))
         checks.in_range("motion.options.wind", speed, 0.0, 0.9 * config.motion.max_speed, "m/s")
         # The wind blows from its bearing, clockwise from north.

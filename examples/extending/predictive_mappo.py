@@ -28,7 +28,7 @@ from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.config import MappoConfig, ModelConfig
 from damian.learners.mappo import LOSS_KEYS, Mappo
-from damian.learners.networks import POLICY_GAIN, hidden_layers, make_mlp, with_distribution
+from damian.learners.networks import hidden_layers, make_mlp, with_distribution
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
 
@@ -335,7 +335,7 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
         encoder = MessageEncoder(n_features, history.shape[-1], n_code, config, heads, width, device)
         head = BeliefHead(encoder, n_encoding, n_targets, n_actions, n_code, device)
         read = [keys.OBSERVATION, *head.out_keys]
-        policy = make_mlp(config, n_features + n_encoding, n_out, device, POLICY_GAIN)
+        policy = make_mlp(config, n_features + n_encoding, n_out, device)
         module = Preference(policy, n_targets, device) if discrete else NormalPolicy(policy)
         parts = [head, TensorDictModule(module, read, list(out_keys))]
         return TensorDictSequential(parts)  # type: ignore[arg-type]

@@ -28,7 +28,6 @@ from damian.common import checks
 from damian.common.fields import setting
 from damian.keys import next_key
 from damian.learners.networks import make_mlp, with_distribution
-from damian.learners.schedule import LinearSchedule
 
 VALUES, CHOSEN, JOINT = (keys.AGENTS, "action_value"), (keys.AGENTS, "chosen_action_value"), "joint"
 
@@ -83,6 +82,26 @@ class EpsilonGreedy(nn.Module):
         return ((1 - self.epsilon) * greedy + self.epsilon * legal / legal.sum(-1, keepdim=True)).log()
 
 
+class LinearSchedule:
+    """A number that goes linearly from one value to another in so many ``frames``."""
+
+    def __init__(self, first: float, last: float, frames: int) -> None:
+        self.first, self.last, self.frames, self.learnt = first, last, frames, 0
+        self.value = first
+
+    def advance(self, n_steps: int) -> None:
+        """Count environment steps that have been learnt from, over all worlds."""
+        self.learnt += n_steps
+        self.value = self.first + (self.last - self.first) * min(self.learnt / self.frames, 1.0)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"learnt": self.learnt}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.learnt = 0
+        self.advance(int(state["learnt"]))
+
+
 class Qmix:
     """Learns the value of the team by temporal differences of steps that are drawn from a replay buffer."""
 
@@ -90,7 +109,7 @@ class Qmix:
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = config.make_actor(env, setup.model)
         self.chooser, annealed = self.actor[0].module, max(int(config.annealed * setup.frames), 1)
-        self.epsilon = LinearSchedule(config.epsilon, config.epsilon_end, annealed, env.device)
+        self.epsilon = LinearSchedule(config.epsilon, config.epsilon_end, annealed)
         n_agents, n_columns = env.observation_spec[setup.critic_key].shape[-2:]
         mixer, read = VDNMixer(n_agents, env.device), [CHOSEN]
         if config.mixer == "qmix":
@@ -124,8 +143,8 @@ class Qmix:
             self.optimizer.step()
             self.targets.step()
         self.epsilon.advance(batch.numel())
-        self.chooser.epsilon.copy_(self.epsilon.value)
-        return {"loss": loss.item(), "epsilon": self.epsilon.value.item()}
+        self.chooser.epsilon.fill_(self.epsilon.value)
+        return {"loss": loss.item(), "epsilon": self.epsilon.value}
 
     def joint(self, steps: TensorDictBase) -> TensorDictBase:
         """Turn stored steps [K] into those of a team that chooses at once, as the loss reads them."""

@@ -17,7 +17,9 @@ from damian.world.regions.sources import RegionConfig
 
 def yard(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     """An L whose outer sides are ``side`` metres long, at the origin."""
-    options = checks.known_keys("region.options", config.options, ["side"])
+    options = config.options or {}
+    for name in options:
+        checks.one_of("region.options", name, ["side"])
     side = options.get("side", 300.0)
     checks.above("region.options.side", side, 0.0, "m")
     square = shapely.box(-side / 2, -side / 2, side / 2, side / 2)

@@ -22,7 +22,7 @@ from damian import feature, keys
 from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.learners.config import MappoConfig, ModelConfig
-from damian.learners.networks import POLICY_GAIN, hidden_layers, make_mlp, with_distribution
+from damian.learners.networks import hidden_layers, make_mlp, with_distribution
 from damian.server.features import FeatureCache, feature_of, of_others
 
 HEARD = "talking:heard"
@@ -92,7 +92,7 @@ class Attention(nn.Module):
         self.says = hidden_layers(model, shape[1], [width], None)
         self.key_and_value = nn.Linear(width, 2 * width)
         self.query = nn.Linear(n_own, width)
-        self.decides = make_mlp(model, n_own + width, n_out, None, POLICY_GAIN)
+        self.decides = make_mlp(model, n_own + width, n_out, None)
 
     def forward(self, observation: Tensor) -> Tensor:
         n_heard = self.shape[0] * self.shape[1]

@@ -26,11 +26,12 @@ The folder gets results.csv, a row for each arm, delay and seed, the means as ta
 """
 
 import csv
+import math
 import statistics
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from simple_spread import AGES, DELAYS, HELD, HORIZON, KINEMATICS, PAST, SEEN, late_spread, observed
@@ -39,8 +40,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ProbabilisticActor
 from tqdm import tqdm
 
 from damian import keys, set_seed
@@ -54,6 +56,7 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms.base import Correction
 from damian.transforms.entries import Entries
 
+Network = TypeVar("Network", bound=nn.Module)
 Delays = tuple[int, int]
 """The shortest and the longest delay of a message [steps]; all between are equally likely."""
 NONE: Delays = (0, 0)
@@ -96,9 +99,9 @@ PUBLISHED = {"undelayed": (-33.1, -37.6, -48.8, -59.9, -67.2), "random": (-82.4,
 """Published returns by arm, under the first of the delays that are evaluated."""
 
 WORLDS = 256  # an update learns from one episode of each
-MODEL = ModelConfig(hidden=[64, 64], init="orthogonal")
+MODEL = ModelConfig(hidden=[64, 64])
 LEARNER: dict[str, Any] = {"steps": HORIZON, "lr": 5e-3, "gamma": 0.9, "lmbda": 0.95, "minibatches": 8}
-LEARNER |= {"entropy_coeff": 0.003, "entropy_coeff_end": 0.0, "normalize_value": True}
+LEARNER |= {"entropy_coeff": 0.003, "normalize_value": True}  # the bonus falls to 0 in the training
 SLOTS = 13  # of a timeline: as old as the longest delay that is evaluated
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 ACTING = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
@@ -125,11 +128,32 @@ def with_timelines(entries: Entries, steps: TensorDictBase, count: Tensor) -> En
     return entries | {next_key(keys.GLOBAL_OBSERVATION): found}
 
 
-def make_learner(env: TransformedEnv, arm: Arm, frames: int, longest: int) -> Mappo:
+class OrthogonalMappo(MappoConfig):
+    """MAPPO whose networks begin with orthogonal matrices and biases of 0 (Saxe et al. 2014)."""
+
+    def make_actor(self, env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
+        return orthogonal(super().make_actor(env, model), 0.01)
+
+    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> Mappo:
+        learner = super().make(env, setup, buffer)
+        orthogonal(learner.critic, 1.0)
+        return learner
+
+
+def orthogonal(network: Network, gain: float) -> Network:
+    """Initialise the weights, with ``gain`` in the last layer."""
+    layers = [each for each in network.modules() if isinstance(each, nn.Linear)]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else math.sqrt(2))
+        nn.init.zeros_(layer.bias)
+    return network
+
+
+def make_learner(env: TransformedEnv, arm: Arm, longest: int) -> Mappo:
     """The learner that also trains UAVs: MAPPO, with back-updating if the arm says so."""
-    config = MappoConfig(**LEARNER)
+    config = OrthogonalMappo(**LEARNER)
     late = {"backupdate": arm.backupdate, "settle": arm.backupdate}
-    setup = LearningSetup(MODEL, WORLDS, HORIZON, HORIZON, longest, frames=frames, **late)
+    setup = LearningSetup(MODEL, WORLDS, HORIZON, HORIZON, longest, **late)
     size = config.buffer_size(setup)
     if size is None:
         return config.make(env, setup, None)
@@ -146,7 +170,7 @@ def train(arm: Arm, seed: int, frames: int, delay: Delays, bar: tqdm) -> nn.Modu
     longest = delay[1]
     env = make_env(arm, WORLDS, delay if arm.delayed else NONE, longest)
     set_seed(env, seed)
-    learner, done = make_learner(env, arm, frames, longest), 0
+    learner, done = make_learner(env, arm, longest), 0
     collector = Collector(
         env,
         learner.actor,
@@ -159,6 +183,8 @@ def train(arm: Arm, seed: int, frames: int, delay: Delays, bar: tqdm) -> nn.Modu
         bar.set_postfix({"return": f"{returns_in(batch):.1f}"})
         bar.update(min(batch.numel(), frames - done))
         done += batch.numel()
+        first = LEARNER["entropy_coeff"]
+        learner.config.entropy_coeff = first - first * min(done / frames, 1.0)
         if done >= frames:
             break
     collector.shutdown()

@@ -4,10 +4,8 @@ import csv
 import sys
 
 import pytest
-import torch
 from extensions import TINY
 from helpers import SQUARE, check_refused, everything
-from torchrl.envs.utils import check_env_specs
 
 from damian import make_env
 from damian.common.errors import InputError
@@ -46,42 +44,13 @@ def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
     [
         (["delay.obs={law: law:Satelite}"], "delay.obs.law: law:Satelite: the module law has no Satelite"),
         (["sensors=[{sensor: sensor:wind, strenght: 3}]"], "sensors[0].strenght: 3 is not a parameter of"),
-        ([*REGION[:2], "region.options={sid: 50}"], "region.options.sid: 50 is not one of its"),
+        ([*REGION[:2], "region.options={sid: 50}"], "region.options: sid is not one of side"),
     ],
 )
 def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
     before = {path.name for path in folder.iterdir()} | {"__pycache__"}
     check_refused(lambda: run(*TINY, *overrides), message, capsys)
     assert {path.name for path in folder.iterdir()} <= before
-
-
-def test_observations_and_rewards_are_float32_whatever_a_component_returns(folder):
-    (folder / "exact.py").write_text(EXACT)
-    scenario = everything(
-        observation=ObservationConfig(["exact:flag", "exact:precise"], []),
-        reward=RewardConfig(custom=[{"term": "exact:counted"}]),
-    )
-    env = make_env(scenario, 2)
-    check_env_specs(env)
-    found = env.rollout(3)["next", "agents"]
-    assert {found[name].dtype for name in ("observation", "reward")} == {torch.float32}
-
-
-EXACT = """
-from damian import feature, reward_term
-
-@feature("local")
-def flag(cache):
-    return cache.messages.spotted
-
-@feature("local")
-def precise(cache):
-    return cache.messages.battery.double() / 100
-
-@reward_term(reads=["spotted"])
-def counted(features, counters):
-    return features["spotted"].double()
-"""
 
 
 LIES = """

@@ -16,7 +16,6 @@ from damian.keys import next_key
 from damian.learners.networks import ModelConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
-from damian.replay.backupdate import BackupdateStorage
 from damian.runs.config import LoggerConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
@@ -118,50 +117,6 @@ def test_targets_use_nothing_that_has_not_arrived_by_now(example):
     assert before[1].equal(after[1])
     assert before[2].equal(after[2])
     assert not before[2].all()
-
-
-def ends_of_completed(storage: BackupdateStorage, act: int) -> dict[tuple[int, int, int], int]:
-    """The last step of each completed action, for the step of its choice, world and UAV, by loops."""
-    steps = storage.steps[storage.latest()]
-    ready, next_ready, reset = (steps[key] for key in (keys.READY, next_key(keys.READY), keys.RESET_AFTER))
-    found, n_steps = {}, len(steps)
-    for t, i, j in ready.nonzero().tolist():
-        end = t + act
-        if end >= n_steps or reset[t:end, i].any():
-            continue
-        while end < n_steps - 1 and not next_ready[end, i, j] and not reset[end, i]:
-            end += 1
-        if next_ready[end, i, j]:
-            found[t, i, j] = end
-    return found
-
-
-@pytest.mark.sample(3)
-@pytest.mark.parametrize(("flights", "act"), [(False, 2), (True, 0), (True, 2)])
-def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_it_has_arrived(
-    example, flights, act
-):
-    learner, env = build(example, flights=flights, act=act, prediction_batch=3000)
-    for _ in range(6):
-        learner.learn(collected(learner, env))
-    storage = learner.storage
-    steps, ends = storage.steps[storage.latest()], ends_of_completed(storage, act)
-    delay, seen = steps[next_key(keys.DELAY)], steps[next_key(keys.GLOBAL_OBSERVATION)]
-    n_steps = len(steps)
-    arrived = {key: end for key, end in ends.items() if 0 <= delay[end, *key[1:]] <= n_steps - 1 - end}
-    durations = {end - key[0] for key, end in ends.items()}
-    assert durations == {act} or (flights and max(durations) > act + 1)
-    last = learner.last_steps()
-    assert {key: int(last[key]) for key in ends} == ends
-    (observation, *_), target, counts = learner.sample(last)
-    assert abs(counts.float().mean().item() - len(arrived) / (n_steps * 4 * 3)) < 0.02
-    sampled = {tuple(row) for row in torch.cat([observation, target], -1)[counts.squeeze(-1)].tolist()}
-    expected = {
-        (*steps[keys.OBSERVATION][key].tolist(), *seen[end, *key[1:]].tolist())
-        for key, end in arrived.items()
-    }
-    assert sampled <= expected
-    assert len(sampled) > 0.9 * len(expected)
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])

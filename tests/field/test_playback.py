@@ -36,12 +36,12 @@ MOTIONS = {
 SCENARIOS = {name: replace(SCENARIO, motion=motion) for name, motion in MOTIONS.items()}
 
 
-def played(path, scenario: ScenarioConfig, *span) -> list[Episode]:
+def played(path, scenario: ScenarioConfig) -> list[Episode]:
     @cache
     def node_of(n: int) -> Node:
         return Node(for_uavs(scenario, n), 3, reward_terms=True)
 
-    return episodes_of(path, node_of, {}, *span)
+    return episodes_of(path, node_of, {})
 
 
 @pytest.fixture(scope="module", params=[pytest.param("instant", marks=pytest.mark.slow), "flights"])
@@ -115,24 +115,6 @@ def test_where_uavs_were_is_what_they_reported_in_hindsight(flown, told):
         for axis in range(2):
             straight = np.interp(steps, steps[came[:, uav]], recorded.true[came[:, uav], uav, axis])
             np.testing.assert_allclose(told.true[:, uav, axis], straight, atol=1.0)
-
-
-def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
-    first = int(np.flatnonzero(told.reward.any(-1))[0])
-    last = first + 10
-    span = told.time[first], told.time[last]
-    (part,) = played(flown[1], scenario, span)
-    assert part.n_steps == last - first
-    assert part.time[0] == 0
-    assert np.array_equal(part.true, told.true[first : last + 1])
-    assert np.array_equal(part.reward[1:], told.reward[first + 1 : last + 1])
-    assert not part.reward[0].any()
-    assert not any(rows[0].any() for rows in part.reward_terms.values())
-    assert not part.sent[0].any()
-    assert np.array_equal(part.sent[1:], told.sent[first + 1 : last + 1])
-    assert np.array_equal(part.delay[part.sent], told.delay[first : last + 1][part.sent])
-    with pytest.raises(InputError, match="span: no step lies between 100 and 200 s: the journal covers 0 to"):
-        played(flown[1], scenario, (100.0, 200.0))
 
 
 def test_a_journal_without_a_flight_is_refused(tmp_path):

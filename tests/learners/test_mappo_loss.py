@@ -98,9 +98,8 @@ def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
 
 def losses_of(learner: Mappo, batch: TensorDictBase, config: MappoConfig | None = None) -> Tensor:
     """The terms of our loss on all steps of a batch [B, T]."""
-    coeff = learner.entropy_coeff.value
     entries, config = loss_entries(learner, batch), config or learner.config
-    return mappo_losses(entries, learner.actor, learner.critic, config, coeff)[0]
+    return mappo_losses(entries, learner.actor, learner.critic, config)[0]
 
 
 def with_gradients(learner: Mappo, losses: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -135,15 +134,15 @@ def test_the_losses_and_their_gradients_are_torchrls(case):
 @pytest.mark.parametrize("case", ["discrete", "continuous", "normalised"])
 def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number_of_steps(case):
     _, learner, batch = flown(case)
-    losses, coeff = compiled(learner._losses, options=COMPILE_OPTIONS), learner.entropy_coeff.value
+    losses = compiled(learner._losses, options=COMPILE_OPTIONS)
     steps = {key: value.flatten(0, 1) for key, value in loss_entries(learner, batch).items()}
     for n in (24, 23, 48, 5):
         entries = {key: value[:n].clone() for key, value in steps.items()}
         torch.manual_seed(0)
-        found, numbers = losses(entries, coeff)
+        found, numbers = losses(entries)
         after = torch.rand(1)
         torch.manual_seed(0)
-        expected, expected_numbers = learner._losses(entries, coeff)
+        expected, expected_numbers = learner._losses(entries)
         assert torch.rand(1) == after  # as many draws of torch's generator
         gradients = [torch.autograd.grad(terms.sum(), learner.weights) for terms in (found, expected)]
         torch.testing.assert_close((found, numbers), (expected, expected_numbers), rtol=1e-4, atol=1e-6)
@@ -200,12 +199,3 @@ def test_rewards_of_any_scale_teach_the_same_if_values_are_normalised(case, adva
         spread = max((other - end).abs().max() for other in others) / moved
         assert moved > 1e-3
         assert spread < 1e-2 if normalize else spread > 5e-2
-
-
-def test_the_entropy_bonus_goes_linearly_to_its_end_over_the_frames_of_the_run():
-    env, _, batch = flown("discrete")
-    config = MappoConfig(epochs=1, minibatches=2, entropy_coeff=0.4, entropy_coeff_end=0.0)
-    learner = Mappo(env, config, learning(SMALL, frames=4 * batch.numel()))
-    numbers = [learner.learn(batch.clone()) for _ in range(6)]
-    weights = [-each["loss_entropy"] / each["entropy"] for each in numbers]
-    assert weights == pytest.approx([0.4, 0.3, 0.2, 0.1, 0.0, 0.0], abs=1e-6)

@@ -60,7 +60,7 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
         (["train", "resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
         (["compare", "experiment=usecases", "agents=3"], "agents: it is a setting of the runs"),
         (["compare", "-m", "experiment=usecases"], "-m: not with damian compare, which has many runs anyway"),
-        (["results"], "folders: it is not one folder, or two to compare"),
+        (["results"], "folder: it is missing: that of a run, a sweep or a comparison"),
     ],
     ids=lambda part: part[-1] if isinstance(part, list) else "",
 )
@@ -121,23 +121,6 @@ def mine(tmp_path, monkeypatch) -> Path:
 
 
 OWN = ["train", "--config-dir", "own", "scenario=mine"]
-
-
-@pytest.mark.parametrize("option", ["burst", "paper"])
-def test_a_law_of_a_scenario_is_not_mixed_with_that_of_a_delay(capsys, mine, option):
-    law = f"delay: {{obs: {UNIFORM}}}"
-    mine.write_text(f"# @package _global_\nepisode: {{max_steps: 9}}\n{law}\n")
-    mixed = "mixes laws of several files; write the one that you mean as a whole"
-    accepted = "model.hidden: 8 is not a list"
-    for more, message in (
-        ([], accepted),
-        ([f"delay={option}"], mixed),
-        ([f"delay={option}", "delay.obs=1..7"], accepted),
-        ([f"delay={option}", f"delay.obs={UNIFORM}"], accepted),
-    ):
-        with pytest.raises(SystemExit):
-            main([*OWN, "model.hidden=8", *more])
-        assert message in capsys.readouterr().err
 
 
 def test_a_range_is_uniform_over_whole_steps():

@@ -74,13 +74,6 @@ def test_an_option_replaces_what_its_group_sets_and_all_else_stays(fly):
     assert (config.episode.max_steps, config.region.lattice_step, config.seed) == (10, 60, 3)
 
 
-@pytest.mark.slow
-def test_a_policy_keeps_its_action_history_under_another_delay(fly):
-    first = fly(*TRAINED, "delay.history=2", of=None, folder="first", program="train")
-    config = OmegaConf.load(fly("delay=paper", of=first) / "config.yaml")
-    assert (config.delay.history, config.delay.obs.law) == (2, "uniform")
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

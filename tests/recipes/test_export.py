@@ -3,10 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
-import onnxruntime
 import pytest
 import torch
 from helpers import check_refused
@@ -69,95 +66,6 @@ def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path):
         assert described["actions"]["table"][9] == [50.0, -90.0]
 
 
-OWN = """
-from dataclasses import dataclass
-
-from tensordict.nn import TensorDictModule
-from torch import distributions, nn
-from torchrl.modules import ProbabilisticActor
-
-from damian import LearnerConfig, keys
-
-class Beta(distributions.Independent):
-    def __init__(self, loc, scale):
-        super().__init__(distributions.Beta(loc, scale), 1)
-
-class Drawn(Beta):
-    deterministic_sample = property(lambda self: self.rsample())
-
-class Split(nn.Linear):
-    def forward(self, x):
-        return tuple(1.5 + part.tanh() for part in super().forward(x).chunk(2, -1))
-
-@dataclass
-class StillConfig(LearnerConfig):
-    law: str = "Beta"
-
-    def make(self, env, setup, buffer):
-        return Still(self.make_actor(env, setup.model))
-
-    def make_actor(self, env, model):
-        width = env.observation_spec[keys.OBSERVATION].shape[-1]
-        names = [("agents", "loc"), ("agents", "scale")]
-        return ProbabilisticActor(
-            TensorDictModule(Split(width, 4), [keys.OBSERVATION], names),
-            in_keys={"loc": names[0], "scale": names[1]},
-            out_keys=[keys.ACTION],
-            distribution_class=globals()[self.law],
-            return_log_prob=True,
-            log_prob_key=keys.ACTION_LOG_PROB,
-        )
-
-class Still:
-    def __init__(self, actor):
-        self.actor = actor
-
-    def components(self):
-        return {"actor": self.actor}
-
-    def learn(self, batch):
-        return {}
-"""
-
-
-@pytest.fixture
-def trained(tmp_path, monkeypatch) -> Callable[[str], Path]:
-    """Train with a learner of a file in an empty folder, whose actor draws from a given distribution."""
-    (tmp_path / "own.py").write_text(OWN)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(sys.modules, "own", raising=False)
-
-    def train(law: str) -> Path:
-        words = [f"learner.law={law}", "actions=continuous", "hydra.run.dir=run"]
-        main(["train", *TRAINED, "learner=own:StillConfig", *words])
-        return tmp_path / "run"
-
-    return train
-
-
-def test_the_own_action_of_an_actor_from_outside_is_exported_exactly(trained):
-    run = trained("Beta")
-    main(["export", str(run), "trust=true"])
-    described = json.loads((run / "export" / "policy.json").read_text())
-    policy, env = damian.load(run, worlds=7, deterministic=True, trust=True)
-    steps = env.rollout(4, policy, break_when_any_done=False).flatten()
-    inputs = [steps["agents", name] for name in described["inputs"]]
-    outputs = torch.export.load(run / "export" / "policy.pt2").module()(*inputs)
-    assert outputs[0].equal(steps[keys.ACTION])
-    session = onnxruntime.InferenceSession(run / "export" / "policy.onnx")
-    given = {name: each.numpy() for name, each in zip(described["inputs"], inputs, strict=True)}
-    torch.testing.assert_close(torch.as_tensor(session.run(None, given)[0]), steps[keys.ACTION])
-    assert list(described["outputs"]) == ["action", "loc", "scale"]
-    assert described["actions"]["low"] == env.full_action_spec_unbatched[keys.ACTION].space.low[0].tolist()
-    assert described["distribution"] == {"class": "Beta"}
-
-
-def test_what_cannot_be_exported_is_refused_in_one_line(trained, capsys, tmp_path):
-    run, message = (
-        trained("Drawn"),
-        "Drawn needs a property deterministic_sample: without it the action is drawn",
-    )
-    check_refused(lambda: main(["export", str(run), "trust=true"]), message, capsys)
-    assert not (run / "export").exists()
+def test_what_cannot_be_exported_is_refused_in_one_line(capsys, tmp_path):
     check_refused(lambda: main(["export"]), "checkpoint: it is missing", capsys)
     check_refused(lambda: main(["export", str(tmp_path)]), "holds no config.yaml", capsys)

@@ -21,7 +21,7 @@ WHOLE = [
     "model.rnn=gru",
 ]
 TRIGGERED = ["learner.steps=4", "clock.trigger=2s", "clock.longest=10s", "source.level_db=106", "delay.obs=2"]
-TRIGGERED += ["learner.normalize_value=true", "learner.entropy_coeff_end=0"]
+TRIGGERED += ["learner.normalize_value=true"]
 SLOW_CLOCKS = ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"]
 FEW = ["learner.prediction_steps=2", "learner.prediction_batch=8", "learner.prediction_buffer=64"]
 CASES = {

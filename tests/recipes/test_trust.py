@@ -115,14 +115,6 @@ def test_no_stored_setting_is_imported_however_it_is_spelt(store, key, capsys):
     check_refuses(PROGRAMS["resume"], capsys, "this run uses code outside DAMIAN (evilmod:X)")
 
 
-def test_no_word_of_a_journal_is_run(store, capsys):
-    about = {"overrides": ["region=llanbedr", "learner=[evilmod:X]", "delay.obs={law: evilmod:X}"]}
-    head = {"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A"], "about": about}
-    Path("north.jsonl").write_text(json.dumps(head) + "\n", encoding="utf-8")
-    fly = ["fly", "journal=north.jsonl", "formats=[]", "hydra.run.dir=new"]
-    check_refuses(lambda: main(fly), capsys, "north.jsonl: the fleet never began")
-
-
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_no_program_imports_what_a_stored_run_names(store, name, capsys):
     store("learner.name", "evilmod:X")

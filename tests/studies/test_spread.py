@@ -95,7 +95,7 @@ def corrected(arm: str) -> list[TensorDictBase]:
     """What the learner of an arm learns from, [B, T] each, and [B, T, N, 4 + C + N] for its critic."""
     env = make_env(ARMS[arm], 4, LATE, 9)
     set_seed(env, 0)
-    learner = make_learner(env, ARMS[arm], 1, 9)
+    learner = make_learner(env, ARMS[arm], 9)
     with torch.no_grad():
         batches = env.rollout(3 * HORIZON, learner.actor, break_when_any_done=False).split(HORIZON, 1)
     return [learner.backupdated_batch(batch) for batch in batches][1:]

@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 import torch
 from delay_twin import Counting, drawn
-from environments import petting_zoo, vmas
+from environments import vmas
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs.utils import step_mdp
 
 from damian.common import counter_rng
 from damian.delays.laws import Burst, Law, Trace, Uniform, law_of, sampler_of
@@ -269,19 +268,3 @@ def test_an_agent_sends_what_its_policy_chooses(navigation):
 
     make = twin_of(Uniform(0, 3), own_at_reset=False)
     check_against_twin(env, make, wants, forced=some_worlds, sent=key)
-
-
-def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
-    env = TransformedEnv(petting_zoo(N), Channel(1, action_key=("agent", "message"), message_size=4))
-    assert isinstance(env.full_action_spec["agent", "message"], Bounded)
-    assert ("agent", "message") not in env.base_env.full_action_spec.keys(True)
-    check_env_specs(env)
-    got = []
-    step = env.base_env._step
-    env.base_env._step = lambda td: got.append(td) or step(td)
-    late = env.rollout(5)
-    assert all(("agent", "message") not in td.keys(True) for td in got)
-    sent, received = late["agent", "message"], late["next", "agent", "received"]
-    assert received[1:, 0, 2].equal(sent[:-1, 2])
-    assert received[:, 1, 1].equal(sent[:, 1])
-    assert not late["agent", "received_mask"][0].any()

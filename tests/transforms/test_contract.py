@@ -395,21 +395,6 @@ IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
 }
 
 
-@pytest.mark.parametrize("kind", GROUPS.values(), ids=GROUPS)
-def test_a_channel_without_delay_shows_current_messages_and_changes_nothing_else(kind):
-    undelayed, delayed = (
-        onward(env, begun(env, 0), 8)
-        for env in (kind.make(), TransformedEnv(kind.make(), Channel(0, kind.observation)))
-    )
-    group = kind.observation[0]
-    for td, other in zip(delayed, undelayed, strict=True):
-        assert same(td.select(*other.keys(True, True)), other)
-        sent = other[kind.observation]
-        assert td[group, "received"].equal(sent.unsqueeze(-3).expand_as(td[group, "received"]))
-        assert not td[group, "received_age"].any()
-        assert td[group, "received_mask"].all()
-
-
 @pytest.mark.sample(5)
 @every_kind
 @pytest.mark.parametrize("identity", IDENTITIES.values(), ids=IDENTITIES)

@@ -22,10 +22,8 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from damian.common.errors import InputError
 from damian.delays.laws import Uniform
 from damian.transforms import (
-    ActionDelay,
     ActionHistory,
     CumulativeReward,
     ObservationDelay,
@@ -80,20 +78,3 @@ def test_stored_steps_are_delayed_as_in_the_environment(kind, chain):
     assert same(found, online)
     assert found.batch_size == online.batch_size
     assert found.names == online.names
-
-
-# Where episodes begin.
-
-
-def test_the_number_of_the_trajectory_tells_where_an_episode_begins():
-    data = collect(Counting(WORLDS, ends=0.0), 8)
-    again = torch.arange(8).expand(len(WORLDS), 8) == torch.tensor([2, 3, 4, 9]).unsqueeze(-1)
-    data = data.set(("collector", "traj_ids"), again.long().cumsum(-1))
-    ages = delay_trajectories(data, ObservationDelay(2, [OBSERVATION]))["agents", "age"]
-    assert ages[0, :, 0, 0].tolist() == [0, 1, 0, 1, 2, 2, 2, 2]
-    assert ages[3, :, 0, 0].tolist() == [0, 1, *[2] * 6]
-
-
-def test_stored_steps_refuse_what_would_have_changed_what_happened():
-    with pytest.raises(InputError, match="transform: ActionDelay changes which actions"):
-        delay_trajectories(Counting([3, 5]).rollout(8, break_when_any_done=False), ActionDelay(3, ACTION))
