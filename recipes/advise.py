@@ -4,8 +4,6 @@ damian advise checkpoint=runs/first table=reports.csv     (one table, one answer
 damian advise fit=journals/north.jsonl                    (only the delays, as a trace to train with)
 """
 
-__package__ = "damian.recipes"  # also of a script: python recipes/advise.py
-
 import time
 from pathlib import Path
 
@@ -96,7 +94,3 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
 @hydra.main(config_path="../conf", config_name="advise", version_base=None)
 def main(given: DictConfig) -> None:
     start(advise, given, "advise")
-
-
-if __name__ == "__main__":
-    main()

@@ -7,8 +7,6 @@ damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results
 The same command continues a comparison; keep=true also without the folders of finished runs.
 """
 
-__package__ = "damian.recipes"  # also of a script: python recipes/compare.py
-
 import math
 import sys
 from collections.abc import Sequence
@@ -153,7 +151,3 @@ def main(given: DictConfig) -> None:
     config = cli.checked(given, running.overrides.task, "compare")
     with nullcontext() if config.report_only else locked(folder):  # it may be reported on while it runs
         compare(config, folder)
-
-
-if __name__ == "__main__":
-    main()

@@ -6,8 +6,6 @@ damian evaluate -m checkpoint=runs/first,runs/second delay.obs=0,2,4,8
 Words change settings of the run; what is not mentioned stays.
 """
 
-__package__ = "damian.recipes"  # also of a script: python recipes/evaluate.py
-
 from pathlib import Path
 from typing import NamedTuple
 
@@ -143,7 +141,3 @@ def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
 @hydra.main(config_path="../conf", config_name="evaluate", version_base=None)
 def main(given: DictConfig) -> None:
     start(fly, given, "evaluate")
-
-
-if __name__ == "__main__":
-    main()

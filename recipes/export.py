@@ -2,11 +2,9 @@
 
 damian export runs/FOLDER    # fills runs/FOLDER/export
 
-``policy.pt2`` is a program of ``torch.export``, ``policy.onnx`` the same for ONNX runtimes, and
-``policy.safetensors`` its weights; ``policy.json`` says what goes in and what comes out (docs/runs.md).
+``policy.pt2`` is a program of ``torch.export``, ``policy.onnx`` the same for ONNX runtimes; ``policy.json``
+says what goes in and what comes out (docs/runs.md).
 """
-
-__package__ = "damian.recipes"  # also of a script: python recipes/export.py
 
 import json
 import math
@@ -45,7 +43,7 @@ UNFILTERED = (
 def export(run: Path, trust: bool = False) -> Path:
     """Export the policy of a run folder into its subfolder ``export``; returns that folder."""
     try:
-        safetensors, _ = import_module("safetensors.torch"), import_module("onnxscript")
+        import_module("onnxscript")
     except ImportError as error:
         raise InputError(f"export needs {error.name}: pip install 'damian[export]'") from None
     actor, env = load(run, worlds=2, deterministic=True, trust=trust)
@@ -56,8 +54,6 @@ def export(run: Path, trust: bool = False) -> Path:
     with writing(target):
         target.mkdir(exist_ok=True)
         torch.export.save(program, target / "policy.pt2")
-        weights = {name: weight.contiguous() for name, weight in policy.state_dict().items()}
-        safetensors.save_file(weights, target / "policy.safetensors")
         onnx.save(target / "policy.onnx", external_data=False)
     text = json.dumps(described, indent=2, default=lambda x: x.tolist() if isinstance(x, Tensor) else str(x))
     write_atomically(target / "policy.json", text + "\n")
@@ -144,7 +140,3 @@ def main(given: DictConfig) -> None:
     if not (folder / RESULTS).exists() and not folder.is_file():
         print(f"{folder}: the training has not finished; its latest checkpoint is exported")
     print(f"results: {target}")
-
-
-if __name__ == "__main__":
-    main()

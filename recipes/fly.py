@@ -5,8 +5,6 @@ damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"   (
 damian fly journal=north.jsonl "formats=[html]"    (the flight of real UAVs)
 """
 
-__package__ = "damian.recipes"  # also of a script: python recipes/fly.py
-
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -117,7 +115,3 @@ def summary(name: str, episode: Episode) -> str:
 @hydra.main(config_path="../conf", config_name="fly", version_base=None)
 def main(given: DictConfig) -> None:
     start(show, given, "fly")
-
-
-if __name__ == "__main__":
-    main()

@@ -4,8 +4,6 @@ damian results runs/FOLDER
 damian.results("runs/FOLDER")   # in Python
 """
 
-__package__ = "damian.recipes"  # also of a script: python recipes/results.py
-
 from pathlib import Path
 
 import hydra
@@ -52,7 +50,3 @@ def table(folder: Path) -> str:
 def main(given: DictConfig) -> None:
     config = cli.checked(given, [], "results")
     print(table(Path(config.folder)))
-
-
-if __name__ == "__main__":
-    main()

@@ -69,19 +69,6 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
     save(path, [*known["task"].unique()], panel, (3.0, 3.0), width=4, sharey=True)
 
 
-def plot_means(table: pd.DataFrame, name: str, path: Path) -> None:
-    """Draw a column of a table of means by groups of runs, for each policy."""
-    groups, policies = table["group"].unique().tolist(), table["policy"].unique().tolist()
-    styles = {policy: style_of(n) | {"linestyle": ""} for n, policy in enumerate(policies)}
-
-    def panel(axis: Axes, _: None) -> None:
-        draw_groups(axis, table, ("group", "policy", name), groups, styles, spread=0.5)
-        axis.tick_params(axis="x", rotation=90)
-        axis.set_ylabel(name)
-
-    save(path, [None], panel, (0.4 * len(groups) + 1.4, 5.2))
-
-
 def draw_groups(
     axis: Axes,
     lines: pd.DataFrame,

@@ -369,9 +369,14 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     ``delay[receiver][sender]`` is the law of a link; the diagonal is not used.
     """
     loss_key = f"{key.removesuffix('delay')}loss"
-    n = same_size({key: delay, loss_key: loss})
-    if n is None or isinstance(delay, Sampler):
+    matrices = {name: each for name, each in {key: delay, loss_key: loss}.items() if is_matrix(each)}
+    if not matrices or isinstance(delay, Sampler):
         return sampler_of(delay, dt, loss, key)
+    n = len(next(iter(matrices.values())))
+    for name, matrix in matrices.items():
+        good = [len(row) if is_matrix(row) else 0 for row in matrix] == [n] * n
+        should = f"is not N x N, {n} x {n}: a list for each receiver, with an entry for each sender"
+        checks.require(good, name, matrix, should)
     distinct: list[Any] = []
     samplers: list[Sampler] = []
     index = []
@@ -387,18 +392,3 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     for probability in losses.flatten().tolist():
         checks.in_range(loss_key, probability, 0.0, 1.0)
     return LinkSampler(samplers, torch.tensor(index), losses.flatten().clone())
-
-
-def same_size(settings: Mapping[str, Any]) -> int | None:
-    """The number N of agents of those settings that are N x N, by name; None if none is."""
-    sizes = {}
-    for key, matrix in settings.items():
-        if is_matrix(matrix):
-            lengths = {len(row) if is_matrix(row) else 0 for row in matrix}
-            should = "is not N x N: a list for each receiver, with an entry for each sender"
-            checks.require(lengths == {len(matrix)}, key, matrix, should)
-            sizes[key] = len(matrix)
-    if len(set(sizes.values())) > 1:
-        found = ", ".join(f"{key} {n} x {n}" for key, n in sizes.items())
-        raise InputError(f"{found}: these are of different numbers of agents")
-    return next(iter(sizes.values()), None)

@@ -108,10 +108,6 @@ class TableSampler(Sampler):
     """Probabilities of the delays 0, 1, ... and, last, of a loss, [S, longest + 2]."""
     _boundaries: Tensor
 
-    def __init_subclass__(cls) -> None:
-        if "forward" in cls.__dict__:
-            raise TypeError(f"{cls.__name__}: a sampler that draws by a rule of its own derives from Sampler")
-
     def __init__(
         self, states: list[list[float]], transitions: list[list[float]] | None = None, loss: float = 0.0
     ) -> None:

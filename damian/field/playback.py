@@ -24,7 +24,7 @@ from damian.field.journal import Line, read_journal
 from damian.field.node import Node
 from damian.field.rows import Place, Report, Rows, written
 from damian.field.tracker import Tracker
-from damian.show.episode import Episode, Floats, at_instant, episode_of
+from damian.show.episode import Episode, at_instant, episode_of
 from damian.world.state import Truth
 
 
@@ -114,20 +114,13 @@ def _hindsight(
     goals = table[goal].fillna(stands[~table.flies]).bfill().fillna(stands)
     following = np.clip(table.index.searchsorted(steps), None, len(table) - 1)
     newest = np.clip(table.index.searchsorted(steps, side="right") - 1, 0, None)
-    track = _course(position) if table.track.isna().any() else table.track.to_numpy()[newest]
     return {
         "position": position,
         "target": goals.to_numpy()[following],
         "battery": table.battery.astype(float).ffill().fillna(100.0).to_numpy()[newest],
         "spotted": table.spotted.to_numpy()[newest],
-        "track": track % (2 * np.pi),
+        "track": table.track.astype(float).ffill().fillna(0.0).to_numpy()[newest] % (2 * np.pi),
     }
-
-
-def _course(position: Floats) -> Floats:
-    """Headings by which a UAV has come to its positions [S, 3], clockwise from north [rad], [S]."""
-    way = np.diff(position[:, :2], axis=0, prepend=position[:1, :2])
-    return pd.Series(np.arctan2(*way.T)).where(np.asarray(way.any(1))).ffill().fillna(0.0).to_numpy()
 
 
 def _messages(

@@ -22,7 +22,7 @@ from damian.replay.time_storage import TimeStorage
 
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 """Terms of the loss, by their names in TorchRL's losses."""
-NUMBERS = (*LOSSES, "alpha", "entropy", "gradient_norm_actor", "gradient_norm_critic")
+NUMBERS = (*LOSSES, "alpha", "entropy")
 """Numbers that a round of updates logs; ``alpha`` is the temperature, ``entropy`` in nats."""
 N_CRITICS = 2
 """Number of critics, of which the lower value counts."""
@@ -44,12 +44,7 @@ class Sac:
         self.loss.register_load_state_dict_post_hook(
             lambda loss, _: loss.make_value_estimator(gamma=config.gamma)
         )
-        parameters = dict(self.loss.named_parameters())
-        networks = [weights for name, weights in parameters.items() if name != "log_alpha"]
-        self.actor_weights, self.critic_weights = (
-            [weights for name, weights in parameters.items() if name.startswith(network)]
-            for network in ("actor_network", "qvalue_network")
-        )
+        networks = [weights for name, weights in self.loss.named_parameters() if name != "log_alpha"]
         temperature = {"params": [self.loss.log_alpha], "lr": config.alpha_lr}
         self.optimizer = torch.optim.Adam([{"params": networks}, temperature], lr=config.lr, fused=True)
         self.targets = SoftUpdate(self.loss, tau=config.tau)
@@ -89,9 +84,6 @@ class Sac:
         losses = self.loss(batch)
         self.optimizer.zero_grad()
         torch.stack([losses[name] for name in LOSSES]).sum().backward()
-        for name, weights in (("actor", self.actor_weights), ("critic", self.critic_weights)):
-            gradients = [cast(Tensor, each.grad) for each in weights]
-            losses[f"gradient_norm_{name}"] = torch.nn.utils.get_total_norm(gradients)
         self.optimizer.step()
         self.targets.step()
         return losses.detach()

@@ -40,7 +40,7 @@ LOGGERS = Registry[Callable[..., Logger]](
 
 
 def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Logger]:
-    """Make the loggers of settings that ``check_loggers`` has checked.
+    """Make the loggers of settings.
 
     Args:
         config: the settings.
@@ -48,7 +48,7 @@ def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Lo
         frames: environment steps that a resumed run has made; TensorBoard drops what it logged of later ones.
     """
     loggers: list[Logger] = [TensorBoard(folder, frames)] if config.tensorboard else []
-    for path, make, parameters in map(_read, config.custom):
+    for path, make, parameters in map(read_logger, config.custom):
         with naming_errors(f"logger.custom: {path}"):
             logger = make(folder, **parameters)
             should = "is not a logger: it has no method log_scalar(name, value, step)"
@@ -73,13 +73,8 @@ class TensorBoard:
         self._events.close()
 
 
-def check_loggers(written: Sequence[Any]) -> None:
-    """Check loggers, each ``package.module:Name`` or ``{logger: package.module:Name, ...}``."""
-    for each in written:
-        _read(each)
-
-
-def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
+def read_logger(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
+    """Path, class and parameters of ``package.module:Name`` or ``{logger: package.module:Name, ...}``."""
     key, entry = "logger.custom", written if isinstance(written, Mapping) else {"logger": written}
     path, make, parameters = LOGGERS.read(entry, key, "logger")
     check_parameters(make, parameters, path, key)

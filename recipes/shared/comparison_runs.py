@@ -184,7 +184,7 @@ def perform_run(run: Run, work: Work) -> None:
 
 ROWS, POINTS = "results.csv", "curves.csv"
 MARKDOWN, FIGURE = "table.md", "figure.png"
-"""What follows from the rows, also of a sweep."""
+"""What follows from the rows; a sweep has the table, too."""
 MOST_POINTS = 50
 """Largest number of points of a stored learning curve, evenly spaced over its updates."""
 CURVE = [*RUN, "frames", "episodes", *LABELS]

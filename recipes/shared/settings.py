@@ -4,7 +4,7 @@ from damian import keys
 from damian.common import checks
 from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
-from damian.runs.metrics_log import check_loggers
+from damian.runs.metrics_log import read_logger
 from damian.server.features import check_features
 from damian.server.rewards import terms_of
 from damian.world.regions.sources import REGION_SOURCES
@@ -58,7 +58,8 @@ def check_components(config: TrainConfig) -> None:
     check_features(config.observation)
     terms_of(config.reward)
     sensors_of(config.sensors)
-    check_loggers(config.logger.custom)
+    for written in config.logger.custom:
+        read_logger(written)
 
 
 def check_learning(config: TrainConfig) -> None:

@@ -15,7 +15,6 @@ from damian.delays.samplers import (
     MessageContext,
     Recorded,
     Sampler,
-    TableSampler,
 )
 
 SENDERS = 20_000
@@ -52,11 +51,9 @@ def test_links_keep_the_states_of_all_samplers_floats_or_not():
         assert found[:, link].equal(drawn(sampler, streams, 9)[:, link])
 
 
-def test_a_sampler_must_draw_and_a_table_cannot_be_drawn_from_otherwise():
+def test_a_sampler_must_draw():
     with pytest.raises(TypeError, match="abstract"):
         Sampler(3)  # type: ignore[abstract]
-    with pytest.raises(TypeError, match="Faked: a sampler that draws by a rule"):
-        type("Faked", (TableSampler,), {"forward": Doubling.forward})
 
 
 # Contexts.

@@ -43,7 +43,7 @@ def test_an_entry_that_there_is_already_is_not_replaced(transforms):
 
 MISTAKES = {
     "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
-    "delay 2 x 2, loss 3 x 3: these are of": lambda: Channel([[0, 1], [1, 0]], loss=[[0.5] * 3] * 3),
+    "loss: .* is not N x N, 2 x 2: a list": lambda: Channel([[0, 1], [1, 0]], loss=[[0.5] * 3] * 3),
     "comm_range: 5 needs a position_key": lambda: Channel(1, comm_range=5),
 }
 
