@@ -27,8 +27,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from damian.common import checks
 from damian.common.errors import RUN_ERROR, InputError, RunError
-from damian.common.fields import filled, set_at
+from damian.common.fields import filled, set_at, value_at
 from damian.common.text_files import one_line
 from damian.learners.config import LEARNERS
 from damian.runs.processes import end_interrupted
@@ -110,6 +111,7 @@ def plain(given: DictConfig, words: Sequence[str], program: str = "train") -> di
     """
     own = OmegaConf.masked_copy(given, [str(key) for key in given if key != "hydra"])
     values: Any = OmegaConf.to_container(own, resolve=True)
+    _check_whole(values, words, (given.get("hydra") or HydraConfig.get()).runtime.choices)
     known, replaced = known_settings(program), set[str]()
     for word in OverridesParser.create().parse_overrides([*words]):
         key, value = word.key_or_group, word.value()
@@ -124,18 +126,35 @@ def plain(given: DictConfig, words: Sequence[str], program: str = "train") -> di
     return values
 
 
-def options_in(group: str) -> Iterator[tuple[dict[str, Any], list[str]]]:
+def options_in(group: str, option: str = "*") -> Iterator[tuple[dict[str, Any], list[str]]]:
     """What the files of a group's options set, as nested settings, and what their defaults lists name.
 
     They lie in ``conf`` and in the folder of ``--config-dir``.
     """
     sources = HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ()
     for folder in (CONF, *(Path(source.path) for source in sources if source.schema == "file")):
-        for file in sorted((folder / group).rglob("*.yaml")):
+        for file in sorted((folder / group).rglob(f"{option}.yaml")):
             text = file.read_text(encoding="utf-8")
             written = yaml.safe_load(text) or {}
             chosen = [name for each in written.pop("defaults", ()) if isinstance(each, dict) for name in each]
             yield written if "@package _global_" in text else {group: written}, chosen
+
+
+def _check_whole(values: Mapping[str, Any], words: Sequence[str], choices: Mapping[str, Any]) -> None:
+    """Refuse a law that Hydra has merged from two files, such as that of a scenario over ``delay=burst``."""
+    for key in (key for key in LAWS if not any(f"{key_of(word)}.".startswith(f"{key}.") for word in words)):
+        law = value_at(values, key)
+        options = choices.items() if isinstance(law, Mapping) else ()
+        files = [
+            value_at(found, key) for each in options for found, _ in options_in(*each) if "/" not in each[0]
+        ]
+        written = [found for found in files if isinstance(found, Mapping) and "law" in found]
+        problem = f"mixes laws of several files; write the one that you mean as a whole: {key}={{law: ...}}"
+        checks.require(not written or law in written, key, law, problem)
+
+
+LAWS = ("delay.obs", "delay.act", "delay.rew", "links.delay")
+"""Settings that are laws."""
 
 
 def reason(error: BaseException, program: str = "train") -> str:

@@ -123,6 +123,23 @@ def mine(tmp_path, monkeypatch) -> Path:
 OWN = ["train", "--config-dir", "own", "scenario=mine"]
 
 
+@pytest.mark.parametrize("option", ["burst", "paper"])
+def test_a_law_of_a_scenario_is_not_mixed_with_that_of_a_delay(capsys, mine, option):
+    law = f"delay: {{obs: {UNIFORM}}}"
+    mine.write_text(f"# @package _global_\nepisode: {{max_steps: 9}}\n{law}\n")
+    mixed = "mixes laws of several files; write the one that you mean as a whole"
+    accepted = "model.hidden: 8 is not a list"
+    for more, message in (
+        ([], accepted),
+        ([f"delay={option}"], mixed),
+        ([f"delay={option}", "delay.obs=1..7"], accepted),
+        ([f"delay={option}", f"delay.obs={UNIFORM}"], accepted),
+    ):
+        with pytest.raises(SystemExit):
+            main([*OWN, "model.hidden=8", *more])
+        assert message in capsys.readouterr().err
+
+
 def test_a_range_is_uniform_over_whole_steps():
     by_steps, by_time = (sampler_of(law, dt=1.0).chances[0].tolist() for law in ("1..3", "2s..4s"))
     assert by_steps == pytest.approx([0, 1 / 3, 1 / 3, 1 / 3, 0])
