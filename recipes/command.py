@@ -14,7 +14,7 @@ from damian.common.text_files import one_line
 
 from .known import PROGRAMS, check_words, help_text
 
-FOLDERS = {"export": "checkpoint={}", "results": "folder={}"}
+FOLDERS = {"export": "checkpoint={}", "results": "folders=[{}]"}
 """The setting that plain words mean, of programs whose main setting is a folder."""
 MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, rules, setting
-from damian.compare.config import STORED
+from damian.compare.config import SCORES, STORED
 from damian.envs.config import ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.runs.config import LoggerConfig
@@ -185,8 +185,11 @@ class ExportConfig(Settings):
 class ResultsConfig(Settings):
     """All settings of ``damian results``."""
 
-    folder: str | None = setting(None, "Folder of a run, a sweep or a comparison.")
+    folders: list[str] = setting([], "Folder of a run, a sweep or a comparison; or two folders to compare.")
+    score: str = setting(
+        "return", "The measure whose differences the table of two folders has.", choices=SCORES
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.refuse(self.folder is None, "folder", "is missing: that of a run, a sweep or a comparison")
+        self.refuse(len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare")

@@ -1,6 +1,7 @@
 """One table of the results in a folder: of a run, of a sweep, or of a comparison (docs/runs.md).
 
 damian results runs/FOLDER
+damian results runs/A runs/B    # and the differences of B to A, paired by seed
 damian.results("runs/FOLDER")   # in Python
 """
 
@@ -15,7 +16,7 @@ from damian.runs.run_folder import RESULTS
 
 from . import cli
 from .shared.comparison_runs import MARKDOWN, POINTS, stored_results
-from .shared.sweeps import report, sweep_rows
+from .shared.sweeps import compared, report, sweep_rows
 
 
 def results(folder: str | Path) -> pd.DataFrame:
@@ -32,9 +33,11 @@ def results(folder: str | Path) -> pd.DataFrame:
     return stored_results(folder).rows if (folder / POINTS).is_file() else sweep_rows(folder)[1]
 
 
-def table(folder: Path) -> str:
-    """The table of a folder."""
-    is_comparison = (folder / POINTS).is_file()
+def table(folders: list[Path], score: str) -> str:
+    """The table of a folder, or of two folders."""
+    folder, is_comparison = folders[0], (folders[0] / POINTS).is_file()
+    if len(folders) == 2:
+        return compared(folders, score)
     if is_comparison and (folder / MARKDOWN).exists():
         return (folder / MARKDOWN).read_text(encoding="utf-8")
     if is_comparison or (folder / RESULTS).exists():
@@ -49,4 +52,4 @@ def table(folder: Path) -> str:
 @cli.one_line_errors("results")
 def main(given: DictConfig) -> None:
     config = cli.checked(given, [], "results")
-    print(table(Path(config.folder)))
+    print(table([*map(Path, config.folders)], config.score))

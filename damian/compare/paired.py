@@ -6,6 +6,7 @@ import pandas as pd
 
 from damian.common.tables import markdown_table
 from damian.compare.comparison import improvement, means_over_seeds, shown
+from damian.compare.config import LESS_IS_BETTER
 from damian.compare.statistics import FEWEST
 
 MEASURES = ["return", "success_rate", "steps", "perceived_return", "age"]
@@ -15,43 +16,46 @@ NOTE = (
     "server knew"
 )
 DIFFERENCE = (
-    "; difference: of the return to that of {first}, paired by seed; P > first: probability that a run of "
+    "; difference: of the {score} to that of {first}, paired by seed; P > first: probability that a run of "
     "the line beats one of the first"
 )
 
 
-def means(rows: pd.DataFrame, groups: Sequence[str]) -> pd.DataFrame:
+def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> pd.DataFrame:
     """A line for each policy of each group: means over seeds, and differences to the first value."""
     succeeds, lines = (rows["success_rate"] > 0).any(), []
     measures = [name for name in MEASURES if succeeds or name not in ("success_rate", "steps")]
+    measures = list(dict.fromkeys([*measures, score]))
     for names, runs in rows.groupby([*groups, "policy"], sort=False):
         labels = dict(zip([*groups, "policy"], names, strict=True))
         group = ", ".join(f"{key}={labels[key]}" for key in groups) or "all runs"
         line = {**labels, "group": group, "n": len(runs), **means_over_seeds(runs[measures])}
         if groups and labels[groups[0]] != (first := rows[groups[0]].iloc[0]):
             beside = {**labels, groups[0]: first}
-            line |= difference(runs, rows[(rows[[*beside]] == pd.Series(beside)).all(axis=1)])
+            line |= difference(runs, rows[(rows[[*beside]] == pd.Series(beside)).all(axis=1)], score)
         lines.append(line)
     return pd.DataFrame(lines)
 
 
-def difference(runs: pd.DataFrame, others: pd.DataFrame) -> dict[str, float]:
-    """The mean difference of the return by seed, and the probability of improvement, with their intervals."""
-    pairs = runs[["seed", "return"]].merge(others[["seed", "return"]], on="seed")
+def difference(runs: pd.DataFrame, others: pd.DataFrame, score: str) -> dict[str, float]:
+    """The mean difference of a score by seed, and the probability of improvement, with their intervals."""
+    pairs = runs[["seed", score]].merge(others[["seed", score]], on="seed")
     if pairs.empty:
         return {}
-    new, old = pairs["return_x"], pairs["return_y"]
+    new, old = pairs[f"{score}_x"], pairs[f"{score}_y"]
+    sign = -1 if score in LESS_IS_BETTER else 1
     found = means_over_seeds(pd.DataFrame({"difference": new - old}))
-    return found | improvement(new.to_numpy(), old.to_numpy())
+    return found | improvement(sign * new.to_numpy(), sign * old.to_numpy())
 
 
-def as_table(lines: pd.DataFrame, groups: Sequence[str]) -> str:
+def as_table(lines: pd.DataFrame, groups: Sequence[str], score: str = "return") -> str:
     """Lines of means as a Markdown table, with a note on its columns."""
     head = [*groups, "policy", "n"]
-    columns, note = {name: name for name in MEASURES if name in lines}, NOTE
+    measures = [name for name in dict.fromkeys([*MEASURES, score]) if name in lines]
+    columns, note = {name: name for name in measures}, NOTE
     if "difference" in lines:
         columns |= {"difference": "difference", "improvement": "P > first"}
-        note += DIFFERENCE.format(first=f"{groups[0]}={lines[groups[0]].iloc[0]}")
+        note += DIFFERENCE.format(score=score, first=f"{groups[0]}={lines[groups[0]].iloc[0]}")
     cells = [
         [*(line[name] for name in head), *(shown(line, name) for name in columns)]
         for line in lines.to_dict("records")

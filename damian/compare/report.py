@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 
 from damian.common.tables import markdown_table
 from damian.compare.comparison import (
@@ -15,6 +17,7 @@ from damian.compare.comparison import (
     Comparison,
     shown,
 )
+from damian.compare.figures import curve
 
 
 def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
@@ -30,6 +33,8 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
         for delay in comparison.delays(task) or [NOT_LATE]:
             lines = table[(table["task"] == task) & table["delay"].isin([NOT_LATE, delay])]
             parts += [f"## {task}, delay {delay}", trained, _table(lines)]
+            if delay != NOT_LATE:
+                parts += _steps(comparison, task, delay)
     return "\n\n".join(parts) + "\n"
 
 
@@ -43,3 +48,25 @@ def _table(lines: pd.DataFrame) -> str:
     measured = [name.replace("_", " ") for name in MEASURED]
     head = ["method", "regime", "policy", "n", *measured, "n compared", *COMPARED[:-1], "P > naive"]
     return markdown_table(head, rows, left=3)
+
+
+def _steps(comparison: Comparison, task: str, delay: str) -> list[str]:
+    """Table of the environment steps in which arms reach the final training return of the best naive arm."""
+    found = {}
+    for arm, of_arm in comparison.arms.items():
+        runs = comparison.curves.get((task, delay if of_arm.delayed else NOT_LATE, arm))
+        if runs is not None:
+            steps, values = curve(runs, "hindsight_return")
+            tenth = len(steps) // 10
+            found[arm] = steps[tenth - 1 :], sliding_window_view(values, tenth, axis=0).mean(-1)
+    ends = {arm: found[arm][1][-1].mean() for arm in found if comparison.arms[arm].naive}
+    if not ends:
+        return []
+    best, level = max(ends.items(), key=lambda end: end[1])
+    rows = []
+    for arm, (steps, values) in found.items():
+        reached = [min(steps[run >= level], default=np.inf) for run in (values.mean(-1), *values.T)]
+        numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
+        rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
+    title = f"Steps to the final training return (in hindsight, mean over a tenth) of *{best}*, {level:.1f}:"
+    return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]

@@ -1,7 +1,8 @@
-"""The table of a sweep: means over seeds, and paired differences to the first value."""
+"""The tables of a sweep and of two folders: means over seeds, and paired differences to the first value."""
 
 import json
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
     if not runs:
         raise InputError(f"{folder}: there is no {RESULTS} in it, so no run has finished there")
     for run in runs:
-        check_no_links(run, "folder")
+        check_no_links(run, "folders")
     records = {run: read_record(run) for run in runs}
     runs.sort(key=lambda run: records[run].get(JOB, 0))  # as the command line names them
     words = [[word.partition("=") for word in records[run].get(OVERRIDES, [])] for run in runs]
@@ -64,7 +65,7 @@ def report(folder: Path) -> str:
     """Write rows and table of a sweep into its folder; returns the table."""
     failed = [file.parent for file in sorted(folder.rglob(FAILED))]
     for each in (folder, *failed):
-        check_no_links(each, "folder")
+        check_no_links(each, "folders")
     errors = [[str(run.relative_to(folder)), json.loads(read_text(run / FAILED))["error"]] for run in failed]
     parts, rows = [], pd.DataFrame(errors, columns=["folder", "error"])
     if any(folder.rglob(RESULTS)) or not failed:
@@ -77,3 +78,11 @@ def report(folder: Path) -> str:
     write_csv(folder / ROWS, rows)
     write_atomically(folder / MARKDOWN, "\n\n".join(parts) + "\n")
     return "\n\n".join(parts)
+
+
+def compared(folders: Sequence[Path], score: str) -> str:
+    """The table of two folders, of runs or sweeps, with the difference of the second to the first."""
+    found = [sweep_rows(folder) for folder in folders]
+    rows = pd.concat([rows.assign(folder=str(path)) for path, (_, rows) in zip(folders, found, strict=True)])
+    shared = [key for key in found[0][0] if key in found[1][0]]
+    return as_table(means(rows, ["folder", *shared], score), ["folder", *shared], score)

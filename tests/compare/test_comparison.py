@@ -13,6 +13,7 @@ from damian.compare.comparison import (
     Comparison,
     shown,
 )
+from damian.compare.report import markdown
 
 LIKELIEST = f"{TRAINED}, deterministic"
 ARMS = {
@@ -120,3 +121,25 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     assert aware["compared_seeds"] == 0  # only the trained policy of an arm is compared with others
     assert prior["J_norm"] == pytest.approx(2.5 / 10)
     assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
+
+
+def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
+    # Straight learning curves over 100 steps: the mean of the naive one ends with 4, of the aware one with 8.
+    # The mean over the last tenth of the steps lags a straight curve by a twentieth of them, 5 steps.
+    ends = {
+        ("t", "late", "blind"): [3.0, 5.0],
+        ("t", "late", "aware"): [3.0, 13.0],
+        ("t", "none", "best"): [40.0],
+    }
+    points = [
+        (*run, seed, x, end * x / 100, np.nan)
+        for run, of_seeds in ends.items()
+        for seed, end in enumerate(of_seeds)
+        for x in (0, 100)
+    ]
+    lines = markdown(comparison(rows_of("t", "late", SCORES), ARMS, points), []).splitlines()
+    table = lines[next(i for i, line in enumerate(lines) if line.endswith("of *blind*, 3.8:")) :]
+    rows = {arm: numbers for arm, *numbers in (line.strip("| ").split(" | ") for line in table[4:7])}
+    assert rows["best"] == ["15", "15", "15"]
+    assert rows["aware"] == ["53", "34", "never"]
+    assert rows["blind"] == ["100", "81", "never"]

@@ -60,7 +60,7 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
         (["train", "resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
         (["compare", "experiment=usecases", "agents=3"], "agents: it is a setting of the runs"),
         (["compare", "-m", "experiment=usecases"], "-m: not with damian compare, which has many runs anyway"),
-        (["results"], "folder: it is missing: that of a run, a sweep or a comparison"),
+        (["results"], "folders: it is not one folder, or two to compare"),
     ],
     ids=lambda part: part[-1] if isinstance(part, list) else "",
 )

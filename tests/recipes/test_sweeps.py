@@ -96,15 +96,25 @@ def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, caps
     (first,) = [line for line in table.splitlines() if line.startswith("| none | trained |")]
     assert first.endswith("| - | - |")
     assert "return to that of aware=none, paired by seed" in table
+    for aware in ("none", "backupdate"):  # two folders, as two sweeps
+        Path(aware).mkdir()
+        for folder in Path("sweep").glob(f"aware-{aware}_*"):
+            shutil.copytree(folder, Path(aware, folder.name))
+    main(["results", "none", "backupdate"])
+    (again,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("| backupdate | trained |")]
+    assert again == line
 
 
 def test_a_difference_takes_only_seeds_that_both_have():
-    runs = pd.DataFrame({"seed": [0, 1, 2, 5], "return": [3.0, 5.0, 4.0, 99.0]})
-    others = pd.DataFrame({"seed": [2, 1, 0], "return": [3.5, 4.0, 1.0]})
-    found = difference(runs, others)
+    runs = pd.DataFrame(
+        {"seed": [0, 1, 2, 5], "return": [3.0, 5.0, 4.0, 99.0], "steps": [1.0, 2.0, 3.0, 0.0]}
+    )
+    others = pd.DataFrame({"seed": [2, 1, 0], "return": [3.5, 4.0, 1.0], "steps": [4.0, 5.0, 6.0]})
+    found = difference(runs, others, "return")
     assert found["difference"] == pytest.approx((2 + 1 + 0.5) / 3)
     assert found["difference_low"] < found["difference"] < found["difference_high"]
-    assert difference(runs, others.assign(seed=[7, 8, 9])) == {}
+    assert difference(runs, others, "steps")["improvement"] == 1  # fewer are better
+    assert difference(runs, others.assign(seed=[7, 8, 9]), "return") == {}
 
 
 def test_a_sweep_evaluates_runs_of_other_folders_as_they_are_now(sweep):
