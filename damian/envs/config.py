@@ -9,7 +9,7 @@ from damian.common import checks
 from damian.common.fields import Settings, setting
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.world.config import WorldConfig
+from damian.world.config import IN_REACH, WorldConfig
 
 if TYPE_CHECKING:
     from damian.delays.scenario import ScenarioDelays
@@ -81,6 +81,8 @@ class ScenarioConfig(WorldConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.reward.detection == "truth" and IN_REACH not in self.sensors:
+            self.sensors = [*self.sensors, IN_REACH]
         links, observation, episode = self.links.kind, self.observation, self.episode
         problem = "does not go with clock.server: between two broadcasts no observation changes"
         self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)

@@ -122,6 +122,12 @@ class RewardConfig(RewardWeights):
     desired_distance: float = setting(0.5, "D of R6^s, in largest distances between vertices.", low=0, high=2)
     desired_distance_not_spotting: float = setting(0.5, "D_nss of R7^s, in the same unit.", low=0, high=2)
     desired_distance_spotting: float = setting(0.1, "D_ss of R8^s, in the same unit.", low=0, high=2)
+    detection: str = setting(
+        "reports",
+        "What counts as spotting: what UAVs report, or the truth (regime R1), which matters with misses and "
+        "false alarms.",
+        choices=("reports", "truth"),
+    )
     bonus: float = setting(0.0, "Added to the reward of every UAV on success.")
     bonus_over_steps: bool = setting(False, "Divide the bonus by the elapsed steps of the episode.")
     penalty: float = setting(0.0, "Subtracted from every reward when an episode ends without success.")

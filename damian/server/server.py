@@ -20,6 +20,7 @@ from damian.server.features import ServerContext, check_features, feature_of, ob
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
+from damian.world.config import IN_REACH
 from damian.world.coverage import KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.simulation import Simulation
@@ -175,10 +176,16 @@ class Server:
         """
         names = self.names if observes else self.reads
         features = self.features(messages, steps, names, coverage, belief)
+        if self.reward.detection == "truth":
+            first, _ = self._context.readings[IN_REACH]
+            messages = messages._replace(spotted=messages.readings[..., first] > 0.5)
+            judged = self.features(messages, steps, self.reads, coverage, belief)
+        else:
+            judged = features
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         counters = Counters(steps, messages.motions)
         ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
-        terms = reward(features, counters, self.terms)
+        terms = reward(judged, counters, self.terms)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
         seen = self.observations(features) if observes else (None, None)
         known = None

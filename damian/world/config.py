@@ -13,6 +13,8 @@ RANDOM, GEOJSON, FILES = ("random",), ("geojson",), ("fir", "geojson")
 POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 
 
+IN_REACH = "in_reach"
+"""The sensor that tells the truth about detections, for ``reward.detection=truth``."""
 RANDOMISED = (
     "motion.max_speed",
     "motion.max_acceleration",

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.registry import Registry, check_parameters, name_of
+from damian.world.config import IN_REACH
 from damian.world.messages import Messages
 from damian.world.state import State
 
@@ -55,6 +56,14 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
 
 SENSORS = Registry[Sensor]("sensor", Sensor, "is not a sensor: decorate the function with damian.sensor")
 """Sensors, as ``package.module:name``."""
+
+
+@SENSORS.register(IN_REACH)
+@sensor()
+def in_reach(state: State, world: Any) -> Tensor:
+    """Whether a UAV is where it would spot a source if it never missed one, [B, N]: the simulator's truth."""
+    _, emits, _ = world.source_now(state)
+    return world.in_reach(state, emits).any(-1).float()
 
 
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:

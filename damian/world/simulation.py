@@ -151,11 +151,7 @@ class Simulation:
         state = state._replace(source=place, source_over=over.all(-1))
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
-        # Of each UAV and source, [B, N, K].
-        squared_distance = (position.unsqueeze(-2) - place.unsqueeze(-3)).square().sum(-1)
-        listens = on_ground.unsqueeze(-1)
-        in_reach = listens & emits.unsqueeze(-2) & (squared_distance <= self.reach.square())
-        detected = self._reported(state, in_reach, listens)
+        detected = self._reported(state, self.in_reach(state, emits), on_ground.unsqueeze(-1))
         spotted = detected.any(-1)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         trail, landed = self._stops(state, times, on_ground, action_valid)
@@ -182,6 +178,12 @@ class Simulation:
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
+
+    def in_reach(self, state: State, emits: Tensor) -> Tensor:
+        """Whether each UAV listens within the radius of each source that ``emits`` [B, K]; [B, N, K]."""
+        ways = state.position[..., None, :2] - state.source.unsqueeze(-3)
+        near = ways.square().sum(-1) <= self.reach.square()
+        return self.vehicles.on_ground(state).unsqueeze(-1) & emits.unsqueeze(-2) & near
 
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
         """What each UAV reports of each source; some in reach miss it, some out of reach raise an alarm."""

@@ -11,6 +11,7 @@ from helpers import clock
 from damian.common.errors import InputError
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
+from damian.server.config import RewardConfig
 from damian.world.config import ActionConfig, BatteryConfig, MotionConfig, RegionConfig, WindConfig
 
 DENTED = [[0, 0], [600, 0], [600, 400], [320, 400], [300, 240], [280, 400], [0, 400]]
@@ -134,6 +135,29 @@ def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
     share = counts[:, 0] / counts[:, 1]
     spread = 4 * (torch.tensor([0.21, 0.09]) / counts[:, 1]).sqrt()
     assert ((share - torch.tensor([0.7, 0.1])).abs() < spread).all(), share
+
+
+def test_rewards_by_the_truth_are_those_without_misses_and_false_alarms():
+    clear = replace(
+        WORLD,
+        motion=MotionConfig(),
+        battery=BatteryConfig(),
+        reward=RewardConfig(spotted=0.0, spotting_agents=1.0),
+        source=replace(WORLD.source, level_db=150.0),
+    )
+    reported = replace(clear, source=replace(clear.source, miss=0.5, false_alarm=0.2))
+    judged, rewards = replace(reported, reward=replace(clear.reward, detection="truth")), []
+    for scenario in (clear, judged, reported):
+        env = UavEnv(scenario, 16, seed=0)
+        env.set_seed(1)
+        td, found = env.reset(), []
+        for step in range(20):
+            action = torch.randint(24, (16, 3), generator=torch.Generator().manual_seed(step))
+            td = env.step(td.set(("agents", "action"), action))["next"]
+            found.append(td["agents", "reward"])
+        rewards.append(torch.stack(found))
+    assert rewards[1].equal(rewards[0])
+    assert not rewards[2].equal(rewards[0])
 
 
 @pytest.mark.parametrize(
