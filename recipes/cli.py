@@ -87,7 +87,8 @@ def composed(*words: str, program: str = "train") -> DictConfig:
     running = GlobalHydra.instance().hydra
     try:
         _register_own(words)
-        if running and str(CONF) in str(running.config_loader.get_search_path()):
+        path = str(running.config_loader.get_search_path()) if running else ""
+        if str(CONF) in path or "pkg://damian/conf" in path:
             return compose(program, [*words], return_hydra_config=True)
         GlobalHydra.instance().clear()  # of a Hydra application that calls this
         with initialize_config_dir(str(CONF), version_base=None):
