@@ -191,8 +191,8 @@ def legend_marks(episode: Episode) -> list[Any]:
     if episode.requests is not None:
         marks.append(_mark("open request", marker="s", color=INK, markerfacecolor="none"))
     if "wind" in episode.about:
-        speed, whence = episode.about["wind"]
-        blows = MarkerStyle(_BLOWS, transform=Affine2D().rotate_deg(-whence))
+        speed, direction = episode.about["wind"]
+        blows = MarkerStyle(_BLOWS, transform=Affine2D().rotate_deg(-direction))
         marks.append(_mark(f"wind, {speed:.2g} m/s", marker=blows, color=INK, markersize=14))
     return marks
 

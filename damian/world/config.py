@@ -160,7 +160,7 @@ class WindConfig(Settings):
     speed: float = setting(0.0, "Mean speed of the wind.", unit="m/s", low=0, high=100)
     direction: float | None = setting(
         None,
-        "Whence it blows, clockwise from north; drawn for each episode if not given.",
+        "Direction from which it blows, clockwise from north; drawn for each episode if not given.",
         unit="deg",
         low=-360,
         high=360,

@@ -46,15 +46,19 @@ class Detours(NamedTuple):
 
     def way(self, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
         """Places on the ways between landing points, from one to the other, [*, C + 2, 2] metres."""
+        return self._along(self.row(origin, goal), origin, goal, points)
+
+    def _along(self, row: Tensor, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
         first, last = gather_rows(points, origin).unsqueeze(-2), gather_rows(points, goal).unsqueeze(-2)
-        corners = gather_rows(self.corners, self.row(origin, goal))
+        corners = gather_rows(self.corners, row)
         return torch.cat([first, torch.where(corners.isnan(), last, corners), last], -2)
 
     def length(self, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
         """Lengths of the ways between landing points [m], [*]; infinite where none leads to the goal."""
-        way = self.way(origin, goal, points)
+        row = self.row(origin, goal)
+        way = self._along(row, origin, goal, points)
         straight = torch.linalg.vector_norm(way[..., -1, :] - way[..., 0, :], dim=-1)
-        leads = gather_rows(self.reached, self.row(origin, goal)) & (straight <= self.longest)
+        leads = gather_rows(self.reached, row) & (straight <= self.longest)
         return way_length(way).where(leads, torch.inf)
 
 

@@ -49,8 +49,13 @@ class Simulation:
         if self.widths.requests:
             self.request_places = request_places(regions, rng)
         shortest = self._shortest_flights()
-        unsure = any(each.miss or each.false_alarm for each in self.sources)
-        self.draws = bool(self.sensors or self.vehicles.values.choices or unsure)
+        self.misses, self.false_alarms = (
+            torch.tensor([getattr(source, name) for source in self.sources])
+            for name in ("miss", "false_alarm")
+        )
+        """Probabilities of the reports about each source, [K]."""
+        self.unsure = any(each.miss or each.false_alarm for each in self.sources)
+        self.draws = bool(self.sensors or self.vehicles.values.choices or self.unsure)
         """Whether first messages differ from episode to episode that begins alike."""
         self.shortest_flight = shortest if config.battery.enabled else None
         self.initial = self._initial_state(region, start, stops, seed)
@@ -187,22 +192,17 @@ class Simulation:
 
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
         """What each UAV reports of each source; some in reach miss it, some out of reach raise an alarm."""
-        chances = [self._chances(state, name) for name in ("miss", "false_alarm")]
-        if not any(isinstance(chance, Tensor) or chance for chance in chances):
+        values, drawn = self.vehicles.values, state.drawn
+        miss, alarm = (values.get(f"source.{name}", drawn) for name in ("miss", "false_alarm"))
+        if not (self.unsure or isinstance(miss, Tensor) or isinstance(alarm, Tensor)):
             return in_reach
+        miss = miss.unsqueeze(-1) if isinstance(miss, Tensor) else self.misses
+        alarm = alarm.unsqueeze(-1) if isinstance(alarm, Tensor) else self.false_alarms
         number = torch.arange(in_reach[0].numel(), device=in_reach.device).view(in_reach.shape[1:])
         counters = torch.full_like(state.episode, _REPORT), state.episode, state.steps
         seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
         share = counter_rng.uniform(seed, *counters, number)
-        return torch.where(in_reach, share >= chances[0], listens & (share < chances[1]))
-
-    def _chances(self, state: State, name: str) -> float | Tensor:
-        """A probability of the reports about each source: of all, [K], or drawn, [B, 1, 1]."""
-        value = self.vehicles.values.get(f"source.{name}", state.drawn)
-        if isinstance(value, Tensor):
-            return value.unsqueeze(-1)
-        each = [getattr(source, name) for source in self.sources]
-        return each[0] if len({*each}) == 1 else state.track.new_tensor(each)
+        return torch.where(in_reach, share >= miss, listens & (share < alarm))
 
     def _stops(
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None

@@ -38,7 +38,9 @@ def believing(own: bool = False, **changed) -> DelayedEnv:
 def test_all_uavs_fly_to_where_they_detect_the_source(own):
     env = believing(own=own)
     td, centres = env.reset(), env.server.grid.centres
-    cell = (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()  # of which all are certain
+    cell = (
+        (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()
+    )  # the cell in which the source certainly is
     td[keys.BELIEF] = torch.nn.functional.one_hot(cell, len(centres)).float().unsqueeze(0)
     if own:
         td[keys.OWN_BELIEF] = td[keys.BELIEF].unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()
