@@ -63,7 +63,7 @@ SENSORS = Registry[Sensor]("sensor", Sensor, "is not a sensor: decorate the func
 def in_reach(state: State, world: Any) -> Tensor:
     """Whether a UAV is where it would spot a source if it never missed one, [B, N]: the simulator's truth."""
     _, emits, _ = world.source_now(state)
-    return world.in_reach(state, emits).any(-1).float()
+    return world.in_reach(state, emits, world.vehicles.on_ground(state)).any(-1).float()
 
 
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:

@@ -156,7 +156,8 @@ class Simulation:
         state = state._replace(source=place, source_over=over.all(-1))
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
-        detected = self._reported(state, self.in_reach(state, emits), on_ground.unsqueeze(-1))
+        in_reach = self.in_reach(state, emits, on_ground)
+        detected = self._reported(state, in_reach, on_ground.unsqueeze(-1))
         spotted = detected.any(-1)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         trail, landed = self._stops(state, times, on_ground, action_valid)
@@ -184,11 +185,11 @@ class Simulation:
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
 
-    def in_reach(self, state: State, emits: Tensor) -> Tensor:
-        """Whether each UAV listens within the radius of each source that ``emits`` [B, K]; [B, N, K]."""
+    def in_reach(self, state: State, emits: Tensor, on_ground: Tensor) -> Tensor:
+        """Whether UAVs ``on_ground`` [B, N] are within the radius of sources that emit [B, K]; [B, N, K]."""
         ways = state.position[..., None, :2] - state.source.unsqueeze(-3)
         near = ways.square().sum(-1) <= self.reach.square()
-        return self.vehicles.on_ground(state).unsqueeze(-1) & emits.unsqueeze(-2) & near
+        return on_ground.unsqueeze(-1) & emits.unsqueeze(-2) & near
 
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
         """What each UAV reports of each source; some in reach miss it, some out of reach raise an alarm."""
