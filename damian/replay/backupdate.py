@@ -158,16 +158,37 @@ class BackupdateStorage(TimeStorage):
 
     def backupdate(self, n_steps: int) -> None:
         """Correct the latest ``n_steps`` steps with all that has arrived by the last step."""
-        # Earlier steps too, whose messages may be the newest ones of the steps to correct.
+        # The entries of steps before these are right already; but one of their messages may be the newest of
+        # a step to correct, and corrections read some.
         index = self.latest(n_steps + self.longest + self.lookback)
-        rows = index[-n_steps:]
-        recomputed = self.recomputed(cast(TensorDictBase, self.steps[index]), len(index) - len(rows))
-        self.overwrite(rows, {key: value[-len(rows) :] for key, value in recomputed.items()})
+        n_steps = min(n_steps, len(index))
+        read = n_steps + min(self.lookback + 1, len(index) - n_steps)
+        messages, added = self._messages_by_now(self.rows(index), read)
+        recomputed = self._recomputed(self.rows(index[-read:]), messages, read - n_steps)
+        entries = {**recomputed, **added}
+        self.overwrite(index[-n_steps:], {key: value[-n_steps:] for key, value in entries.items()})
 
-    def recomputed(self, steps: TensorDictBase, n_right: int = 0) -> dict[NestedKey, Tensor]:
-        """The corrected entries of steps [T, B]; the first ``n_right`` stored ones are right."""
+    def _messages_by_now(self, steps: TensorDictBase, last: int) -> tuple[Tensor | None, Entries]:
+        """The newest arrived message of each of the ``last`` of steps [T, B], and ``hindsight_key``."""
+        if self.recompute is None:
+            return None, {}
+        held, age, delay = steps[self._held], steps[self._age].long(), steps[self._delay]
+        if self._hindsight is not None:
+            # At the first step, the storage may know a newer message than the receiver held; its sender may
+            # have sent it before that step, so that it is in no row of these steps.
+            held = torch.cat([steps[self._hindsight][:1], held[1:]])
+            age = torch.cat([steps[self._hindsight_age][:1], age[1:]])
+        latest, age = latest_arrived(steps[self._sent], delay.squeeze(-1), held, age.squeeze(-1))
+        latest, age = latest[-last:], age[-last:].unsqueeze(-1)
+        hindsight = {self._hindsight: latest, self._hindsight_age: age}
+        return latest, cast(Entries, hindsight if self._hindsight else {})
+
+    def _recomputed(
+        self, steps: TensorDictBase, messages: Tensor | None, n_right: int
+    ) -> dict[NestedKey, Tensor]:
+        """The corrected entries of steps [T, B], of which the first ``n_right`` stored ones are right."""
         begins = steps[self._count].squeeze(-1) == 0
-        entries, added = self._recompute_latest(steps)
+        entries = self.recompute(steps, messages) if self.recompute and messages is not None else {}
         after = self._correct(entries, steps)
         done, terminated, truncated = ENDS
         reset = steps[keys.RESET_AFTER]
@@ -180,25 +201,13 @@ class BackupdateStorage(TimeStorage):
             ended = torch.cat([ended[:n_right], after[done][n_right:]])
         over = ended_before(ended.squeeze(-1), begins, already_ended)
         if self.recompute is not None:
-            added[self._backupdated] = _rewards_changed(after, steps, steps[self._backupdated])
-        return {**after, **_before(steps, after, begins), **added, keys.VALID: ~over.unsqueeze(-1)}
-
-    def _recompute_latest(self, steps: TensorDictBase) -> tuple[Entries, Entries]:
-        """What ``recompute`` returns for all that has arrived, and ``hindsight_key``, or ``backupdated``."""
-        delay = steps[self._delay]
-        if self.recompute is None:
+            changed = _rewards_changed(after, steps, steps[self._backupdated])
+        else:
             late = cast(Correction, self._late_rewards)
             paid = cast(Callable[..., Tensor], late.paid)(steps, steps[self._count].squeeze(-1))
-            return {}, {self._backupdated: paid & (delay > 0)}
-        held, age = steps[self._held], steps[self._age].long()
-        if self._hindsight is not None:
-            # At the first step, the storage may know a newer message than the receiver held; its sender may
-            # have sent it before that step, so that it is in no row of these steps.
-            held = torch.cat([steps[self._hindsight][:1], held[1:]])
-            age = torch.cat([steps[self._hindsight_age][:1], age[1:]])
-        latest, age = latest_arrived(steps[self._sent], delay.squeeze(-1), held, age.squeeze(-1))
-        hindsight = {self._hindsight: latest, self._hindsight_age: age.unsqueeze(-1)}
-        return self.recompute(steps, latest), cast(Entries, hindsight if self._hindsight else {})
+            changed = paid & (steps[self._delay] > 0)
+        marks = {self._backupdated: changed, keys.VALID: ~over.unsqueeze(-1)}
+        return {**after, **_before(steps, after, begins, n_right), **marks}
 
     def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
         """Apply the corrections to what ``recompute`` returned for steps [T, B]."""
@@ -228,15 +237,18 @@ def _rewards_changed(after: Entries, steps: TensorDictBase, changed: Tensor) -> 
     return changed
 
 
-def _before(steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor) -> dict[NestedKey, Tensor]:
-    """Entries before each step [T, B], as far as the steps have them: those after the previous step."""
-    no_previous = begins.clone()
-    no_previous[0] = True  # the step before the first one is not among these steps
+def _before(
+    steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor, n_right: int
+) -> dict[NestedKey, Tensor]:
+    """Entries before the steps [T, B] behind the right ones: what was after the step before."""
+    keep = begins[n_right:].clone()
+    keep[0] |= n_right == 0  # the step before the first one is not among these steps
     before: dict[NestedKey, Tensor] = {}
     for next_, value in after.items():
         key = unravel_key(next_[1:])
         stored = None if next_ in ENDS else steps.get(key, None)
         if stored is not None:
-            previous = torch.cat([value[:1], value[:-1]])
-            before[key] = torch.where(expand_mask(no_previous, stored), stored, previous)
+            stored = stored[n_right:]
+            previous = value[n_right - 1 : -1] if n_right else torch.cat([value[:1], value[:-1]])
+            before[key] = torch.where(expand_mask(keep, stored), stored, previous)
     return before

@@ -30,6 +30,10 @@ class TimeStorage(LazyTensorStorage):
         """Number of stored steps, T."""
         return cast(int, self._len_along_dim0 or 0)
 
+    def rows(self, index: Tensor) -> TensorDictBase:
+        """The steps at these indices [K], [K, B]; an entry is copied when it is read."""
+        return self.steps._get_sub_tensordict(index)
+
     def overwrite(self, index: Tensor, entries: Mapping[NestedKey, Tensor]) -> None:
         """Replace entries of the steps at these indices [K] by values [K, B, ...], by key."""
         for key, value in entries.items():

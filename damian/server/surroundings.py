@@ -197,7 +197,8 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     offsets = ring_places(context.radius, standing.device)
     places = gather_rows(context.points, standing).unsqueeze(-2) + offsets
     landed = gather_rows(context.points, trail)  # [*, N, n, 2]
-    distance = distances(places.flatten(-3, -2), landed.flatten(-3, -2)) / (2 * context.radius)
+    distance = distances(places.flatten(-3, -2), landed.flatten(-3, -2))
+    nearest = distance.view(*places.shape[:-1], *trail.shape[-2:]).amin(-2)  # of all UAVs
     age = torch.arange(trail.shape[-1], device=trail.device) / trail.shape[-1]
-    new = distance.view(*places.shape[:-1], *trail.shape[-2:]) + _OLDEST * age
-    return new.flatten(-2).amin(-1).clamp(max=1) * gather_rows(context.places_inside, standing)
+    new = (nearest / (2 * context.radius) + _OLDEST * age).amin(-1)
+    return new.clamp(max=1) * gather_rows(context.places_inside, standing)
