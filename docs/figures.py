@@ -7,19 +7,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
-import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torchrl.envs import GymEnv, TransformedEnv
 
 from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
-from damian.compare.comparison import TRAINED, Comparison
-from damian.compare.figures import draw_groups, save, style_of
+from damian.common.plotting import COLOURS, STYLE
+from damian.compare.comparison import ENDS, TRAINED, Comparison
 from damian.recipes import cli
 from damian.recipes.compare import includes
 from damian.recipes.shared.comparison_runs import stored_results
+from damian.runs.run_folder import RANDOM
 
 IMAGES = Path(__file__).parent / "images"
 DELAYBENCH = Path(__file__).parent / "results" / "delaybench"
@@ -32,13 +33,26 @@ LAWS = {
     "burst: at times 6 steps, half of them lost": Burst(enter=0.05, leave=0.2, bad=6, bad_loss=0.5),
     "lag: for 20 steps the same, 0 to 6": Lag(Uniform(0, 6), update_period=20),
 }
-_DELAY, _FLOWN = "@delay_", 4
-"""Mark of the tasks of held-out delays; least number of them under which a policy flew, to be drawn."""
-_SPECIALISTS = ", trained at each delay"
-"""End of the label of a line of policies that fly under the delay at which they were trained."""
-SHOWN = ["experiment=delaybench", "tasks=[crowded]", "delays=['4','5',lag,0-7]"]
+SHOWN = ["experiment=delaybench", "tasks=[crowded]", "delays=['1','2','3','4','5','6',lag]"]
 SHOWN += ["arms=[undelayed,backupdate+gru,timeline,timeline+gru]"]
 """What the figure of delaybench shows."""
+ALONE = "backupdate+gru"
+POLICIES = {
+    ("timeline+gru", "lag"): "one policy: timeline, GRU, back-updating (trained at 1 to 7)",
+    ("timeline", "lag"): "the same without GRU",
+    (ALONE, "lag"): "without timeline (trained at 1 to 7)",
+    (ALONE, "4"): "without timeline (trained at 4)",
+}
+"""Labels of the trainings in the figure: method, and delay of the training (lag: one to seven steps)."""
+LAWS_FLOWN = {
+    "1-7": "1 to 7",
+    "lost": "1 to 7, a\nfifth lost",
+    "bimodal": "1 or 6",
+    "burst": "bursts",
+    "paper": "the\npaper's",
+    "trace": "measured\nlink",
+}
+"""Labels of the laws that are no constant delay."""
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 
 
@@ -108,44 +122,47 @@ def main() -> None:
 
 
 def plot_matrix(path: Path) -> None:
-    """Draw delaybench: scores over the held-out delays under which policies flew, a line for each training.
-
-    Held-out tasks of delays have names that begin with ``delay_``; a policy must have flown under four.
-    Dashed, an arm that was trained at several constant delays: at each one, the policies trained there.
-    """
+    """Draw delaybench: returns over the delay of the flight, a line for each training."""
     config = cli.settings(*SHOWN, program="compare")
     results = stored_results(path.parent).only(partial(includes, config))
-    comparison = Comparison(*results, config.chosen("arms"))
-    drawn = {task: lines for task in comparison.tasks() if len(lines := _matrix(comparison, task))}
-
-    def panel(axis: Axes, task: str) -> None:
-        names = sorted(drawn[task]["flown"].unique(), key=lambda x: (not x.isdecimal(), x.zfill(9)))
-        styles = {label: style_of(n) for n, label in enumerate(drawn[task]["label"].unique())}
-        for label, style in styles.items():
-            style["linestyle"] = "--" if label.endswith(_SPECIALISTS) else "-"
-        draw_groups(axis, drawn[task], ("flown", "label", comparison.score), names, styles)
-        axis.tick_params(axis="x", rotation=90)
-        axis.set(title=task, xlabel="delay of the flight [steps], or its law", ylabel=comparison.score)
-
-    save(path, [*drawn], panel, (6.4, 3.6))
-
-
-def _matrix(comparison: Comparison, task: str) -> pd.DataFrame:
-    """Lines of the table with the delay in which they were ``flown``, and a ``label`` for each training."""
-    table = comparison.table[comparison.table["policy"] == TRAINED]
-    away = table[table["task"].str.startswith(f"{task}{_DELAY}")]
-    flown, label = (
-        away["task"].str.removeprefix(f"{task}{_DELAY}"),
-        away["arm"] + ", trained at " + away["delay"],
-    )
-    away = away.assign(flown=flown, label=label)
-    away = away[away.groupby("label")["flown"].transform("size") >= _FLOWN]
-    constant = [name for name in flown.unique() if name.isdecimal()]
-    trained = [name for name, arm in comparison.arms.items() if arm.policy_of is None]
-    own = table[(table["task"] == task) & table["delay"].isin(constant) & table["arm"].isin(trained)]
-    own = own.assign(flown=own["delay"], label=own["arm"] + _SPECIALISTS)
-    own = own[own.groupby("label")["flown"].transform("size") > 1]
-    return pd.concat([away, own]) if len(away) else away
+    table = Comparison(*results, config.chosen("arms")).table
+    rows = table.set_index(["arm", "delay", "task", "policy"])[["return" + end for end in ENDS]]
+    constant = [str(steps) for steps in range(9)]
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True, width_ratios=(9, 7))
+        for number, (trained, label) in enumerate(POLICIES.items()):
+            look = {"color": COLOURS[number], "linewidth": 1.2 + (number == 0), "markersize": 4}
+            for axis, flown in ((left, constant), (right, [*LAWS_FLOWN])):
+                tasks = {name: "crowded" if name == trained[1] else f"crowded@delay_{name}" for name in flown}
+                known = {
+                    place: rows.loc[key]
+                    for place, name in enumerate(flown)
+                    if (key := (*trained, tasks[name], TRAINED)) in rows.index
+                }
+                value, low, high = np.array([*known.values()]).reshape(-1, 3).T
+                error = np.nan_to_num([value - low, high - value], posinf=0)
+                line = "-" if axis is left else ""
+                place = np.array([*known]) + (axis is right) * 0.12 * (number - 1)
+                axis.errorbar(place, value, error, marker="o", linestyle=line, label=label, **look)
+        there = {
+            x: rows.loc[key] for x in range(9) if (key := (ALONE, str(x), "crowded", TRAINED)) in rows.index
+        }
+        label = "without timeline (trained at the delay of the flight)"
+        left.plot(
+            [*there], [row["return"] for row in there.values()], "D", color="0.3", markersize=3, label=label
+        )
+        for axis, labels in ((left, constant), (right, [*LAWS_FLOWN.values()])):
+            axis.set_xticks(range(len(labels)), labels)
+            for arm, policy, line in (("undelayed", TRAINED, "--"), (RANDOM, RANDOM, ":")):
+                level = rows.loc[arm, "none", "crowded", policy]["return"]
+                axis.axhline(level, color="0.5", linestyle=line, linewidth=0.8)
+                right.annotate(arm, (len(LAWS_FLOWN) - 1, level + 0.3), ha="right", color="0.4")
+        left.set(xlabel="delay of every message [steps]", ylabel="return")
+        right.set(xlabel="delays that vary")
+        handles = left.get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False)
+        figure.savefig(path, dpi=150)
 
 
 if __name__ == "__main__":
