@@ -97,7 +97,7 @@ pictures: $(VENV)/base
 	$(PY) docs/figures.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
 	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench "delays=['4']" \
-	  "arms=[undelayed,naive,naive+history,naive+gru,naive+gru+tuned,backupdate,backupdate+history,backupdate+gru,untrained,deployed]" > build/delaybench.md
+	  "methods=[undelayed,naive,naive+history,naive+gru,naive+gru+tuned,backupdate,backupdate+history,backupdate+gru,untrained,deployed]" > build/delaybench.md
 
 # The documentation site, in build/site.
 docs: $(VENV)/docs

@@ -59,7 +59,7 @@ OWN_BELIEF = (AGENTS, "belief")
 """The same as each UAV knows it, whose own messages are not delayed for it, [B, N, K]."""
 STATE = "state"
 """The simulator's true state, [B, S]: of each UAV the position (east, north, up [m]), of each the battery
-level [%], whether the source emits, and its position [m]. For drawing and reference arms, never an actor."""
+level [%], whether the source emits, and its position [m]. For drawing and references, never an actor."""
 SOURCE_OVER = "source_over"
 """Has the source finished its walk for good, [B, 1] bool."""
 SUCCESS = "success"

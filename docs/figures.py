@@ -34,7 +34,7 @@ LAWS = {
     "lag: for 20 steps the same, 0 to 6": Lag(Uniform(0, 6), update_period=20),
 }
 SHOWN = ["experiment=delaybench", "tasks=[crowded]", "delays=['1','2','3','4','5','6',lag]"]
-SHOWN += ["arms=[undelayed,backupdate+gru,timeline,timeline+gru]"]
+SHOWN += ["methods=[undelayed,backupdate+gru,timeline,timeline+gru]"]
 """What the figure of delaybench shows."""
 ALONE = "backupdate+gru"
 POLICIES = {
@@ -125,8 +125,8 @@ def plot_matrix(path: Path) -> None:
     """Draw delaybench: returns over the delay of the flight, a line for each training."""
     config = cli.settings(*SHOWN, program="compare")
     results = stored_results(path.parent).only(partial(includes, config))
-    table = Comparison(*results, config.chosen("arms")).table
-    rows = table.set_index(["arm", "delay", "task", "policy"])[["return" + end for end in ENDS]]
+    table = Comparison(*results, config.chosen("methods")).table
+    rows = table.set_index(["method", "delay", "task", "policy"])[["return" + end for end in ENDS]]
     constant = [str(steps) for steps in range(9)]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 3.4), layout="constrained")
@@ -154,10 +154,10 @@ def plot_matrix(path: Path) -> None:
         )
         for axis, labels in ((left, constant), (right, [*LAWS_FLOWN.values()])):
             axis.set_xticks(range(len(labels)), labels)
-            for arm, policy, line in (("undelayed", TRAINED, "--"), (RANDOM, RANDOM, ":")):
-                level = rows.loc[arm, "none", "crowded", policy]["return"]
+            for method, policy, line in (("undelayed", TRAINED, "--"), (RANDOM, RANDOM, ":")):
+                level = rows.loc[method, "none", "crowded", policy]["return"]
                 axis.axhline(level, color="0.5", linestyle=line, linewidth=0.8)
-                right.annotate(arm, (len(LAWS_FLOWN) - 1, level + 0.3), ha="right", color="0.4")
+                right.annotate(method, (len(LAWS_FLOWN) - 1, level + 0.3), ha="right", color="0.4")
         left.set(xlabel="delay of every message [steps]", ylabel="return")
         right.set(xlabel="delays that vary")
         handles = left.get_legend_handles_labels()

@@ -1,7 +1,7 @@
-"""Train and evaluate several arms with several seeds over tasks and delays, and compare their results.
+"""Train and evaluate several methods with several seeds over tasks and delays, and compare their results.
 
 damian compare experiment=usecases "tasks=[usecase2]" seeds=2 "overrides=['frames=1000','eval_episodes=8']"
-damian compare experiment=delaybench seeds=10 processes=2 "delays=[paper]" "arms=[undelayed,naive]"
+damian compare experiment=delaybench seeds=10 processes=2 "delays=[paper]" "methods=[undelayed,naive]"
 damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench
 
 The same command continues a comparison; keep=true also without the folders of finished runs.
@@ -51,21 +51,25 @@ from .train import train
 
 TABLE, CURVES = "table.csv", "curves.png"
 EPISODES = 100
-"""A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
+"""A report with a method of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
 
 
 def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
-    """Which rows of results are of a task, a delay, an arm and a seed that are asked for."""
+    """Which rows of results are of a task, a delay, a method and a seed that are asked for."""
     tasks, first = [*config.chosen("tasks")], config.experiment.first_seed
     tasks += [f"{task}{HELD_OUT_MARK}{name}" for task in tasks for name in config.experiment.held_out]
-    asked = {"task": tasks, "delay": [NOT_LATE, *config.chosen("delays")], "arm": [*config.chosen("arms")]}
+    asked = {
+        "task": tasks,
+        "delay": [NOT_LATE, *config.chosen("delays")],
+        "method": [*config.chosen("methods")],
+    }
     last = math.inf if config.seeds is None else config.every_seed[-1]
     return rows[[*asked]].isin(asked).all(axis=1) & rows["seed"].between(first, last)
 
 
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
     """Write the tables and the figures."""
-    comparison = Comparison(*results, config.chosen("arms"), config.score)
+    comparison = Comparison(*results, config.chosen("methods"), config.score)
     write_csv(folder / TABLE, comparison.table, unknown="")
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results.rows, missing)))
     plot_curves(comparison, folder / CURVES)
@@ -84,8 +88,8 @@ def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) ->
         "Mean over seeds [95 % interval: bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the sampled policy; perceived: as far as the server knew, "
         "else as it truly was; age in steps; backupdated: share of the rewards in training; n: seeds",
-        "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (R0, or R1 "
-        "and R2), 1 undelayed, not shown where "
+        "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (late "
+        "data, or simulator), 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
         "one of the strongest naive method, with its score interval; n compared: seeds that all have",
         *[f"missing: {', '.join(missing)}"] * bool(missing),
@@ -120,7 +124,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
     done = [run for run in runs if run.finished]
     if failed and not done:
         sys.exit(1)
-    results = kept.with_those_of(results_of(done, config.chosen("arms")))
+    results = kept.with_those_of(results_of(done, config.chosen("methods")))
     if done:
         results.write(folder)
     results = results.only(partial(includes, config))
@@ -136,7 +140,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
 def _not_kept(runs: list[Run], kept: Results) -> list[Run]:
     """The runs without kept results, or with a folder, and those whose policies they need."""
     done = {*kept.rows[RUN].itertuples(index=False, name=None)}
-    todo = [r for r in runs if (r.task, r.delay, r.arm, r.config.seed) not in done or r.folder.exists()]
+    todo = [r for r in runs if (r.task, r.delay, r.method, r.config.seed) not in done or r.folder.exists()]
     needed = {run.needs for run in todo if not run.finished}
     needed |= {run.needs for run in runs if run.folder in needed}
     return [run for run in runs if run in todo or run.folder in needed]

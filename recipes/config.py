@@ -24,7 +24,7 @@ class TrainConfig(ScenarioConfig):
     model: ModelConfig = setting(ModelConfig)
     critic: str = setting(
         "server",
-        "The critic observes the messages that the server holds, or the true state (privileged, regime R1).",
+        "The critic observes the messages that the server holds, or the true state (privileged).",
         choices=("server", "privileged"),
     )
     logger: LoggerConfig = setting(LoggerConfig)

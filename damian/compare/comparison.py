@@ -1,4 +1,4 @@
-"""Comparison of arms over tasks, delays and seeds: means, J_norm and recovery, with 95 % intervals."""
+"""Comparison of methods over tasks, delays and seeds: means, J_norm and recovery, with 95 % intervals."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from damian.compare.config import LESS_IS_BETTER, Arm
+from damian.compare.config import LESS_IS_BETTER, Method
 from damian.compare.statistics import (
     Floats,
     bootstrap,
@@ -20,13 +20,13 @@ from damian.compare.statistics import (
 from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED
 
 SCRIPTED = (RANDOM, SCRIPT)
-"""Policies that fly the same episodes beside each arm, and learn nothing."""
-OF_ARM = (TRAINED, TRAINED + DETERMINISTIC, UNTRAINED, UNTRAINED + DETERMINISTIC)
-"""Policies of an arm: its network after the training and before the first update."""
+"""Policies that fly the same episodes beside each method, and learn nothing."""
+OF_METHOD = (TRAINED, TRAINED + DETERMINISTIC, UNTRAINED, UNTRAINED + DETERMINISTIC)
+"""Policies of a method: its network after the training and before the first update."""
 HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
-"""Name that stands for the delay of an undelayed arm."""
+"""Name that stands for the delay of an undelayed method."""
 MEASURED = (
     "return",
     "success_rate",
@@ -40,26 +40,28 @@ MEASURED += ("age", "late", "lost", "backupdated")
 SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
 """Measures whose intervals end at 0 and at 1."""
 COMPARED = ("J_norm", "recovery", "improvement")
-"""What is found of an arm beside others under the same delay (``normalised``, ``recovery``,
-``probability_of_improvement``), the naive arm being the strongest one of the same track: arms that learn from
-late data only (R0), or those that had a simulator."""
-RUN = ["task", "delay", "arm", "seed"]
+"""What is found of a method beside others under the same delay (``normalised``, ``recovery``,
+``probability_of_improvement``), the naive method being the strongest of the same track: methods that learn
+from late data only, or those that had a simulator."""
+LATE_DATA, SIMULATOR, NO_DELAY = "late data", "simulator", "no delay"
+"""Regimes: the information that a method may use (docs/protocol.md)."""
+RUN = ["task", "delay", "method", "seed"]
 """Columns of results that name a run."""
 ENDS = ("", "_low", "_high")
 """Endings of the columns that hold a value and the ends of its 95 % interval."""
-COLUMNS = ["task", "delay", "arm", "regime", "policy", "seeds", "compared_seeds"]
+COLUMNS = ["task", "delay", "method", "regime", "policy", "seeds", "compared_seeds"]
 COLUMNS += [name + end for name in (*MEASURED, *COMPARED) for end in ENDS]
 """Columns of ``Comparison.table``."""
 
 
-def regime(arms: Mapping[str, Arm], name: str) -> str:
-    """The regime of an arm: its own, or R3 without delay, R2 if it needs a policy without, or else R0."""
-    arm = arms[name]
-    if arm.regime or not arm.delayed:
-        return arm.regime or "R3"
-    if arm.source is None:
-        return "R0"
-    return "R2" if not arms[arm.source].delayed else regime(arms, arm.source)
+def regime(methods: Mapping[str, Method], name: str) -> str:
+    """What a method may know: ``NO_DELAY``, ``LATE_DATA``, or else what only a ``SIMULATOR`` has."""
+    method = methods[name]
+    if not method.delayed:
+        return NO_DELAY
+    if method.simulator is None and method.source:
+        return LATE_DATA if regime(methods, method.source) == LATE_DATA else SIMULATOR
+    return SIMULATOR if method.simulator else LATE_DATA
 
 
 def shown(line: Mapping[Any, Any], name: str) -> str:
@@ -74,7 +76,7 @@ def shown(line: Mapping[Any, Any], name: str) -> str:
 def _estimates(
     names: Sequence[str], statistic: Callable[[Floats], Floats], scores: Floats
 ) -> dict[str, float]:
-    """Columns (``ENDS``) of a statistic from ``scores`` [arms, seeds] to a number for each name."""
+    """Columns (``ENDS``) of a statistic from ``scores`` [methods, seeds] to a number for each name."""
     triples = zip(names, *(np.ravel(x).tolist() for x in bootstrap(statistic, scores)), strict=True)
     return {name + end: x for name, *triple in triples for end, x in zip(ENDS, triple, strict=True)}
 
@@ -102,15 +104,15 @@ def _scores(runs: pd.DataFrame) -> Floats:
 class Comparison:
     """Results of all runs, and the statistics that follow from them.
 
-    ``rows`` has an evaluation of each run and policy: task, delay, arm, regime, seed, policy, episodes,
+    ``rows`` has an evaluation of each run and policy: task, delay, method, regime, seed, policy, episodes,
     ``MEASURED``, and of the run ``frames`` (environment steps in training) and ``seconds``. ``points`` are
-    those of learning curves: task, delay, arm, seed, frames, episodes, and measures in training. Unknown
+    those of learning curves: task, delay, method, seed, frames, episodes, and measures in training. Unknown
     or meaningless numbers are nan.
     """
 
     rows: pd.DataFrame
     points: pd.DataFrame
-    arms: Mapping[str, Arm]
+    methods: Mapping[str, Method]
     score: str = "return"
     """Measure that is the J of J_norm and recovery."""
 
@@ -125,72 +127,83 @@ class Comparison:
 
     @cached_property
     def curves(self) -> dict[tuple[Any, ...], list[pd.DataFrame]]:
-        """Points of the learning curves by task, delay and arm, a table for each seed."""
+        """Points of the learning curves by task, delay and method, a table for each seed."""
         found: dict[tuple[Any, ...], list[pd.DataFrame]] = {}
         for (*name, _), points in self.points.groupby(RUN, sort=False):
             found.setdefault(tuple(name), []).append(points)
         return found
 
-    def policy_of(self, arm: str) -> str:
-        """The policy with which an arm is compared; an untrained arm has none but its untrained network."""
-        return UNTRAINED if self.arms[arm].untrained else TRAINED
+    def policy_of(self, method: str) -> str:
+        """The policy with which a method is compared: an untrained one has only its untrained network."""
+        return UNTRAINED if self.methods[method].untrained else TRAINED
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A line for each task, delay, arm and policy, with ``COLUMNS``; the undelayed arm comes first."""
+        """A line for each task, delay, method and policy, with ``COLUMNS``; first the undelayed method."""
         return pd.DataFrame(self._lines(), columns=COLUMNS)
 
     def _lines(self) -> Iterator[dict[str, Any]]:
         for task in self.tasks():
             for delay in (NOT_LATE, *self.delays(task)):
                 scores = self.scores(task, delay)
-                arms = self._present(task, delay)
-                names = [(arm, arm, policy) for arm in arms for policy in OF_ARM]
-                names += [(policy, arm, policy) for policy in SCRIPTED for arm in arms[:1]]
-                for name, arm, policy in names:
-                    runs = self._runs.get((task, delay, arm, policy))
+                methods = self._present(task, delay)
+                names = [(method, method, policy) for method in methods for policy in OF_METHOD]
+                names += [(policy, method, policy) for policy in SCRIPTED for method in methods[:1]]
+                for name, method, policy in names:
+                    runs = self._runs.get((task, delay, method, policy))
                     if runs is None:
-                        continue  # an arm may have no untrained network, and a task no script
-                    line = {"task": task, "delay": delay, "arm": name, "policy": policy, "seeds": len(runs)}
-                    line |= {"regime": regime(self.arms, arm) if name == arm else "", "compared_seeds": 0}
-                    if name == arm and policy == self.policy_of(arm) and delay != NOT_LATE:
-                        line |= self._compared(scores, arm)
+                        continue  # a method may have no untrained network, and a task no script
+                    line = {
+                        "task": task,
+                        "delay": delay,
+                        "method": name,
+                        "policy": policy,
+                        "seeds": len(runs),
+                    }
+                    line |= {
+                        "regime": regime(self.methods, method) if name == method else "",
+                        "compared_seeds": 0,
+                    }
+                    if name == method and policy == self.policy_of(method) and delay != NOT_LATE:
+                        line |= self._compared(scores, method)
                     yield line | means_over_seeds(runs[[*MEASURED]])
 
     @cached_property
     def _runs(self) -> dict[tuple[Any, ...], pd.DataFrame]:
-        """Rows by task, delay, arm and policy, with the seed as their index."""
+        """Rows by task, delay, method and policy, with the seed as their index."""
         grouped = self.rows.groupby([*RUN[:-1], "policy"], sort=False)
         return {name: found.set_index("seed") for name, found in grouped}
 
     def scores(self, task: str, delay: str) -> pd.DataFrame:
-        """Scores by seed, higher ones better, in a column for each arm; nan where a run is missing.
+        """Scores by seed, higher ones better, in a column for each method; nan where a run is missing.
 
-        The first columns are the undelayed arm and the random policy, without delay.
+        The first columns are the undelayed method and the random policy, without delay.
         """
-        undelayed = next((name for name, arm in self.arms.items() if not arm.delayed), "")
+        undelayed = next((name for name, method in self.methods.items() if not method.delayed), "")
         of = {undelayed: (NOT_LATE, undelayed, TRAINED), RANDOM: (NOT_LATE, undelayed, RANDOM)}
-        of |= {arm: (delay, arm, self.policy_of(arm)) for arm in self._present(task, delay)}
+        of |= {method: (delay, method, self.policy_of(method)) for method in self._present(task, delay)}
         none = pd.DataFrame({self.score: []}, dtype=float)
         found = {name: self._runs.get((task, *key), none)[self.score] for name, key in of.items()}
         return pd.DataFrame(found).sort_index() * (-1 if self.score in LESS_IS_BETTER else 1)
 
     def _present(self, task: str, delay: str) -> list[str]:
-        """Arms that have a finished run of a task under a delay."""
-        return [arm for arm in self.arms if (task, delay, arm, self.policy_of(arm)) in self._runs]
+        """Methods that have a finished run of a task under a delay."""
+        return [
+            method for method in self.methods if (task, delay, method, self.policy_of(method)) in self._runs
+        ]
 
-    def _compared(self, scores: pd.DataFrame, arm: str) -> dict[str, Any]:
-        """``COMPARED`` of a delayed arm, over the seeds that it and all it is compared with have finished."""
+    def _compared(self, scores: pd.DataFrame, method: str) -> dict[str, Any]:
+        """``COMPARED`` of a delayed method, over the seeds that it and its rivals have finished."""
         undelayed, random, *delayed = scores.columns
-        tracks = {name: regime(self.arms, name) == "R0" for name in (*delayed, arm)}
-        others = [name for name in delayed if tracks[name] == tracks[arm]]
-        naive = [name for name in others if self.arms[name].naive]
-        paired = scores[[undelayed, random, *(name for name in naive if name != arm), arm]].dropna()
+        tracks = {name: regime(self.methods, name) == LATE_DATA for name in (*delayed, method)}
+        others = [name for name in delayed if tracks[name] == tracks[method]]
+        naive = [name for name in others if self.methods[name].naive]
+        paired = scores[[undelayed, random, *(name for name in naive if name != method), method]].dropna()
         if paired.empty:
             return {}
         array = _scores(paired)
         found = {"compared_seeds": len(paired), **_estimates(["J_norm"], _norms, array)}
-        if naive and arm not in naive:
+        if naive and method not in naive:
             _, _, *of_naive, own = array
             found |= improvement(own, max(of_naive, key=np.mean))
             if not np.isnan(recovery(array)):
@@ -199,6 +212,6 @@ class Comparison:
 
 
 def _norms(scores: Floats) -> Floats:
-    """J_norm of the last arm's mean score, [*, arms, seeds] to [*]; first come undelayed and random."""
+    """J_norm of the last method's mean score, [*, methods, seeds] to [*]; first come undelayed and random."""
     means = scores.mean(-1)
     return normalised(means[..., -1], means[..., 0], means[..., 1])

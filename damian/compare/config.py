@@ -1,4 +1,4 @@
-"""Settings of a comparison: tasks, delays, the methods (arms) that are compared, and by which score."""
+"""Settings of a comparison: tasks, delays, the methods that are compared, and by which score."""
 
 import re
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
 _MEASURES = ("return", "success_rate", "steps")
 SCORES = (*_MEASURES, *(f"perceived_{name}" for name in _MEASURES))
-"""Measures by which arms can be compared; the first ones are from messages without delay."""
+"""Measures by which methods can be compared; the first ones are from messages without delay."""
 LESS_IS_BETTER = ("steps", "perceived_steps")
 """Scores for which lower values are better."""
 STORED = ("sampled", "deterministic")
@@ -23,26 +23,28 @@ SET_BY_COMPARISON = ("seed", "resume", "checkpoint", "logger", "hydra")
 
 
 @dataclass
-class Arm(Settings):
-    """One way to train policies for a task, or to fly those of another arm."""
+class Method(Settings):
+    """One way to train policies for a task, or to fly those of another method."""
 
     overrides: list[str] = setting([], "Overrides of the settings of ``damian train``.")
-    delayed: bool = setting(True, "Whether it has delays; exactly one arm, the reference, has none.")
-    naive: bool = setting(False, "Whether it ignores the delay; the best such arm has recovery 0.")
-    policy_of: str | None = setting(None, "Arm whose policies it flies, without any training of its own.")
-    starts_from: str | None = setting(None, "Arm from whose policies, of the same seed, its training starts.")
-    teacher: str | None = setting(None, "Arm whose policies its learner imitates: its ``learner.teacher``.")
+    delayed: bool = setting(True, "Whether it has delays; exactly one method, the reference, has none.")
+    naive: bool = setting(False, "Whether it ignores the delay; the best such method has recovery 0.")
+    policy_of: str | None = setting(None, "Method whose policies it flies, without any training of its own.")
+    starts_from: str | None = setting(
+        None, "Method from whose policies, of the same seed, its training starts."
+    )
+    teacher: str | None = setting(
+        None, "Method whose policies its learner imitates: its ``learner.teacher``."
+    )
     untrained: bool = setting(False, "Whether the networks fly as they are before the first update.")
-    tasks: list[str] | None = setting(None, "Tasks that the arm does; all of them if not given.")
-    regime: str = setting(
-        "",
-        "Information in training: R0 messages, R1 truth for the critic, R2 no delay; R3: never any delay.",
-        choices=("", "R0", "R1", "R2", "R3"),
+    tasks: list[str] | None = setting(None, "Tasks that the method does; all of them if not given.")
+    simulator: bool | None = setting(
+        None, "Whether its training uses what only a simulator knows; if not given, whether ``source`` does."
     )
 
     @property
     def source(self) -> str | None:
-        """Arm whose policies it flies, starts from, or imitates."""
+        """Method whose policies it flies, starts from, or imitates."""
         return self.policy_of or self.starts_from or self.teacher
 
 
@@ -53,50 +55,50 @@ class HeldOut(Settings):
     overrides: list[str] = setting([], "Overrides of ``damian train``, such as another region.")
     tasks: list[str] | None = setting(None, "Tasks to change; all of them if not given.")
     delays: list[str] | None = setting(None, "Delays of the training; all of them if not given.")
-    arms: list[str] | None = setting(None, "Arms whose policies are flown; all of them if not given.")
+    methods: list[str] | None = setting(None, "Methods whose policies are flown; all of them if not given.")
 
 
 @dataclass
 class Experiment(Settings):
-    """Tasks, delays and arms to compare, as written in a file of conf/experiment."""
+    """Tasks, delays and methods to compare, as written in a file of conf/experiment."""
 
     section: ClassVar[str] = "experiment"
 
     tasks: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each task.")
     delays: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each delay.")
-    arms: dict[str, Arm] = setting({}, "Ways to train or fly; one of them has ``delayed: false``.")
+    methods: dict[str, Method] = setting({}, "Ways to train or fly; one of them has ``delayed: false``.")
     held_out: dict[str, HeldOut] = setting({}, "Changed tasks, TASK@NAME, to evaluate all policies in.")
-    first_seed: int = setting(0, "The seeds of every arm count from this one.", low=0)
+    first_seed: int = setting(0, "The seeds of every method count from this one.", low=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for kind in ("tasks", "delays", "arms", "held_out"):
+        for kind in ("tasks", "delays", "methods", "held_out"):
             for name in getattr(self, kind):
                 good = re.fullmatch(r"[\w.+-]+", name) and name not in ("none", "random", "script")
                 should = "cannot name a folder: use letters, digits, _ . + - but not none, random or script"
                 checks.require(bool(good), f"experiment.{kind}", name, should)
-        for kind in ("tasks", "arms"):
+        for kind in ("tasks", "methods"):
             self.refuse(
                 not getattr(self, kind), kind, "is missing or empty; an experiment needs at least one"
             )
-        self._check_arms()
+        self._check_methods()
         for name, held_out in self.held_out.items():
-            for kind in ("tasks", "delays", "arms"):
+            for kind in ("tasks", "delays", "methods"):
                 for each in getattr(held_out, kind) or ():
                     checks.one_of(f"experiment.held_out.{name}.{kind}", each, getattr(self, kind))
 
-    def _check_arms(self) -> None:
-        undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
-        should = "are not delayed: exactly one arm must have delayed=false"
-        checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
-        never = not self.delays and len(self.arms) > len(undelayed)
-        self.refuse(never, "delays", "is empty, but there are delayed arms")
-        for name, arm in self.arms.items():
-            key, good = f"experiment.arms.{name}", arm.delayed and arm.policy_of is None
+    def _check_methods(self) -> None:
+        undelayed = [name for name, method in self.methods.items() if not method.delayed]
+        should = "are not delayed: exactly one method must have delayed=false"
+        checks.require(len(undelayed) == 1, "experiment.methods", undelayed, should)
+        never = not self.delays and len(self.methods) > len(undelayed)
+        self.refuse(never, "delays", "is empty, but there are delayed methods")
+        for name, method in self.methods.items():
+            key, good = f"experiment.methods.{name}", method.delayed and method.policy_of is None
             should = "goes with neither policy_of nor delayed=false"
-            checks.require(good or not arm.untrained, key, "untrained", should)
-            source = self.arms.get(arm.source or "", arm)
-            for task in self.tasks if arm.tasks is None else arm.tasks:
+            checks.require(good or not method.untrained, key, "untrained", should)
+            source = self.methods.get(method.source or "", method)
+            for task in self.tasks if method.tasks is None else method.tasks:
                 options = self.tasks if source.tasks is None else source.tasks
                 checks.one_of(f"{key}.tasks", task, options)
 
@@ -112,7 +114,7 @@ class CompareConfig(Settings):
     processes: int = setting(1, "Runs at the same time, of one thread each.", low=1, high=1024)
     tasks: list[str] | None = setting(None, "Tasks to run; all of the experiment's if not given.")
     delays: list[str] | None = setting(None, "Delays to run; all of the experiment's if not given.")
-    arms: list[str] | None = setting(None, "Arms to run; all of the experiment's if not given.")
+    methods: list[str] | None = setting(None, "Methods to run; all of the experiment's if not given.")
     overrides: list[str] = setting([], "Further overrides of ``damian train`` for every run.")
     score: str = setting(
         "return",
@@ -130,18 +132,18 @@ class CompareConfig(Settings):
             ours = word.lstrip("+~").partition("=")[0].partition(".")[0] in SET_BY_COMPARISON
             problem = "cannot be the same for every run: the comparison sets it; leave it out"
             checks.require(not ours, "overrides", word, problem)
-        for kind in ("tasks", "delays", "arms"):
+        for kind in ("tasks", "delays", "methods"):
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))
-        arms = self.chosen("arms")
-        trained = [n for n, a in arms.items() if not (a.policy_of or a.untrained)]
-        for name, arm in arms.items():
+        methods = self.chosen("methods")
+        trained = [n for n, a in methods.items() if not (a.policy_of or a.untrained)]
+        for name, method in methods.items():
             for kind in ("policy_of", "starts_from", "teacher"):
-                if getattr(arm, kind) is not None:
-                    checks.one_of(f"experiment.arms.{name}.{kind}", getattr(arm, kind), trained)
+                if getattr(method, kind) is not None:
+                    checks.one_of(f"experiment.methods.{name}.{kind}", getattr(method, kind), trained)
 
     def chosen(self, kind: str) -> dict[str, Any]:
-        """The experiment's tasks, delays or arms (``kind``) that are asked for, by name."""
+        """The experiment's tasks, delays or methods (``kind``) that are asked for, by name."""
         every, only = getattr(self.experiment, kind), getattr(self, kind)
         return {name: every[name] for name in every if only is None or name in only}
 

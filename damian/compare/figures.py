@@ -1,4 +1,4 @@
-"""Figures of a comparison: learning curves, and J_norm of each arm."""
+"""Figures of a comparison: learning curves, and J_norm of each method."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from damian.common.plotting import COLOURS, STYLE
-from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Arm, Comparison
+from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method
 from damian.compare.statistics import Floats, bootstrap
 from damian.runs.run_folder import RANDOM, SCRIPT
 
@@ -26,8 +26,8 @@ LABELS = {
     "perceived_steps": "steps per episode, perceived",
 }
 """Axis labels of the measures in training: in hindsight, from late data, or as the server perceived them."""
-ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
-"""Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
+METHOD_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
+"""Colours of methods: after the usual ones, six of Paul Tol's muted ones."""
 _POINTS = 200
 """Number of points of a learning curve."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
@@ -39,7 +39,7 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
 
     There is one of the return and, where a task can succeed, of success rate and steps. A curve is the mean
     over seeds, with its 95 % band. Dashed lines: the random policy; dash-dotted: the undelayed script;
-    dotted: arms that train nothing.
+    dotted: methods that train nothing.
     """
     succeeds = comparison.points["perceived_success_rate"].notna().any()
     panels = [
@@ -53,14 +53,14 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
-    """Draw J_norm of each arm under each delay, with 95 % intervals, in a panel for each task with any."""
+    """Draw J_norm of each method under each delay, with 95 % intervals, in a panel for each task with any."""
     known = comparison.table.dropna(subset="J_norm")
-    arms = [name for name, arm in comparison.arms.items() if arm.delayed]
-    styles = {name: look(comparison.arms, name) | {"linestyle": ""} for name in arms}
+    methods = [name for name, method in comparison.methods.items() if method.delayed]
+    styles = {name: look(comparison.methods, name) | {"linestyle": ""} for name in methods}
 
     def panel(axis: Axes, task: str) -> None:
         lines = known[known["task"] == task]
-        draw_groups(axis, lines, ("delay", "arm", "J_norm"), comparison.delays(task), styles, spread=0.7)
+        draw_groups(axis, lines, ("delay", "method", "J_norm"), comparison.delays(task), styles, spread=0.7)
         title = task.replace(HELD_OUT_MARK, ", held-out ")
         axis.set(title=title, xlabel="delay", ylabel="J_norm (dashed: undelayed 1, random 0)")
         for level in (0, 1):
@@ -93,17 +93,17 @@ def draw_groups(
     axis.set_xlim(-0.5, max(len(order), 1) - 0.5)
 
 
-def look(arms: Mapping[str, Arm], arm: str) -> dict[str, Any]:
-    """Style of an arm by its place among all; dotted lines are of arms that train nothing."""
-    trains = arms[arm].policy_of is None and not arms[arm].untrained
-    return style_of([*arms].index(arm)) | {"linestyle": "-" if trains else ":"}
+def look(methods: Mapping[str, Method], method: str) -> dict[str, Any]:
+    """Style of a method by its place among all; dotted lines are of methods that train nothing."""
+    trains = methods[method].policy_of is None and not methods[method].untrained
+    return style_of([*methods].index(method)) | {"linestyle": "-" if trains else ":"}
 
 
 def style_of(number: int) -> dict[str, Any]:
     """Colour, and a marker and a width, which tell from others of this colour."""
-    again, colour = divmod(number, len(ARM_COLOURS))
+    again, colour = divmod(number, len(METHOD_COLOURS))
     return {
-        "color": ARM_COLOURS[colour],
+        "color": METHOD_COLOURS[colour],
         "marker": "os^D"[again % 4],
         "linewidth": (1.2, 2.0, 0.6)[again % 3],
     }
@@ -137,15 +137,15 @@ def save(
 
 
 def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, str]) -> None:
-    """Draw a measure of all arms in a task under a delay."""
+    """Draw a measure of all methods in a task under a delay."""
     task, delay, measure = content
     flown = "return" if measure == "hindsight_return" else measure  # of an evaluation, which knows the truth
     axis.set(xlabel="environment steps", ylabel=LABELS[measure], title=f"{task}, delay {delay}")
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-    table = comparison.table.set_index(["task", "delay", "arm", "policy"])[flown]
-    for name, arm in comparison.arms.items():
-        run = (task, delay if arm.delayed else NOT_LATE, name)
-        style: dict[str, Any] = look(comparison.arms, name) | {"marker": "", "label": name}
+    table = comparison.table.set_index(["task", "delay", "method", "policy"])[flown]
+    for name, method in comparison.methods.items():
+        run = (task, delay if method.delayed else NOT_LATE, name)
+        style: dict[str, Any] = look(comparison.methods, name) | {"marker": "", "label": name}
         if run in comparison.curves:
             place, values = curve(comparison.curves[run], measure)
             mean, low, high = bootstrap(lambda drawn: drawn.mean(-1), values, draws=500)

@@ -1,4 +1,4 @@
-"""Report of a comparison as Markdown: the tables of all arms, and the time that the runs took."""
+"""Report of a comparison as Markdown: the tables of all methods, and the time that the runs took."""
 
 from collections.abc import Sequence
 
@@ -41,8 +41,8 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
 def _table(lines: pd.DataFrame) -> str:
     rows = []
     for line in lines.to_dict("records"):
-        undelayed = " (undelayed)" if line["delay"] == NOT_LATE and line["arm"] in SCRIPTED else ""
-        labels = (line["arm"] + undelayed, line["regime"], line["policy"], line["seeds"])
+        undelayed = " (undelayed)" if line["delay"] == NOT_LATE and line["method"] in SCRIPTED else ""
+        labels = (line["method"] + undelayed, line["regime"], line["policy"], line["seeds"])
         measured, compared = ([shown(line, name) for name in names] for names in (MEASURED, COMPARED))
         rows.append([*labels, *measured, line["compared_seeds"] or "-", *compared])
     measured = [name.replace("_", " ") for name in MEASURED]
@@ -51,22 +51,22 @@ def _table(lines: pd.DataFrame) -> str:
 
 
 def _steps(comparison: Comparison, task: str, delay: str) -> list[str]:
-    """Table of the environment steps in which arms reach the final training return of the best naive arm."""
+    """Table of the steps in which methods reach the final training return of the best naive one."""
     found = {}
-    for arm, of_arm in comparison.arms.items():
-        runs = comparison.curves.get((task, delay if of_arm.delayed else NOT_LATE, arm))
+    for method, of_method in comparison.methods.items():
+        runs = comparison.curves.get((task, delay if of_method.delayed else NOT_LATE, method))
         if runs is not None:
             steps, values = curve(runs, "hindsight_return")
             tenth = len(steps) // 10
-            found[arm] = steps[tenth - 1 :], sliding_window_view(values, tenth, axis=0).mean(-1)
-    ends = {arm: found[arm][1][-1].mean() for arm in found if comparison.arms[arm].naive}
+            found[method] = steps[tenth - 1 :], sliding_window_view(values, tenth, axis=0).mean(-1)
+    ends = {method: found[method][1][-1].mean() for method in found if comparison.methods[method].naive}
     if not ends:
         return []
     best, level = max(ends.items(), key=lambda end: end[1])
     rows = []
-    for arm, (steps, values) in found.items():
+    for method, (steps, values) in found.items():
         reached = [min(steps[run >= level], default=np.inf) for run in (values.mean(-1), *values.T)]
         numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
-        rows.append((arm, *(number.replace("inf", "never") for number in numbers)))
+        rows.append((method, *(number.replace("inf", "never") for number in numbers)))
     title = f"Steps to the final training return (in hindsight, mean over a tenth) of *{best}*, {level:.1f}:"
     return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]

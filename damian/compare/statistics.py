@@ -23,7 +23,7 @@ freedom, as the published tables have it)."""
 def normalised(score: Floats, undelayed: Floats, random: Floats) -> Floats:
     """Normalised score (J_norm), ``(J - J_random) / (J_undelayed - J_random)``.
 
-    It is nan where the undelayed arm does not beat random. All arguments broadcast against each other.
+    It is nan where the undelayed method does not beat random. All arguments broadcast against each other.
     """
     span = np.asarray(undelayed - random, dtype=float)
     return (score - random) / np.where(span > 0, span, np.nan)
@@ -32,7 +32,7 @@ def normalised(score: Floats, undelayed: Floats, random: Floats) -> Floats:
 def recovery(scores: Floats, least: float = LEAST_GAP) -> Floats:
     """Share of the delay's cost that a method wins back, ``(aware - naive) / (undelayed - naive)``.
 
-    Scores are [*, arms, seeds], of undelayed, random, naive arms, and the aware one, to [*]; all of them are
+    Scores are [*, methods, seeds], of undelayed, random, naive methods, and the aware one, to [*]; all are
     means over seeds, and naive is the best. It is nan where undelayed - naive is not positive or less than
     ``least`` of undelayed - random, or where undelayed does not beat random.
     """
@@ -44,7 +44,7 @@ def recovery(scores: Floats, least: float = LEAST_GAP) -> Floats:
 
 
 def resampled(scores: Floats, draws: int) -> Floats:
-    """Draw seeds with replacement, the same for all arms, [*, arms, seeds] to [draws, *, arms, seeds]."""
+    """Draw seeds with replacement, the same for all, [*, methods, seeds] to [draws, *, methods, seeds]."""
     n_seeds = scores.shape[-1]
     drawn = np.random.default_rng(0).integers(n_seeds, size=(draws, n_seeds))
     return np.moveaxis(scores[..., drawn], -2, 0)
@@ -98,8 +98,8 @@ def bootstrap(
     correction for bias. With fewer than ``FEWEST`` seeds both ends are nan.
 
     Args:
-        statistic: function from scores [*, arms, seeds] to [*, ...], for any leading dimensions *.
-        scores: scores by seed, [arms, seeds].
+        statistic: function from scores [*, methods, seeds] to [*, ...], for any leading dimensions *.
+        scores: scores by seed, [methods, seeds].
         draws: number of resamples.
     """
     value, n_seeds = np.asarray(statistic(scores), dtype=float), scores.shape[-1]

@@ -84,7 +84,7 @@ def save_results(
 
 def read_results(path: Path) -> pd.DataFrame:
     """Evaluations as a run or a comparison has written them, one in a row."""
-    return read_csv(path, text=("task", "delay", "arm", "regime", "policy"))
+    return read_csv(path, text=("task", "delay", "method", "regime", "policy"))
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:

@@ -124,8 +124,8 @@ class RewardConfig(RewardWeights):
     desired_distance_spotting: float = setting(0.1, "D_ss of R8^s, in the same unit.", low=0, high=2)
     detection: str = setting(
         "reports",
-        "What counts as spotting: what UAVs report, or the truth (regime R1), which matters with misses and "
-        "false alarms.",
+        "What counts as spotting: what UAVs report, or the truth, which only a simulator knows; with misses "
+        "and false alarms they differ.",
         choices=("reports", "truth"),
     )
     bonus: float = setting(0.0, "Added to the reward of every UAV on success.")

@@ -137,7 +137,7 @@ def delayed(
     return env.compile() if mode == "compiled" else env
 
 
-def arms(
+def methods(
     presets: Scenarios, worlds: int, kinds: tuple[str, ...], modes: tuple[str, ...]
 ) -> dict[str, EnvBase]:
     """Environments of each scenario with each kind of delay, in each mode."""
@@ -177,7 +177,7 @@ def policy_for(env: EnvBase) -> torch.nn.Module:
 def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE, WHOLE)) -> str:
     """Speed beside VMAS, through rollouts and collectors; the figure is written to runs/bench.png."""
     others = rivals(sizes.worlds)
-    envs = others | arms(presets, sizes.worlds, kinds, sizes.modes)
+    envs = others | methods(presets, sizes.worlds, kinds, sizes.modes)
     rolled = rollout_times(envs, sizes.steps, sizes.repeats)
     pairs = {name: (env, policy_for(env)) for name, env in envs.items()}
     collected = collector_times(pairs, sizes.batch, sizes.repeats)

@@ -1,7 +1,7 @@
 """Time of collecting, back-updating and optimising in a training iteration, beside TorchRL's MAPPO on VMAS.
 
-The training part of ``bench.py``. All arms have the same batch size, number of epochs and layer widths. They
-take turns, iteration by iteration, so that a busy machine slows all of them.
+The training part of ``bench.py``. All methods have the same batch size, number of epochs and layer widths.
+They take turns, iteration by iteration, so that a busy machine slows all of them.
 """
 
 import importlib.util
@@ -36,7 +36,7 @@ WIDTHS = {"2 x 64": [64, 64], "2 x 256": [256, 256]}
 """Layer widths of all networks, by name."""
 UNDELAYED, AWARE = "scenario=paper/usecase2", "scenario=paper/usecase2 delay=paper aware=both"
 COMPILED, SHARED = "compile=true", "compile=true model.shared_value=true"
-ARMS = (UNDELAYED, f"{UNDELAYED} {COMPILED}", f"{UNDELAYED} {SHARED}", AWARE, f"{AWARE} {SHARED}")
+METHODS = (UNDELAYED, f"{UNDELAYED} {COMPILED}", f"{UNDELAYED} {SHARED}", AWARE, f"{AWARE} {SHARED}")
 """Overrides of ``damian train``, separated by spaces."""
 HEADER = ("training", "frames/s", "collecting [ms]", "back-updating [ms]", "optimising [ms]")
 HEADER += ("back-updating's share", "times TorchRL and VMAS")
@@ -52,16 +52,16 @@ class Seconds(NamedTuple):
 
 
 def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
-    """Rows under ``HEADER``: medians of ``repeats`` iterations of each arm, with batches [worlds, steps]."""
+    """Rows under ``HEADER``: medians of ``repeats`` iterations of each, with batches [worlds, steps]."""
     found = []
     for width, hidden in WIDTHS.items():
-        arms = {words: damian(arm_config(words, hidden, worlds, steps)) for words in ARMS}
+        methods = {words: damian(method_config(words, hidden, worlds, steps)) for words in METHODS}
         if importlib.util.find_spec("vmas"):
-            config = arm_config(UNDELAYED, hidden, worlds, steps)
-            arms |= {name: rival(config, together) for name, together in RIVALS.items()}
-        times: dict[str, list[Seconds]] = {name: [] for name in arms}
+            config = method_config(UNDELAYED, hidden, worlds, steps)
+            methods |= {name: rival(config, together) for name, together in RIVALS.items()}
+        times: dict[str, list[Seconds]] = {name: [] for name in methods}
         for _ in tqdm(range(WARM_UP + repeats), f"training, {width}", leave=False):
-            for name, iterations in arms.items():
+            for name, iterations in methods.items():
                 times[name].append(next(iterations))
         parts = {name: zip(*measured[WARM_UP:], strict=True) for name, measured in times.items()}
         medians = {name: Seconds(*map(statistics.median, each)) for name, each in parts.items()}
@@ -84,8 +84,8 @@ def rows(medians: dict[str, Seconds], frames: int) -> list[tuple[str, ...]]:
     ]
 
 
-def arm_config(words: str, hidden: Sequence[int], worlds: int, steps: int) -> TrainConfig:
-    """The configuration of an arm: overrides, layer widths, and B and T of a batch."""
+def method_config(words: str, hidden: Sequence[int], worlds: int, steps: int) -> TrainConfig:
+    """The configuration of a method: overrides, layer widths, and B and T of a batch."""
     batch = [f"worlds={worlds}", f"learner.steps={steps}", "learner.epochs=4", "learner.minibatches=4"]
     return composed_config(*words.split(), f"model.hidden={list(hidden)}", *batch)
 

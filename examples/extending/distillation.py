@@ -1,4 +1,6 @@
-"""Your own learner: a student with late observations imitates a teacher without (regime R2).
+"""Your own learner: a student with late observations imitates a teacher without.
+
+The teacher needs a simulator.
 
     damian train scenario=tracking hydra.run.dir=runs/teacher
     cd examples/extending

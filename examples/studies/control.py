@@ -1,20 +1,20 @@
 """Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed late.
 
     python examples/studies/control.py --jobs 2                  (Pendulum-v1; an hour, two free cores)
-    python examples/studies/control.py --arms history history+bpql         (these arms only)
+    python examples/studies/control.py --methods history history+bpql         (these methods only)
     python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out runs/control_random
     python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 --hidden 256 \\
         --lr 3e-4 --episodes 10 --out runs/cheetah               (pip install "gymnasium[mujoco]"; 50 minutes)
     ... --shortest 1 --out runs/cheetah_random                   (delays are drawn from 1 to 9 steps)
 
-These arms are trained for each seed: undelayed; naive, whose observations are late; and three that also
+These methods are trained for each seed: undelayed; naive, whose observations are late; and three that also
 observe the agent's latest actions: history, with the age of the observation if that varies (an augmented
 state); buffer, which holds each observation until it is as old as the longest delay (a jitter buffer); and
 timeline, with all that has arrived of the latest steps, by when it was true (``ObservationTimeline``), in
 place of the newest observation. With bpql the actor is the same, but the critics read only the state, or the
 timeline, as it is known once it has arrived (``BackupdateStorage``). The undelayed policy is also evaluated
-under the delay. The folder gets the mean returns as results.md and results.csv, and a JSON file for each arm
-and seed, with the learning curve.
+under the delay. The folder gets the mean returns as results.md and results.csv, and a JSON file for each
+method and seed, with the learning curve.
 """
 
 import csv
@@ -61,8 +61,8 @@ from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeli
 from damian.transforms.base import Correction
 from damian.transforms.entries import Entries
 
-AWARE = ("history", "buffer", "timeline")  # arms that observe their latest actions
-ARMS = ("undelayed", "naive", *AWARE, *(f"{arm}+bpql" for arm in AWARE))
+AWARE = ("history", "buffer", "timeline")  # methods that observe their latest actions
+METHODS = ("undelayed", "naive", *AWARE, *(f"{method}+bpql" for method in AWARE))
 RANDOM_STEPS = 1000  # steps with random actions before the first update
 CURVE = 10  # points of a learning curve
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
@@ -200,18 +200,18 @@ def evaluate_under(task: Task, actor: nn.Module, episodes: int) -> float:
     return (rollout[next_key(keys.REWARD)] * (ended == 0)).sum(1).mean().item()
 
 
-def run_arm(arm: str, seed: int, args: Namespace) -> dict[str, float]:
-    """Train and evaluate an arm; returns its mean returns by the delay of the evaluation and by step."""
+def run_method(method: str, seed: int, args: Namespace) -> dict[str, float]:
+    """Train and evaluate a method; returns its mean returns by the delay of the evaluation and by step."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     shortest = args.delay if args.shortest is None else args.shortest
-    seen = arm.removesuffix("+bpql")
+    seen = method.removesuffix("+bpql")
     history, slots = args.delay * (seen in AWARE), (args.delay + 1) * (seen == "timeline")
     late = Task(args.env, shortest, args.delay, history, slots, seen == "buffer")
-    task = Task(args.env) if arm == "undelayed" else late
+    task = Task(args.env) if method == "undelayed" else late
     env = make_env(task)
     set_seed(env, seed)
-    learner = make_learner(env, arm != seen, args.steps, args.delay, args.hidden, args.lr)
+    learner = make_learner(env, method != seen, args.steps, args.delay, args.hidden, args.lr)
     found = {}
 
     def watch(step: int) -> None:
@@ -219,21 +219,21 @@ def run_arm(arm: str, seed: int, args: Namespace) -> dict[str, float]:
             with torch.random.fork_rng():
                 found[f"after {step}"] = evaluate_under(task, learner.actor, args.episodes)
 
-    with tqdm(total=args.steps, desc=f"seed {seed} {arm}") as bar:
+    with tqdm(total=args.steps, desc=f"seed {seed} {method}") as bar:
         train(env, learner, args.steps, bar, watch)
     name = f"{shortest} to {args.delay}" if shortest < args.delay else str(args.delay)
-    flown = {"0": task, name: late} if arm == "undelayed" else {name: late}
+    flown = {"0": task, name: late} if method == "undelayed" else {name: late}
     return found | {name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()}
 
 
 def table(results: Results, args: Namespace) -> str:
     """Write the results as results.csv and results.md; returns the latter's text."""
-    rows = [["arm", "delay", "mean", *(f"seed {seed}" for seed in args.seeds)]]
-    for arm in args.arms:
-        found = [results[arm, seed] for seed in args.seeds]
+    rows = [["method", "delay", "mean", *(f"seed {seed}" for seed in args.seeds)]]
+    for method in args.methods:
+        found = [results[method, seed] for seed in args.seeds]
         for name in found[0]:
             values = [returns[name] for returns in found]
-            rows.append([arm, name, *(f"{value:.0f}" for value in (statistics.mean(values), *values))])
+            rows.append([method, name, *(f"{value:.0f}" for value in (statistics.mean(values), *values))])
     with (args.out / "results.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows(rows)
     title = f"# {args.env}, SAC, {args.steps} steps: return, mean of {args.episodes} episodes"
@@ -244,16 +244,16 @@ def table(results: Results, args: Namespace) -> str:
 
 def main(words: list[str] | None = None) -> None:
     """Train, evaluate and print the table."""
-    options = parser("SAC on a control task with late observations.", ARMS, "runs/control")
+    options = parser("SAC on a control task with late observations.", METHODS, "runs/control")
     options.add_argument("--env", default="Pendulum-v1", help="task of Gymnasium with continuous actions")
-    options.add_argument("--steps", type=int, default=20_000, help="training steps of each arm")
+    options.add_argument("--steps", type=int, default=20_000, help="training steps of each method")
     options.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
     options.add_argument("--shortest", type=int, help="delays are drawn, from this to --delay [steps]")
     options.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
     options.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
     options.add_argument("--lr", type=float, default=1e-3, help="learning rate of Adam")
     args = options.parse_args(words)
-    print(table(carried_out(args, run_arm), args))
+    print(table(carried_out(args, run_method), args))
 
 
 if __name__ == "__main__":

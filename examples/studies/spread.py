@@ -1,15 +1,15 @@
 """Compare with a published table: MAPPO in PettingZoo's simple_spread_v3, with late observations.
 
     python examples/studies/spread.py                          (an hour on one core; --jobs 2 takes two)
-    python examples/studies/spread.py --arms undelayed naive   (these arms only)
+    python examples/studies/spread.py --methods undelayed naive   (these methods only)
     python examples/studies/spread.py --delay 6 12 --out runs/spread_6_12
     python examples/studies/spread.py --seeds 0 --frames 100000 --out runs/spread0
 
 Three agents cover three landmarks in episodes of 25 steps; the return is the sum of all agents' rewards. An
 agent knows its own velocity and position at once; it sees each landmark and each other agent late, and begins
-with what it sees at the beginning. Arms: random actions; undelayed, trained without delay; and, trained while
-each of these messages takes 3 to 9 steps, naive and those whose actors also observe the ages of what they see
-and their own latest actions. Of these
+with what it sees at the beginning. Methods: random actions; undelayed, trained without delay; and, trained
+while each of these messages takes 3 to 9 steps, naive and those whose actors also observe the ages of what
+they see and their own latest actions. Of these
 
 - history shows what is seen as it was seen, as naive does;
 - registered moves it into the agent's present frame, by the agent's own way since then, which it knows;
@@ -21,8 +21,9 @@ With backupdate the critic learns from what has arrived since (``BackupdateStora
 acts as undelayed does, but is flown late with what is registered. Each policy is evaluated under several
 delays, in episodes that begin alike for all.
 
-The folder gets results.csv, a row for each arm, delay and seed, the means as table.md beside those published
-(Fu et al. 2025, "Rainbow Delay Compensation", arXiv 2505.03586), and a JSON file for each arm and seed.
+The folder gets results.csv, a row for each method, delay and seed, the means as table.md beside those
+published (Fu et al. 2025, "Rainbow Delay Compensation", arXiv 2505.03586), and a JSON file for each
+method and seed.
 """
 
 import csv
@@ -64,7 +65,7 @@ EVALUATED: tuple[Delays, ...] = (*((d, d) for d in (0, 3, 6, 9, 12)), (3, 9), (6
 """The delays under which policies are evaluated, beside those of the training."""
 
 
-class Arm(NamedTuple):
+class Method(NamedTuple):
     """What a policy is trained with."""
 
     delayed: bool = True
@@ -81,22 +82,22 @@ class Arm(NamedTuple):
     """Whether the critic learns from what has arrived since."""
 
 
-ARMS: dict[str, Arm | None] = {
+METHODS: dict[str, Method | None] = {
     "random": None,
-    "undelayed": Arm(delayed=False),
-    "undelayed+registered": Arm(delayed=False, registered=True),
-    "naive": Arm(),
-    "backupdate": Arm(backupdate=True),
-    "history+backupdate": Arm(history=True, backupdate=True),
-    "registered": Arm(history=True, registered=True),
-    "registered+backupdate": Arm(history=True, registered=True, backupdate=True),
-    "buffer": Arm(history=True, registered=True, buffer=True),
-    "buffer+backupdate": Arm(history=True, registered=True, buffer=True, backupdate=True),
-    "timeline": Arm(history=True, timeline=True),
-    "timeline+backupdate": Arm(history=True, timeline=True, backupdate=True),
+    "undelayed": Method(delayed=False),
+    "undelayed+registered": Method(delayed=False, registered=True),
+    "naive": Method(),
+    "backupdate": Method(backupdate=True),
+    "history+backupdate": Method(history=True, backupdate=True),
+    "registered": Method(history=True, registered=True),
+    "registered+backupdate": Method(history=True, registered=True, backupdate=True),
+    "buffer": Method(history=True, registered=True, buffer=True),
+    "buffer+backupdate": Method(history=True, registered=True, buffer=True, backupdate=True),
+    "timeline": Method(history=True, timeline=True),
+    "timeline+backupdate": Method(history=True, timeline=True, backupdate=True),
 }
 PUBLISHED = {"undelayed": (-33.1, -37.6, -48.8, -59.9, -67.2), "random": (-82.4,)}
-"""Published returns by arm, under the first of the delays that are evaluated."""
+"""Published returns by method, under the first of the delays that are evaluated."""
 
 WORLDS = 256  # an update learns from one episode of each
 MODEL = ModelConfig(hidden=[64, 64])
@@ -108,17 +109,17 @@ ACTING = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": Exploration
 """How an evaluated policy acts: by its most likely action, or by one that is drawn from it."""
 
 
-def make_env(arm: Arm, worlds: int, delay: Delays, longest: int) -> TransformedEnv:
-    """The environment of an arm, under a delay; ``longest`` is the longest one in training."""
-    low, high = (max(steps, longest) for steps in delay) if arm.buffer else delay
-    slots = SLOTS if arm.timeline else 0
-    late = {"aware": arm.history, "registered": arm.registered, "slots": slots}
+def make_env(method: Method, worlds: int, delay: Delays, longest: int) -> TransformedEnv:
+    """The environment of a method, under a delay; ``longest`` is the longest one in training."""
+    low, high = (max(steps, longest) for steps in delay) if method.buffer else delay
+    slots = SLOTS if method.timeline else 0
+    late = {"aware": method.history, "registered": method.registered, "slots": slots}
     return late_spread(worlds, Uniform(low, high), longest, **late)
 
 
-def recompute(arm: Arm, steps: TensorDictBase, blocks: Tensor) -> Entries:
+def recompute(method: Method, steps: TensorDictBase, blocks: Tensor) -> Entries:
     """What critics would have observed after steps [T, B], had these blocks [T, B, K, 2] arrived at once."""
-    found = observed(steps[next_key(KINEMATICS)], blocks, arm.registered)
+    found = observed(steps[next_key(KINEMATICS)], blocks, method.registered)
     return {next_key(keys.GLOBAL_OBSERVATION): found}
 
 
@@ -149,10 +150,10 @@ def orthogonal(network: Network, gain: float) -> Network:
     return network
 
 
-def make_learner(env: TransformedEnv, arm: Arm, longest: int) -> Mappo:
-    """The learner that also trains UAVs: MAPPO, with back-updating if the arm says so."""
+def make_learner(env: TransformedEnv, method: Method, longest: int) -> Mappo:
+    """The learner that also trains UAVs: MAPPO, with back-updating if the method says so."""
     config = OrthogonalMappo(**LEARNER)
-    late = {"backupdate": arm.backupdate, "settle": arm.backupdate}
+    late = {"backupdate": method.backupdate, "settle": method.backupdate}
     setup = LearningSetup(MODEL, WORLDS, HORIZON, HORIZON, longest, **late)
     size = config.buffer_size(setup)
     if size is None:
@@ -161,16 +162,16 @@ def make_learner(env: TransformedEnv, arm: Arm, longest: int) -> Mappo:
     corrections += [Correction(with_timelines)] * len(corrections)
     size += WORLDS * sum(correction.lookback for correction in corrections)
     names = {"message_key": SEEN, "received_key": HELD, "delay_key": DELAYS, "age_key": AGES}
-    storage = BackupdateStorage(size, partial(recompute, arm), longest, corrections=corrections, **names)
+    storage = BackupdateStorage(size, partial(recompute, method), longest, corrections=corrections, **names)
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
 
-def train(arm: Arm, seed: int, frames: int, delay: Delays, bar: tqdm) -> nn.Module:
+def train(method: Method, seed: int, frames: int, delay: Delays, bar: tqdm) -> nn.Module:
     """Train for at least ``frames`` environment steps; returns the policy."""
     longest = delay[1]
-    env = make_env(arm, WORLDS, delay if arm.delayed else NONE, longest)
+    env = make_env(method, WORLDS, delay if method.delayed else NONE, longest)
     set_seed(env, seed)
-    learner, done = make_learner(env, arm, longest), 0
+    learner, done = make_learner(env, method, longest), 0
     collector = Collector(
         env,
         learner.actor,
@@ -198,28 +199,28 @@ def returns_in(batch: TensorDictBase) -> float:
 
 @torch.no_grad()
 def evaluate(
-    arm: Arm, actor: nn.Module | None, delay: Delays, longest: int, episodes: int
+    method: Method, actor: nn.Module | None, delay: Delays, longest: int, episodes: int
 ) -> dict[str, float]:
     """Mean returns over episodes that have the same initial conditions at every call."""
     returns = {}
     for name, how in ACTING.items():
-        env = make_env(arm, episodes, delay, longest)
+        env = make_env(method, episodes, delay, longest)
         set_seed(env, EVALUATION_SEED)
         with set_exploration_type(how):
             returns[name] = returns_in(env.rollout(HORIZON, actor, break_when_any_done=False))
     return returns
 
 
-def run_arm(name: str, seed: int, args: Namespace) -> dict[str, dict[str, float]]:
-    """Train and evaluate an arm; returns its mean returns by delay, and by how the policy acts."""
+def run_method(name: str, seed: int, args: Namespace) -> dict[str, dict[str, float]]:
+    """Train and evaluate a method; returns its mean returns by delay, and by how the policy acts."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    arm, actor, (low, high) = ARMS[name], None, args.delay
-    if arm:
+    method, actor, (low, high) = METHODS[name], None, args.delay
+    if method:
         with tqdm(total=args.frames, desc=f"seed {seed} {name}") as bar:
-            actor = train(arm, seed, args.frames, (low, high), bar)
+            actor = train(method, seed, args.frames, (low, high), bar)
     return {
-        named(delay): evaluate(arm or Arm(), actor, delay, high, args.episodes)
+        named(delay): evaluate(method or Method(), actor, delay, high, args.episodes)
         for delay in dict.fromkeys((*EVALUATED, (low, high)))
     }
 
@@ -234,39 +235,41 @@ def table(results: Results, args: Namespace) -> str:
     """Write the results as results.csv and table.md; returns the latter's text."""
     with (args.out / "results.csv").open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["arm", "delay", "seed", *ACTING])
-        for (arm, seed), returns in results.items():
+        rows.writerow(["method", "delay", "seed", *ACTING])
+        for (method, seed), returns in results.items():
             for delay, found in returns.items():
-                rows.writerow([arm, delay, seed, *(f"{found[name]:.2f}" for name in ACTING)])
+                rows.writerow([method, delay, seed, *(f"{found[name]:.2f}" for name in ACTING)])
     trained, flown = named(args.delay), list(next(iter(results.values())))
     parts = [
         f"# simple_spread_v3, MAPPO, {args.frames} steps, delays of {trained}: returns",
         f"Mean of {args.episodes} episodes and {len(args.seeds)} seeds (smallest and largest of a seed), "
-        f"by delay [steps]. Recovery under {trained}: (arm - base) / (undelayed without delay - base); the "
-        "base is the best arm without backupdate or, as published, undelayed flown late.",
+        f"by delay [steps]. Recovery under {trained}: (method - base) / (undelayed without delay - base); "
+        "the base is the best method without backupdate or, as published, undelayed flown late.",
     ]
     for how in ACTING:
 
-        def mean(arm: str, delay: str = trained, how: str = how) -> float:
-            return statistics.mean(results[arm, seed][delay][how] for seed in args.seeds)
+        def mean(method: str, delay: str = trained, how: str = how) -> float:
+            return statistics.mean(results[method, seed][delay][how] for seed in args.seeds)
 
-        late = [name for name in args.arms if (arm := ARMS[name]) and arm.delayed]
+        late = [name for name in args.methods if (method := METHODS[name]) and method.delayed]
         naive = [mean(name) for name in late if "backupdate" not in name]
-        known = "undelayed" in args.arms
+        known = "undelayed" in args.methods
         bases = [max(naive) if naive and known else None, mean("undelayed") if known else None]
         lines = []
-        for arm in args.arms:
-            found = [[results[arm, s][delay][how] for s in args.seeds] for delay in flown]
+        for method in args.methods:
+            found = [[results[method, s][delay][how] for s in args.seeds] for delay in flown]
             cells = [f"{statistics.mean(x):.1f} ({min(x):.1f}, {max(x):.1f})" for x in found]
             recovered = [
-                f"{(mean(arm) - base) / (mean('undelayed', '0') - base):.2f}" if arm in late and base else ""
+                f"{(mean(method) - base) / (mean('undelayed', '0') - base):.2f}"
+                if method in late and base
+                else ""
                 for base in bases
             ]
-            lines.append([arm, *cells, *recovered])
+            lines.append([method, *cells, *recovered])
         width = len(flown) + len(bases)
-        for arm, returns in PUBLISHED.items():
-            lines.append([f"{arm}, published", *map(str, returns), *[""] * (width - len(returns))])
-        titles = ["arm", *flown, "recovery", "as published"]
+        for method, returns in PUBLISHED.items():
+            lines.append([f"{method}, published", *map(str, returns), *[""] * (width - len(returns))])
+        titles = ["method", *flown, "recovery", "as published"]
         parts += [f"## Actions: {how}", markdown_table(titles, lines)]
     text = "\n\n".join(parts) + "\n"
     (args.out / "table.md").write_text(text, encoding="utf-8")
@@ -275,7 +278,7 @@ def table(results: Results, args: Namespace) -> str:
 
 def main(words: list[str] | None = None) -> None:
     """Train, evaluate and print the table."""
-    options = parser("MAPPO in simple_spread_v3 with late observations.", list(ARMS), "runs/spread")
+    options = parser("MAPPO in simple_spread_v3 with late observations.", list(METHODS), "runs/spread")
     options.add_argument(
         "--delay",
         type=int,
@@ -284,10 +287,10 @@ def main(words: list[str] | None = None) -> None:
         metavar=("LOW", "HIGH"),
         help="delays in training [steps]",
     )
-    options.add_argument("--frames", type=int, default=1_000_000, help="training steps of each arm")
+    options.add_argument("--frames", type=int, default=1_000_000, help="training steps of each method")
     options.add_argument("--episodes", type=int, default=1000, help="episodes of each evaluation")
     args = options.parse_args(words)
-    print(table(carried_out(args, run_arm), args))
+    print(table(carried_out(args, run_method), args))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from damian.common import checks
 from damian.common.errors import InputError, RunError
 from damian.common.tables import write_csv
-from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, OF_ARM, RUN, Arm, regime
+from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, OF_METHOD, RUN, Method, regime
 from damian.compare.config import CompareConfig, HeldOut
 from damian.compare.figures import LABELS
 from damian.runs.metrics_log import read_metrics
@@ -43,11 +43,11 @@ LOG = "log.txt"
 
 @dataclass(frozen=True)
 class Run:
-    """One seed of an arm, for one task and delay."""
+    """One seed of a method, for one task and delay."""
 
     task: str
     delay: str
-    arm: str
+    method: str
     config: TrainConfig
     folder: Path
     trains: bool
@@ -77,9 +77,9 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
     for name, held_out in config.experiment.held_out.items():
         places += [(f"{t}{HELD_OUT_MARK}{name}", t, held_out) for t in tasks if _in(held_out.tasks, t)]
     for (place, task, held_out), (delay, words) in product(places, delays.items()):
-        for name, arm in config.chosen("arms").items():
-            fits = arm.delayed == (delay != NOT_LATE) and _in(arm.tasks, task)
-            if fits and _in(held_out.arms, name) and _in(held_out.delays, delay):
+        for name, method in config.chosen("methods").items():
+            fits = method.delayed == (delay != NOT_LATE) and _in(method.tasks, task)
+            if fits and _in(held_out.methods, name) and _in(held_out.delays, delay):
                 overrides = _replaced([*tasks[task], *words], held_out.overrides)
                 runs += _seeds(config, folder / place / delay / name, task, overrides)
     by_folder = {run.folder: run.config for run in runs}
@@ -88,7 +88,7 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
             try:
                 check_policy_fits(run.config, by_folder[Path(run.config.checkpoint)])
             except InputError as error:
-                raise InputError(f"{run.task}/{run.delay}/{run.arm}: {error}") from None
+                raise InputError(f"{run.task}/{run.delay}/{run.method}: {error}") from None
     succeeds = any(run.config.episode.success_share is not None for run in runs)
     should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
     checks.require(succeeds or "success" not in config.score, "score", config.score, should)
@@ -106,22 +106,22 @@ def _replaced(words: Sequence[str], by: Sequence[str]) -> list[str]:
 
 
 def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list[str]) -> Iterator[Run]:
-    """The runs of one task, delay and arm, which the folder names."""
+    """The runs of one task, delay and method, which the folder names."""
     task, delay, name = folder.parts[-3:]
-    arm, arms = config.experiment.arms[name], config.experiment.arms
+    method, methods = config.experiment.methods[name], config.experiment.methods
     away = task != trained_in  # a held-out task, where nothing is trained
-    flown = arm.policy_of or (name if away and not arm.untrained else None)
-    source = flown or arm.source
-    words = ["logger=csv", *overrides, *arm.overrides, *config.overrides]
+    flown = method.policy_of or (name if away and not method.untrained else None)
+    source = flown or method.source
+    words = ["logger=csv", *overrides, *method.overrides, *config.overrides]
     try:
         unseeded = _composed(*words)
-        late_by = [] if arm.delayed else late(unseeded)
+        late_by = [] if method.delayed else late(unseeded)
         if late_by and away:
-            return  # a held-out delay, under which the undelayed arm is not flown
-        should = "delays this arm, with which others are compared: put delays under experiment.delays"
+            return  # a held-out delay, under which the undelayed method is not flown
+        should = "delays this method, with which others are compared: put delays under experiment.delays"
         checks.require(not late_by, ", ".join(late_by), "its value", should)
-        if flown is None and not arm.untrained:
-            able = not arm.teacher or hasattr(unseeded.learner, "teacher")
+        if flown is None and not method.untrained:
+            able = not method.teacher or hasattr(unseeded.learner, "teacher")
             checks.require(able, "learner", unseeded.learner.name, "has no setting teacher")
             check_learning(unseeded)
     except InputError as error:
@@ -130,17 +130,17 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         policy, seed_folder = None, f"seed_{seed}"
         seeded = replace(unseeded, seed=seed, overrides=[*words, f"seed={seed}"])
         if source:
-            source_delay = delay if arms[source].delayed else NOT_LATE
+            source_delay = delay if methods[source].delayed else NOT_LATE
             policy = folder.parents[2] / trained_in / source_delay / source / seed_folder
-            if flown or arm.starts_from:
+            if flown or method.starts_from:
                 seeded = replace(seeded, checkpoint=str(policy))
             else:
                 seeded = replace(seeded, learner=replace(seeded.learner, teacher=str(policy)))
-        trains = not (arm.untrained or flown)
+        trains = not (method.untrained or flown)
         yield Run(task, delay, name, seeded, folder / seed_folder, trains, policy)
 
 
-_composed = cache(cli.settings)  # several arms differ only in whose policy they fly; Hydra takes 0.2 s
+_composed = cache(cli.settings)  # several methods differ only in whose policy they fly; Hydra takes 0.2 s
 
 
 def perform_all(runs: Sequence[Run], processes: int, train: Work, fly: Work) -> list[Run]:
@@ -216,9 +216,9 @@ class Results(NamedTuple):
 NO_RESULTS = Results(pd.DataFrame(columns=RUN), pd.DataFrame(columns=CURVE))
 
 
-def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
+def results_of(runs: Sequence[Run], methods: Mapping[str, Method]) -> Results:
     """The results of finished runs."""
-    found = [NO_RESULTS, *(_of_run(run, arms) for run in runs)]
+    found = [NO_RESULTS, *(_of_run(run, methods) for run in runs)]
     return Results(*map(_joined, zip(*found, strict=True)))
 
 
@@ -227,18 +227,18 @@ def _joined(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     return pd.concat([table for table in tables if len(table)] or [tables[0]], ignore_index=True)
 
 
-def _of_run(run: Run, arms: Mapping[str, Arm]) -> Results:
-    label = {"task": run.task, "delay": run.delay, "arm": run.arm, "seed": run.config.seed}
+def _of_run(run: Run, methods: Mapping[str, Method]) -> Results:
+    label = {"task": run.task, "delay": run.delay, "method": run.method, "seed": run.config.seed}
     rows, metrics = read_results(run.folder / RESULTS), read_metrics(run.folder)
     of_run = {
-        "regime": regime(arms, run.arm),
+        "regime": regime(methods, run.method),
         "frames": metrics["frames"].max() if len(metrics) else 0.0,
         "seconds": read_record(run.folder).get("wall_time_s", math.nan),
         "backupdated": fmean(metrics["backupdated"]) if "backupdated" in metrics else math.nan,
     }
     names = [*rows.columns]
     rows = rows.assign(**label, **of_run)[[*label, *of_run, *names]]
-    rows.loc[~rows["policy"].isin(OF_ARM[:2]), "backupdated"] = math.nan
+    rows.loc[~rows["policy"].isin(OF_METHOD[:2]), "backupdated"] = math.nan
     spread = np.linspace(0, len(metrics) - 1, min(len(metrics), MOST_POINTS)).round().astype(int)
     points = metrics.iloc[spread].reindex(columns=CURVE[len(RUN) :])
     points = points.map(lambda number: float(f"{number:.5g}")).assign(**label)[CURVE]

@@ -5,8 +5,8 @@ import importlib.util
 import bench
 import bench_training
 import pytest
-from bench import BARE, WHOLE, arms, delays, rivals, scenarios
-from bench_training import ARMS, HEADER, RIVALS, WIDTHS, training
+from bench import BARE, WHOLE, delays, methods, rivals, scenarios
+from bench_training import HEADER, METHODS, RIVALS, WIDTHS, training
 
 TINY = bench.Sizes(
     worlds=4,
@@ -33,11 +33,11 @@ def test_every_environment_of_the_delay_table_is_measured(presets):
 
 
 @pytest.mark.slow
-def test_the_comparison_has_a_row_for_each_arm_and_a_figure(presets, tmp_path, monkeypatch):
+def test_the_comparison_has_a_row_for_each_method_and_a_figure(presets, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
     text = bench.comparison(presets, TINY)
-    names = [*rivals(1), *arms(presets, 1, (BARE, WHOLE), ("eager",))]
+    names = [*rivals(1), *methods(presets, 1, (BARE, WHOLE), ("eager",))]
     assert [line.split(" | ")[0] for line in text.strip().splitlines()[4:]] == [f"| {name}" for name in names]
     assert (tmp_path / "runs" / "bench.png").exists()
 
@@ -46,10 +46,12 @@ def test_the_comparison_has_a_row_for_each_arm_and_a_figure(presets, tmp_path, m
 
 
 @pytest.mark.slow
-def test_every_arm_trains_and_has_a_row_for_each_width(monkeypatch):
+def test_every_method_trains_and_has_a_row_for_each_width(monkeypatch):
     rivals = RIVALS if importlib.util.find_spec("vmas") else ()
-    arms = [words for words in ARMS if "compile" not in words]
-    monkeypatch.setattr(bench_training, "ARMS", arms)
+    methods = [words for words in METHODS if "compile" not in words]
+    monkeypatch.setattr(bench_training, "METHODS", methods)
     table = training(worlds=2, steps=8, repeats=1)
-    assert [row[0] for row in table] == [f"{width}: {name}" for width in WIDTHS for name in [*arms, *rivals]]
+    assert [row[0] for row in table] == [
+        f"{width}: {name}" for width in WIDTHS for name in [*methods, *rivals]
+    ]
     assert {len(row) for row in table} == {len(HEADER)}

@@ -1,4 +1,4 @@
-"""Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables of them."""
+"""Comparisons of methods: pairs of seeds, J_norm, recovery, and the tables of them."""
 
 import numpy as np
 import pandas as pd
@@ -9,54 +9,63 @@ from damian.compare.comparison import (
     RANDOM,
     TRAINED,
     UNTRAINED,
-    Arm,
     Comparison,
+    Method,
     shown,
 )
 from damian.compare.report import markdown
 
 LIKELIEST = f"{TRAINED}, deterministic"
-ARMS = {
-    "best": Arm(delayed=False),
-    "blind": Arm(naive=True),
-    "flown": Arm(naive=True, policy_of="best", regime="R0"),
-    "aware": Arm(),
+METHODS = {
+    "best": Method(delayed=False),
+    "blind": Method(naive=True),
+    "flown": Method(naive=True, policy_of="best", simulator=False),
+    "aware": Method(),
 }
 
 
-def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = TRAINED) -> dict:
+def row(task: str, delay: str, method: str, seed: int, value: float, policy: str = TRAINED) -> dict:
     """A row of results in which every measure has the same value."""
-    labels = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
+    labels = {
+        "task": task,
+        "delay": delay,
+        "method": method,
+        "regime": "late data",
+        "seed": seed,
+        "policy": policy,
+    }
     return labels | {"frames": 400, "seconds": 36.0} | dict.fromkeys((*MEASURED, "episodes"), value)
 
 
 def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
-    """Rows of every arm, seed and policy, from the values of the arms by seed."""
+    """Rows of every method, seed and policy, from the values of the methods by seed."""
     return [
-        row(task, "none" if arm == "best" else delay, arm, seed, x, policy)
-        for arm, values in scores.items()
+        row(task, "none" if method == "best" else delay, method, seed, x, policy)
+        for method, values in scores.items()
         for seed, value in enumerate(values)
         for policy, x in ((TRAINED, value), (LIKELIEST, value), (RANDOM, random))
     ]
 
 
-def comparison(rows: list[dict], arms: dict[str, Arm] = ARMS, curves: list[tuple] = ()) -> Comparison:
-    columns = ["task", "delay", "arm", "seed", "frames", "hindsight_return", "perceived_success_rate"]
-    return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), arms)
+def comparison(
+    rows: list[dict], methods: dict[str, Method] = METHODS, curves: list[tuple] = ()
+) -> Comparison:
+    columns = ["task", "delay", "method", "seed", "frames", "hindsight_return", "perceived_success_rate"]
+    return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), methods)
 
 
 def compared(found: Comparison) -> dict[str, dict]:
-    """Lines of the delayed arms of a table by arm."""
+    """Lines of the delayed methods of a table by method."""
     table = found.table
-    lines = table[(table["delay"] != "none") & (table["policy"] == TRAINED) | (table["arm"] == "prior")]
-    return {line["arm"]: line for line in lines.to_dict("records")}
+    lines = table[(table["delay"] != "none") & (table["policy"] == TRAINED) | (table["method"] == "prior")]
+    return {line["method"]: line for line in lines.to_dict("records")}
 
 
 THREE = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3], "flown": [5.0, 3, 4], "aware": [6.0, 9, 7]}
 SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
 
 
-def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
+def test_recovery_counts_from_the_stronger_naive_method_by_means_over_seeds():
     lines = compared(comparison(rows_of("t", "late", SCORES)))
     aware = lines["aware"]
     assert aware["compared_seeds"] == 2
@@ -70,60 +79,66 @@ def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
     ).all()
 
 
-def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
+def test_a_method_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
     rows = rows_of("t", "late", THREE)
     alone = compared(comparison(rows))
-    lines = compared(comparison([row for row in rows if (row["arm"], row["seed"]) != ("aware", 2)]))
+    lines = compared(comparison([row for row in rows if (row["method"], row["seed"]) != ("aware", 2)]))
     assert lines["aware"]["compared_seeds"] == 2
-    assert str(lines["blind"]) == str(alone["blind"])  # an unfinished arm changes no other one
-    lines = compared(comparison([row for row in rows if (row["arm"], row["seed"]) != ("blind", 0)]))
-    assert [lines[arm]["compared_seeds"] for arm in ("blind", "flown", "aware")] == [2] * 3
+    assert str(lines["blind"]) == str(alone["blind"])  # an unfinished method changes no other one
+    lines = compared(comparison([row for row in rows if (row["method"], row["seed"]) != ("blind", 0)]))
+    assert [lines[method]["compared_seeds"] for method in ("blind", "flown", "aware")] == [2] * 3
 
 
-def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
+def test_a_table_has_every_method_and_policy_with_intervals_and_its_regime():
     table = comparison(rows_of("t", "late", THREE)).table
-    assert [*table[["delay", "arm", "policy"]].itertuples(index=False, name=None)] == [
+    assert [*table[["delay", "method", "policy"]].itertuples(index=False, name=None)] == [
         ("none", "best", TRAINED),
         ("none", "best", LIKELIEST),
         ("none", RANDOM, RANDOM),
-        *[("late", arm, policy) for arm in ("blind", "flown", "aware") for policy in (TRAINED, LIKELIEST)],
+        *[
+            ("late", method, policy)
+            for method in ("blind", "flown", "aware")
+            for policy in (TRAINED, LIKELIEST)
+        ],
         ("late", RANDOM, RANDOM),
     ]
     cells = table.loc[7]
-    assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", TRAINED]
+    assert [cells[name] for name in ("method", "regime", "policy")] == ["aware", "late data", TRAINED]
     assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
     assert cells["return_low"] < cells["return"] < cells["return_high"]
     assert cells["improvement"] == cells["improvement_high"] == 1
     assert np.isnan([table.loc[3, "recovery"], table.loc[8, "J_norm"]]).all()
 
 
-def test_a_recovery_is_from_the_naive_arm_of_the_same_track_if_the_delay_costs_something():
+def test_a_recovery_is_from_the_naive_method_of_the_same_track_if_the_delay_costs_something():
     scores = SCORES | {"flown": [9.0, 9.5]}  # as good as undelayed
     lines = compared(comparison(rows_of("t", "late", scores)))
     assert shown(lines["aware"], "recovery") == "-"
-    arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}  # not the reference of late data
-    lines = compared(comparison(rows_of("t", "late", scores), arms))
+    methods = METHODS | {"flown": Method(naive=True, policy_of="best")}  # not the reference of late data
+    lines = compared(comparison(rows_of("t", "late", scores), methods))
     assert lines["aware"]["recovery"] == pytest.approx((7.5 - 3) / (10 - 3))
-    assert np.isnan(lines["flown"]["recovery"])  # the strongest naive arm of its track
+    assert np.isnan(lines["flown"]["recovery"])  # the strongest naive method of its track
 
 
-def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its_own():
-    arms = ARMS | {"prior": Arm(untrained=True)}
+def test_an_untrained_network_stands_beside_the_trained_one_and_as_a_method_of_its_own():
+    methods = METHODS | {"prior": Method(untrained=True)}
     rows = rows_of("t", "late", SCORES)
     rows += [
-        row("t", "late", arm, seed, 2.0 + seed, UNTRAINED) for arm in ("aware", "prior") for seed in (0, 1)
+        row("t", "late", method, seed, 2.0 + seed, UNTRAINED)
+        for method in ("aware", "prior")
+        for seed in (0, 1)
     ]
-    table = comparison(rows, arms).table
+    table = comparison(rows, methods).table
     lines = table[table["policy"] == UNTRAINED]
-    assert [*lines["arm"]] == ["aware", "prior"]
+    assert [*lines["method"]] == ["aware", "prior"]
     assert (lines["return"] == 2.5).all()
     aware, prior = lines.to_dict("records")
-    assert aware["compared_seeds"] == 0  # only the trained policy of an arm is compared with others
+    assert aware["compared_seeds"] == 0  # only the trained policy of a method is compared with others
     assert prior["J_norm"] == pytest.approx(2.5 / 10)
     assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
 
 
-def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
+def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_method():
     # Straight learning curves over 100 steps: the mean of the naive one ends with 4, of the aware one with 8.
     # The mean over the last tenth of the steps lags a straight curve by a twentieth of them, 5 steps.
     ends = {
@@ -137,9 +152,9 @@ def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_arm():
         for seed, end in enumerate(of_seeds)
         for x in (0, 100)
     ]
-    lines = markdown(comparison(rows_of("t", "late", SCORES), ARMS, points), []).splitlines()
+    lines = markdown(comparison(rows_of("t", "late", SCORES), METHODS, points), []).splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.endswith("of *blind*, 3.8:")) :]
-    rows = {arm: numbers for arm, *numbers in (line.strip("| ").split(" | ") for line in table[4:7])}
+    rows = {method: numbers for method, *numbers in (line.strip("| ").split(" | ") for line in table[4:7])}
     assert rows["best"] == ["15", "15", "15"]
     assert rows["aware"] == ["53", "34", "never"]
     assert rows["blind"] == ["100", "81", "never"]

@@ -24,7 +24,7 @@ def test_recovery_is_nan_if_the_delay_costs_less_than_a_tenth(naive, defined):
     assert np.isnan(recovery(scores)) == (not defined)
 
 
-def test_all_arms_share_their_resamples():
+def test_all_methods_share_their_resamples():
     seeds = np.arange(5.0)
     drawn = resampled(np.stack([seeds, seeds + 10]), draws=50)
     assert drawn.shape == (50, 2, 5)
@@ -46,10 +46,10 @@ def test_the_interval_of_a_recovery_equals_that_over_all_possible_draws():
     aware, naive, undelayed = np.array([[3.0, 4.0, 8.0], [1.0, 0.0, 2.0], [9.0, 7.0, 10.0]])
     ratios = []
     for draw in itertools.product(range(3), repeat=3):
-        a, n, u = (float(np.mean(arm[list(draw)])) for arm in (aware, naive, undelayed))
+        a, n, u = (float(np.mean(method[list(draw)])) for method in (aware, naive, undelayed))
         ratios.append((a - n) / (u - n))
-    arms = np.stack([undelayed, np.zeros(3), naive, aware])
-    low, high = interval(recovery(resampled(arms, draws=20_000), 0.0))
+    methods = np.stack([undelayed, np.zeros(3), naive, aware])
+    low, high = interval(recovery(resampled(methods, draws=20_000), 0.0))
     np.testing.assert_allclose((low, high), exact_interval(ratios, [3**-3] * 27), rtol=1e-12)
 
 

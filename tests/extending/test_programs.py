@@ -99,14 +99,14 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
     (folder / "conf" / "experiment" / "mine.yaml").write_text(
         "tasks: {windy: [scenario=windy]}\n"
         "delays: {late: ['delay.obs={law: law:Satellite, hop: 2}']}\n"
-        "arms:\n"
-        "  undelayed: {delayed: false, regime: R3, overrides: [delay.obs=0]}\n"
+        "methods:\n"
+        "  undelayed: {delayed: false, overrides: [delay.obs=0]}\n"
         "  naive: {naive: true}\n"
     )
     tiny = ",".join(f"'{word}'" for word in TINY if word != "logger=csv")
     words = ["--config-dir=conf", "experiment=mine", "seeds=1", "processes=2", f"overrides=[{tiny}]"]
     compared = run(*words, program="compare", name="compared")
-    assert "| naive | R0 |" in (compared / "table.md").read_text()
+    assert "| naive | late data |" in (compared / "table.md").read_text()
 
 
 @pytest.mark.parametrize(

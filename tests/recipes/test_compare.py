@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from helpers import check_refused
 
-from damian.compare.comparison import TRAINED, Arm
+from damian.compare.comparison import TRAINED, Method
 from damian.compare.config import CompareConfig, Experiment, HeldOut
 from damian.recipes.compare import includes
 from damian.recipes.shared.comparison_runs import plan
@@ -37,7 +37,7 @@ def listed(*words: str) -> str:
 
 
 ONE = ["experiment=usecases", "tasks=[usecase2]"]
-TWO = [*ONE, "seeds=2", "arms=[undelayed,naive]", listed(*SMALL)]
+TWO = [*ONE, "seeds=2", "methods=[undelayed,naive]", listed(*SMALL)]
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def stamps(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in sorted(folder.rglob("seed_*/*")) if path.is_file()}
 
 
-def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare, capsys, tmp_path):
+def test_each_method_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare, capsys, tmp_path):
     (tmp_path / "my files").mkdir()
     folder = compare("--config-dir", "my files", *TWO)
     printed = capsys.readouterr().out
@@ -77,14 +77,14 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert shlex.split(typed) == ["--config-dir", "my files", *TWO]
     rows = table(folder / "results.csv")
     assert len(rows) == 4 * 6
-    naive = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("naive", TRAINED, "paper")]
+    naive = [r for r in rows if (r["method"], r["policy"], r["delay"]) == ("naive", TRAINED, "paper")]
     assert [r["seed"] for r in naive] == ["8", "9"]
     stored = [table(folder / "usecase2" / name / "result.csv")[2]["return"] for name in runs[2:]]
     assert [float(r["return"]) for r in naive] == [float(number) for number in stored]
 
     before = stamps(folder)
     (folder / "usecase2" / runs[3] / "result.csv").unlink()  # as after Ctrl-C during the evaluation
-    compare(*TWO[:3], "arms=[undelayed,naive,deployed]", TWO[4])
+    compare(*TWO[:3], "methods=[undelayed,naive,deployed]", TWO[4])
     after = stamps(folder)
     rewritten = {path for path in before if before[path] != after[path]}
     assert rewritten
@@ -113,7 +113,7 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
 LEARNING_FROM_OTHERS = """\
 tasks: {tracking: [scenario=tracking]}
 delays: {paper: [delay=paper]}
-arms:
+methods:
   undelayed: {delayed: false}
   naive: {naive: true}
   finetuned: {starts_from: undelayed}
@@ -121,7 +121,7 @@ arms:
 """
 
 
-def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(compare, tmp_path):
+def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(compare, tmp_path):
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "others.yaml").write_text(LEARNING_FROM_OTHERS)
     shutil.copy(ROOT / "examples" / "extending" / "distillation.py", tmp_path)
@@ -133,8 +133,13 @@ def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(comp
     policy = digest(place / "none" / "undelayed" / "seed_3" / "checkpoint.pt")
     assert read_record(place / "paper" / "finetuned" / "seed_3")[POLICY] == policy
     rows = measured(folder)
-    regimes = {row["arm"]: row["regime"] for row in rows}
-    assert regimes == {"undelayed": "R3", "naive": "R0", "finetuned": "R2", "student": "R2"}
+    regimes = {row["method"]: row["regime"] for row in rows}
+    assert regimes == {
+        "undelayed": "no delay",
+        "naive": "late data",
+        "finetuned": "simulator",
+        "student": "simulator",
+    }
 
     shutil.rmtree(place)
     compare(*words, "keep=true")
@@ -142,20 +147,20 @@ def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(comp
     assert measured(folder) == rows
 
     stored = pd.read_csv(folder / "results.csv")
-    stored[stored["arm"] != "student"].to_csv(folder / "results.csv", index=False, na_rep="nan")
+    stored[stored["method"] != "student"].to_csv(folder / "results.csv", index=False, na_rep="nan")
     compare(*words, "keep=true")
     assert {path.parent.name for path in place.rglob("seed_3")} == {"undelayed", "student"}
     found = measured(folder)
     assert sorted(map(str, found)) == sorted(map(str, rows))
 
-    compare(*words[:3], "arms=[undelayed]", "seeds=1", "experiment.first_seed=4", small, "keep=true")
+    compare(*words[:3], "methods=[undelayed]", "seeds=1", "experiment.first_seed=4", small, "keep=true")
     assert {row["seed"] for row in measured(folder)} == {"3", "4"}
     assert "1 seeds (4 to 4)" in (folder / "table.md").read_text()
 
 
 @pytest.mark.slow
 def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
-    words = [*ONE, "seeds=1", "arms=[undelayed,naive]", listed(*SMALL, "frames=64")]
+    words = [*ONE, "seeds=1", "methods=[undelayed,naive]", listed(*SMALL, "frames=64")]
     folder, kept = compare(*words), tmp_path / "kept"
     kept.mkdir()
     for name in ("results.csv", "curves.csv"):
@@ -164,15 +169,15 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     compare(*words, *stored)
     for name in ("table.csv", "figure.png", "curves.png"):
         assert (kept / name).read_bytes() == (folder / name).read_bytes()
-    compare(*words[:3], "arms=[undelayed]", *stored)
-    assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "script"}
+    compare(*words[:3], "methods=[undelayed]", *stored)
+    assert {line["method"] for line in table(kept / "table.csv")} == {"undelayed", "random", "script"}
     late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
     check_refused(lambda: compare(*words, *late), problem, capsys)
 
 
 @pytest.mark.slow
 def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compare, capsys):
-    words = [*ONE, "seeds=1", "arms=[undelayed,deployed]", TWO[4]]
+    words = [*ONE, "seeds=1", "methods=[undelayed,deployed]", TWO[4]]
     folder = compare(*words) / "usecase2"
     source, flown = (folder / name / "seed_8" for name in ("none/undelayed", "paper/deployed"))
     compare(*words)
@@ -194,7 +199,7 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
 
 @pytest.mark.slow
 def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_named(compare, capsys):
-    words = [*TWO[:3], "arms=[undelayed,naive,deployed]", TWO[4]]
+    words = [*TWO[:3], "methods=[undelayed,naive,deployed]", TWO[4]]
     folder = compare(*words)
     expected = measured(folder)
     compare(*words, "processes=2", "hydra.run.dir=runs/usecases/other")
@@ -212,7 +217,7 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
 FITS_NOT = """\
 tasks: {spotting: []}
 delays: {late: [delay.obs=2]}
-arms:
+methods:
   undelayed: {delayed: false}
   both: {overrides: [aware=both]}
   flown: {policy_of: both}
@@ -223,11 +228,11 @@ arms:
     ("text", "words", "message"),
     [
         ("", [listed("framess=3")], "usecase2/none/undelayed: framess: unknown setting"),
-        ("", ["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
-        ("tasks: {spotting: []}", ["experiment=mine"], "experiment.arms: it is missing or empty"),
+        ("", ["methods=[deployed]"], "experiment.methods.deployed.policy_of: undelayed is not known"),
+        ("tasks: {spotting: []}", ["experiment=mine"], "experiment.methods: it is missing or empty"),
         (FITS_NOT, ["experiment=mine"], "flown: observation.age: the policy was trained with True"),
     ],
-    ids=["words", "arms", "empty", "fits not"],
+    ids=["words", "methods", "empty", "fits not"],
 )
 def test_a_mistake_is_one_line_and_leaves_no_folder(compare, capsys, tmp_path, text, words, message):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
@@ -240,7 +245,7 @@ def test_a_mistake_is_one_line_and_leaves_no_folder(compare, capsys, tmp_path, t
 HELD_OUT = """\
 tasks: {follow: [scenario=delaybench/tracking]}
 delays: {late: [delay.obs=2]}
-arms: {best: {delayed: false}, naive: {naive: true}}
+methods: {best: {delayed: false}, naive: {naive: true}}
 held_out: {two: {overrides: [agents=2], tasks: [follow]}}
 """
 
@@ -253,28 +258,28 @@ def test_a_comparison_flies_policies_in_held_out_tasks(compare, tmp_path):
     compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
     results = tmp_path / "runs/script"
     assert "## follow@two, delay late\n\nPolicies of another task." in (results / "table.md").read_text()
-    for arm in ("none/best", "late/naive"):
-        flown = results / "follow@two" / arm / "seed_0"
+    for method in ("none/best", "late/naive"):
+        flown = results / "follow@two" / method / "seed_0"
         config = (flown / "config.yaml").read_text()
-        assert re.search(f"checkpoint: .*/follow/{arm}/seed_0", config)
+        assert re.search(f"checkpoint: .*/follow/{method}/seed_0", config)
         assert "agents: 2" in config
         assert not (flown / "metrics.csv").exists()
 
 
 def test_runs_go_seed_by_seed_and_a_held_out_delay_replaces_the_one_of_the_training():
-    arms = {"best": Arm(delayed=False), "naive": Arm(naive=True, tasks=["a"])}
-    arms["flown"] = Arm(policy_of="best", tasks=["b"])
+    methods = {"best": Method(delayed=False), "naive": Method(naive=True, tasks=["a"])}
+    methods["flown"] = Method(policy_of="best", tasks=["b"])
     tasks = {task: ["scenario=delaybench/tracking"] for task in ("a", "b")}
     held_out = {"six": HeldOut(["delay.obs=6"], ["a"]), "burst": HeldOut(["delay=burst"], ["a"])}
-    experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, arms, held_out, first_seed=3)
+    experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, methods, held_out, first_seed=3)
     config = CompareConfig(experiment, seeds=2)
     runs = plan(config, Path("runs"))
     trained = [
         f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
     ]
     assert [run.name for run in runs if run.trains] == trained
-    flown = {(run.task, run.arm): run.config.delay.obs for run in runs if not run.trains}
+    flown = {(run.task, run.method): run.config.delay.obs for run in runs if not run.trains}
     assert flown.keys() == {("b", "flown"), ("a@six", "naive"), ("a@burst", "naive")}
     assert (flown["a@six", "naive"], flown["a@burst", "naive"]["law"]) == (6, "burst")
-    stored = pd.DataFrame({"task": ["a@six", "a@seven"], "delay": "late", "arm": "naive", "seed": 3})
+    stored = pd.DataFrame({"task": ["a@six", "a@seven"], "delay": "late", "method": "naive", "seed": 3})
     assert includes(config, stored).tolist() == [True, False]  # of an experiment that had another one

@@ -10,7 +10,7 @@ from helpers import check_refused
 from omegaconf import OmegaConf
 
 import damian
-from damian.compare.comparison import OF_ARM
+from damian.compare.comparison import OF_METHOD
 from damian.recipes import train
 
 TRAINED = ["frames=64", "worlds=4", "learner.steps=8", "model.hidden=[16]", "eval_episodes=8", "logger=csv"]
@@ -42,7 +42,7 @@ def test_without_overrides_the_evaluation_after_the_training_is_repeated(fly, tr
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "result.csv", "result.md", "run.json"}
     assert (folder / "result.md").read_text().strip() in capsys.readouterr().out
     again, before = (damian.results(path).set_index("policy") for path in (folder, trained))
-    assert {*again.index} == {*before.index} == {*OF_ARM, "random", "script"}
+    assert {*again.index} == {*before.index} == {*OF_METHOD, "random", "script"}
     assert again.loc["trained, deterministic"].equals(before.loc["trained, deterministic"])
     config, other = (OmegaConf.load(path / "config.yaml") for path in (folder, trained))
     differ = {name for name in other if config[name] != other[name]}

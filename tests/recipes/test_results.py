@@ -61,6 +61,6 @@ def test_results_are_utf_8_whatever_the_locale_and_shown_also_where_it_lacks_a_l
 def test_results_of_a_run_and_of_a_comparison_are_rows(trained):
     assert [*damian.results(trained)["policy"]][:2] == ["untrained", "untrained, deterministic"]
     folder = Path(__file__).parents[2] / "docs" / "results" / "delaybench"
-    assert {*damian.results(folder)["arm"]} >= {"undelayed", "backupdate"}
+    assert {*damian.results(folder)["method"]} >= {"undelayed", "backupdate"}
     with pytest.raises(InputError, match="no run has finished there"):
         damian.results(folder.parent / "none")

@@ -151,10 +151,10 @@ def test_links_in_a_run_folder_are_not_followed(store, name, linked, capsys):
 
 def test_comparisons_and_tables_of_results_read_stored_runs_as_data(store, capsys):
     store("learner.name", "evilmod:X")
-    arms = "tasks: {{t: [agents=3]}}\narms: {{a: {{delayed: false, overrides: [{}]}}}}\n"
+    methods = "tasks: {{t: [agents=3]}}\nmethods: {{a: {{delayed: false, overrides: [{}]}}}}\n"
     Path("conf/experiment").mkdir(parents=True, exist_ok=True)
     Path("conf/experiment/x.yaml").write_text(
-        arms.format(", ".join(f"'{word}'" for word in TINY)), encoding="utf-8"
+        methods.format(", ".join(f"'{word}'" for word in TINY)), encoding="utf-8"
     )
     shutil.copytree("run", "old/t/none/a/seed_0", dirs_exist_ok=True)
     words = ["compare", "--config-dir=conf", "experiment=x", "seeds=1", "hydra.run.dir=old"]

@@ -12,7 +12,7 @@ DELAY = 3
 
 
 def trained(task: Task, bpql: bool) -> Sac:
-    """The learner of an arm after 20 steps with random actions."""
+    """The learner of a method after 20 steps with random actions."""
     torch.manual_seed(0)
     env = make_env(task)
     set_seed(env, 0)

@@ -6,7 +6,7 @@ import pytest
 import spread
 import torch
 from simple_spread import AGES, DELAYS, HELD, HORIZON, KINEMATICS, SEEN
-from spread import ARMS, SLOTS, make_env, make_learner
+from spread import METHODS, SLOTS, make_env, make_learner
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -17,10 +17,10 @@ WORLDS = 3
 LATE = (3, 9)
 
 
-def flown(arm: str) -> TensorDictBase:
-    """Two episodes of an arm whose agents act at random, [T, B]."""
+def flown(method: str) -> TensorDictBase:
+    """Two episodes of a method whose agents act at random, [T, B]."""
     torch.manual_seed(0)
-    env = make_env(ARMS[arm], WORLDS, LATE, 9)
+    env = make_env(METHODS[method], WORLDS, LATE, 9)
     set_seed(env, 0)
     return env.rollout(2 * HORIZON, break_when_any_done=False).transpose(0, 1)
 
@@ -91,24 +91,24 @@ def small(monkeypatch) -> None:
     monkeypatch.setattr(spread, "MODEL", ModelConfig(hidden=[8]))
 
 
-def corrected(arm: str) -> list[TensorDictBase]:
-    """What the learner of an arm learns from, [B, T] each, and [B, T, N, 4 + C + N] for its critic."""
-    env = make_env(ARMS[arm], 4, LATE, 9)
+def corrected(method: str) -> list[TensorDictBase]:
+    """What the learner of a method learns from, [B, T] each, and [B, T, N, 4 + C + N] for its critic."""
+    env = make_env(METHODS[method], 4, LATE, 9)
     set_seed(env, 0)
-    learner = make_learner(env, ARMS[arm], 9)
+    learner = make_learner(env, METHODS[method], 9)
     with torch.no_grad():
         batches = env.rollout(3 * HORIZON, learner.actor, break_when_any_done=False).split(HORIZON, 1)
     return [learner.backupdated_batch(batch) for batch in batches][1:]
 
 
-@pytest.mark.parametrize("arm", ["backupdate", "registered+backupdate", "timeline+backupdate"])
-def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm):
-    for late in corrected(arm):
+@pytest.mark.parametrize("method", ["backupdate", "registered+backupdate", "timeline+backupdate"])
+def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, method):
+    for late in corrected(method):
         kinematics, critic = late["next", *KINEMATICS], late["next", *keys.GLOBAL_OBSERVATION]
         seen = late["next", *SEEN].unflatten(2, (3, 5))
-        if "registered" in arm:
+        if "registered" in method:
             seen = seen - kinematics[..., 2:].unsqueeze(-2)
-        if "timeline" in arm:
+        if "timeline" in method:
             slots = critic[..., 4:-3].unflatten(-1, (5, SLOTS, 3))
             known = torch.arange(SLOTS) <= late["next", "step_count"]
             assert slots[..., 2].bool().equal(known[:, :, None, None].expand(slots.shape[:-1]))
@@ -122,7 +122,7 @@ def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm
 
 
 def test_a_jitter_buffer_holds_each_message_until_it_is_as_old_as_the_longest_delay_in_training():
-    arm = ARMS["buffer"]
+    method = METHODS["buffer"]
     for delay, longest in (((3, 9), 9), ((0, 0), 9), ((12, 12), 12)):
-        steps = make_env(arm, WORLDS, delay, 9).rollout(HORIZON - 1)
+        steps = make_env(method, WORLDS, delay, 9).rollout(HORIZON - 1)
         assert steps["next", *DELAYS].unique().tolist() == [longest]

@@ -1,4 +1,4 @@
-"""Reference arms: messages held back to a constant delay (``delay.hold``), and a privileged critic."""
+"""Reference methods: messages held back to a constant delay (``delay.hold``), and a privileged critic."""
 
 import math
 
