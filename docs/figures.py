@@ -125,7 +125,7 @@ def plot_matrix(path: Path) -> None:
     """Draw delaybench: returns over the delay of the flight, a line for each training."""
     config = cli.settings(*SHOWN, program="compare")
     results = stored_results(path.parent).only(partial(includes, config))
-    table = Comparison(*results, config.chosen("methods")).table
+    table = Comparison(*results, config.experiment.methods).table
     rows = table.set_index(["method", "delay", "task", "policy"])[["return" + end for end in ENDS]]
     constant = [str(steps) for steps in range(9)]
     with matplotlib.rc_context(STYLE):

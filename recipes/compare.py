@@ -25,7 +25,7 @@ from damian.common.errors import InputError
 from damian.common.tables import write_csv
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, RUN, Comparison
 from damian.compare.config import SEEDS, CompareConfig
-from damian.compare.figures import plot_curves, plot_norms
+from damian.compare.figures import plot_curves, plot_profiles, plot_scores
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.processes import end_interrupted
@@ -38,6 +38,7 @@ from .shared.comparison_runs import (
     LOG,
     MARKDOWN,
     NO_RESULTS,
+    PROFILES,
     ROWS,
     Results,
     Run,
@@ -69,11 +70,12 @@ def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
 
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
     """Write the tables and the figures."""
-    comparison = Comparison(*results, config.chosen("methods"), config.score)
+    comparison = Comparison(*results, config.experiment.methods, config.score)
     write_csv(folder / TABLE, comparison.table, unknown="")
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results.rows, missing)))
     plot_curves(comparison, folder / CURVES)
-    plot_norms(comparison, folder / FIGURE)
+    plot_scores(comparison, folder / FIGURE)
+    plot_profiles(comparison, folder / PROFILES)
 
 
 def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Figures of a comparison: learning curves, and J_norm of each method."""
+"""Figures of a comparison: learning curves, scores with intervals, and performance profiles."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -13,10 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from damian.common.plotting import COLOURS, STYLE
+from damian.common.plotting import STYLE
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method
-from damian.compare.statistics import Floats, bootstrap
-from damian.runs.run_folder import RANDOM, SCRIPT
+from damian.compare.config import LESS_IS_BETTER
+from damian.compare.statistics import Floats, bootstrap, normalised
+from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
 
 Panel = TypeVar("Panel")
 
@@ -26,8 +27,9 @@ LABELS = {
     "perceived_steps": "steps per episode, perceived",
 }
 """Axis labels of the measures in training: in hindsight, from late data, or as the server perceived them."""
-METHOD_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
-"""Colours of methods: after the usual ones, six of Paul Tol's muted ones."""
+METHOD_COLOURS = ("#0F3C2D", "#E15A00", "#4B96FF", "#A5000F", "#5A9696", "#FFA500", "#873C96")
+METHOD_COLOURS += ("#1E2DFF", "#FF87FF", "#0000A5")
+"""Colours of methods: each pair is far apart in OKLab, for readers without green receptors too."""
 _POINTS = 200
 """Number of points of a learning curve."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
@@ -39,7 +41,7 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
 
     There is one of the return and, where a task can succeed, of success rate and steps. A curve is the mean
     over seeds, with its 95 % band. Dashed lines: the random policy; dash-dotted: the undelayed script;
-    dotted: methods that train nothing.
+    dotted: methods without a curve, such as those that train nothing.
     """
     succeeds = comparison.points["perceived_success_rate"].notna().any()
     panels = [
@@ -47,65 +49,88 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
         for task in comparison.tasks()
         if HELD_OUT_MARK not in task
         for delay in comparison.delays(task) or [NOT_LATE]
+        if {(task, delay), (task, NOT_LATE)} & {run[:2] for run in comparison.curves}
         for measure in (LABELS if succeeds else ["hindsight_return"])  # else episodes end at their limit
     ]
     save(path, panels, partial(_curve_panel, comparison), (3.2, 2.6), width=3)
 
 
-def plot_norms(comparison: Comparison, path: Path) -> None:
-    """Draw J_norm of each method under each delay, with 95 % intervals, in a panel for each task with any."""
-    known = comparison.table.dropna(subset="J_norm")
-    methods = [name for name, method in comparison.methods.items() if method.delayed]
-    styles = {name: look(comparison.methods, name) | {"linestyle": ""} for name in methods}
+def plot_scores(comparison: Comparison, path: Path) -> None:
+    """Draw the score of each method with its 95 % interval, in a panel for each task and delay.
 
-    def panel(axis: Axes, task: str) -> None:
-        lines = known[known["task"] == task]
-        draw_groups(axis, lines, ("delay", "method", "J_norm"), comparison.delays(task), styles, spread=0.7)
-        title = task.replace(HELD_OUT_MARK, ", held-out ")
-        axis.set(title=title, xlabel="delay", ylabel="J_norm (dashed: undelayed 1, random 0)")
-        for level in (0, 1):
-            axis.axhline(level, **_LEVEL)
-
-    save(path, [*known["task"].unique()], panel, (3.0, 3.0), width=4, sharey=True)
-
-
-def draw_groups(
-    axis: Axes,
-    lines: pd.DataFrame,
-    columns: tuple[str, str, str],
-    order: Sequence[str],
-    styles: Mapping[str, dict[str, Any]],
-    spread: float = 0.0,
-) -> None:
-    """Draw values with their intervals over places in order, for each group beside the others.
-
-    ``columns`` of the lines have the place, the group and the value; an infinite interval has no bar.
+    Dashed: the undelayed method; dotted: random actions; shaded: what the delay costs the strongest naive
+    method. Held-out tasks are in the table only.
     """
-    place, group, name = columns
-    for number, (label, style) in enumerate(styles.items()):
-        own = lines[lines[group] == label].set_index(place)
-        own = own.loc[[each for each in order if each in own.index]]
-        shift = spread * ((number + 0.5) / len(styles) - 0.5)
-        value, low, high = (own[name + end].to_numpy() for end in ENDS)
-        places = [order.index(each) + shift for each in own.index]
-        axis.errorbar(places, value, yerr=[value - low, high - value], markersize=4, label=label, **style)
-    axis.set_xticks(range(len(order)), order)
-    axis.set_xlim(-0.5, max(len(order), 1) - 0.5)
+    table: Any = comparison.table.set_index(["task", "delay", "method", "policy"])
+    score = comparison.score
+    undelayed = next((name for name, method in comparison.methods.items() if not method.delayed), "")
+
+    def panel(axis: Axes, place: tuple[str, str]) -> None:
+        task, delay = place
+        shown = [(name, comparison.policy_of(name)) for name in comparison.methods] + [(SCRIPT, SCRIPT)]
+        shown = [key for key in shown if (*place, *key) in table.index]
+        naive = []
+        for row, (name, policy) in enumerate(shown):
+            value, low, high = table.loc[(*place, name, policy), [score + end for end in ENDS]].astype(float)
+            error = np.nan_to_num([[value - low], [high - value]], posinf=0.0)
+            style: dict[str, Any] = {"color": "0.5", "marker": "o"}
+            style |= look(comparison.methods, name) if name != SCRIPT else {}
+            axis.errorbar([value], [row], xerr=error, markersize=4, **style)
+            if name != SCRIPT and comparison.methods[name].naive:
+                naive.append(value)
+        for name, policy, line in ((undelayed, TRAINED, "--"), (RANDOM, RANDOM, ":")):
+            if (task, NOT_LATE, name, policy) not in table.index:
+                continue
+            level = table.loc[(task, NOT_LATE, name, policy), score]
+            style = _LEVEL | {"linestyle": line}
+            axis.axvline(level, **style)
+            if name == undelayed and naive:
+                best = min(naive) if score in LESS_IS_BETTER else max(naive)
+                axis.axvspan(best, level, color="0.92", zorder=0)
+        axis.set_yticks(range(len(shown)), [name for name, _ in shown])
+        axis.invert_yaxis()
+        axis.set(title=f"{task}, delay {delay}", xlabel=score)
+
+    tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
+    panels = [(task, delay) for task in tasks for delay in comparison.delays(task)]
+    save(path, panels, panel, (3.4, 2.8), width=3)
+
+
+def plot_profiles(comparison: Comparison, path: Path) -> None:
+    """Draw performance profiles: the share of runs, of all tasks, delays and seeds, above each J_norm.
+
+    Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice". A method
+    without runs of some task or delay is left out.
+    """
+    tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
+    scores = [comparison.scores(task, delay) for task in tasks for delay in comparison.delays(task)]
+    names = [name for name in comparison.methods if all(name in found for found in scores)]
+
+    def panel(axis: Axes, _: str) -> None:
+        places = np.linspace(-0.1, 1.1, _POINTS)
+        for name in names:
+            columns: list[Any] = [
+                found[[name, *found.columns[:2]]] for found in scores
+            ]  # undelayed and random
+            runs = [normalised(found.iloc[:, 0], *found.iloc[:, 1:].mean()) for found in columns]
+            values = np.concatenate(runs)
+            share = (values[~np.isnan(values), None] > places).mean(0)
+            style: dict[str, Any] = look(comparison.methods, name) | {"marker": "", "label": name}
+            axis.plot(places, share, **style)
+        axis.set(xlabel="J_norm (random 0, undelayed 1)", ylabel="share of runs above")
+
+    save(path, ["all"] if len(scores) > 1 else [], panel, (4.0, 3.0))
 
 
 def look(methods: Mapping[str, Method], method: str) -> dict[str, Any]:
     """Style of a method by its place among all; dotted lines are of methods that train nothing."""
+    again, colour = divmod([*methods].index(method), len(METHOD_COLOURS))
     trains = methods[method].policy_of is None and not methods[method].untrained
-    return style_of([*methods].index(method)) | {"linestyle": "-" if trains else ":"}
-
-
-def style_of(number: int) -> dict[str, Any]:
-    """Colour, and a marker and a width, which tell from others of this colour."""
-    again, colour = divmod(number, len(METHOD_COLOURS))
     return {
         "color": METHOD_COLOURS[colour],
         "marker": "os^D"[again % 4],
         "linewidth": (1.2, 2.0, 0.6)[again % 3],
+        "linestyle": "-" if trains else ":",
     }
 
 
@@ -115,7 +140,6 @@ def save(
     draw: Callable[[Axes, Panel], None],
     size: tuple[float, float],
     width: int = 1,
-    sharey: bool = False,
 ) -> None:
     """Draw panels of this size [inches] in rows of ``width``, with one legend to the right of them."""
     if not panels:
@@ -125,14 +149,15 @@ def save(
     height = math.ceil(len(panels) / width)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(size[0] * width + 1.2, size[1] * height), layout="constrained")
-        axes = figure.subplots(height, width, squeeze=False, sharey=sharey).flat
+        axes = figure.subplots(height, width, squeeze=False).flat
         drawn: dict[str, Any] = {}
         for axis, panel in zip(axes, panels, strict=False):
             draw(axis, panel)
             drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
         for axis in axes[len(panels) :]:
             axis.set_axis_off()
-        figure.legend([*drawn.values()], [*drawn], loc="outside right upper", frameon=False)
+        if drawn:
+            figure.legend([*drawn.values()], [*drawn], loc="outside right upper", frameon=False)
         figure.savefig(path, dpi=150)
 
 
@@ -152,6 +177,7 @@ def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, st
             axis.plot(place, mean, **style)
             axis.fill_between(place, low, high, color=style["color"], alpha=0.2, linewidth=0)
         elif (level := table.get((*run, comparison.policy_of(name)))) is not None:
+            style |= {"linestyle": ":"}
             axis.axhline(level, **style)
     for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, f"{SCRIPT}, undelayed", "-.")):
         if (level := table.get((task, NOT_LATE, policy, policy))) is not None:

@@ -183,7 +183,7 @@ def perform_run(run: Run, work: Work) -> None:
 
 
 ROWS, POINTS = "results.csv", "curves.csv"
-MARKDOWN, FIGURE = "table.md", "figure.png"
+MARKDOWN, FIGURE, PROFILES = "table.md", "figure.png", "profiles.png"
 """What follows from the rows; a sweep has the table, too."""
 MOST_POINTS = 50
 """Largest number of points of a stored learning curve, evenly spaced over its updates."""
