@@ -8,32 +8,42 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from damian.delays.config import DelayConfig
-    from damian.delays.laws import Burst, Constant, Distance, Geometric, Lag, Law, Trace, Uniform
-    from damian.delays.samplers import ContextSampler, MessageContext, Sampler, TableSampler
-    from damian.envs.config import ClockConfig, ScenarioConfig
-    from damian.envs.nodes import ServerNode
-    from damian.envs.pipeline import make_env
-    from damian.envs.uav_env import UavEnv
-    from damian.learners.config import LearnerConfig, LearningSetup
-    from damian.recipes.evaluate import load  # type: ignore[import-not-found]
-    from damian.recipes.results import results  # type: ignore[import-not-found]
-    from damian.recipes.shared.environments import compose_scenario  # type: ignore[import-not-found]
-    from damian.replay.backupdate import BackupdateStorage
-    from damian.server.features import feature
-    from damian.server.rewards import reward_term
-    from damian.transforms import (
-        ActionDelay,
-        ActionHistory,
-        Channel,
-        CumulativeReward,
-        ObservationDelay,
-        ObservationTimeline,
-        RewardDelay,
-        SampleAndHold,
-        set_seed,
-    )
-    from damian.world.sensors import sensor
+    from damian.delays.config import DelayConfig as DelayConfig
+    from damian.delays.laws import Burst as Burst
+    from damian.delays.laws import Constant as Constant
+    from damian.delays.laws import Distance as Distance
+    from damian.delays.laws import Geometric as Geometric
+    from damian.delays.laws import Lag as Lag
+    from damian.delays.laws import Law as Law
+    from damian.delays.laws import Trace as Trace
+    from damian.delays.laws import Uniform as Uniform
+    from damian.delays.samplers import ContextSampler as ContextSampler
+    from damian.delays.samplers import MessageContext as MessageContext
+    from damian.delays.samplers import Sampler as Sampler
+    from damian.delays.samplers import TableSampler as TableSampler
+    from damian.envs.config import ClockConfig as ClockConfig
+    from damian.envs.config import ScenarioConfig as ScenarioConfig
+    from damian.envs.nodes import ServerNode as ServerNode
+    from damian.envs.pipeline import make_env as make_env
+    from damian.envs.uav_env import UavEnv as UavEnv
+    from damian.learners.config import LearnerConfig as LearnerConfig
+    from damian.learners.config import LearningSetup as LearningSetup
+    from damian.recipes.evaluate import load as load  # type: ignore[import-not-found]
+    from damian.recipes.results import results as results  # type: ignore[import-not-found]
+    from damian.recipes.shared.environments import compose_scenario as compose_scenario  # type: ignore[import-not-found]
+    from damian.replay.backupdate import BackupdateStorage as BackupdateStorage
+    from damian.server.features import feature as feature
+    from damian.server.rewards import reward_term as reward_term
+    from damian.transforms import ActionDelay as ActionDelay
+    from damian.transforms import ActionHistory as ActionHistory
+    from damian.transforms import Channel as Channel
+    from damian.transforms import CumulativeReward as CumulativeReward
+    from damian.transforms import ObservationDelay as ObservationDelay
+    from damian.transforms import ObservationTimeline as ObservationTimeline
+    from damian.transforms import RewardDelay as RewardDelay
+    from damian.transforms import SampleAndHold as SampleAndHold
+    from damian.transforms import set_seed as set_seed
+    from damian.world.sensors import sensor as sensor
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
 
@@ -78,48 +88,9 @@ _MODULES = {
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = [
-    "ActionDelay",
-    "ActionHistory",
-    "BackupdateStorage",
-    "Burst",
-    "Channel",
-    "ClockConfig",
-    "Constant",
-    "ContextSampler",
-    "CumulativeReward",
-    "DelayConfig",
-    "Distance",
-    "Geometric",
-    "Lag",
-    "Law",
-    "LearnerConfig",
-    "LearningSetup",
-    "MessageContext",
-    "ObservationDelay",
-    "ObservationTimeline",
-    "RewardDelay",
-    "SampleAndHold",
-    "Sampler",
-    "ScenarioConfig",
-    "ServerNode",
-    "TableSampler",
-    "Trace",
-    "UavEnv",
-    "Uniform",
-    "compose_scenario",
-    "feature",
-    "load",
-    "make_env",
-    "results",
-    "reward_term",
-    "sensor",
-    "set_seed",
-]
-
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return [*globals(), *_MODULE_OF]
 
 
 def __getattr__(name: str) -> Any:
