@@ -1,16 +1,11 @@
-"""The environments for PettingZoo and Gymnasium; importing this registers ``damian/Spotting-v0``."""
-
-from typing import TYPE_CHECKING, Any
+"""The environments for Gymnasium, which importing registers, and (in ``pettingzoo``) for PettingZoo."""
 
 import gymnasium
 
 from damian.interop.delay_wrapper import DelayWrapper
 from damian.interop.gym import UavGymEnv, UavVectorEnv
 
-if TYPE_CHECKING:
-    from damian.interop.pettingzoo import UavParallelEnv
-
-__all__ = ["DelayWrapper", "UavGymEnv", "UavParallelEnv", "UavVectorEnv"]
+__all__ = ["DelayWrapper", "UavGymEnv", "UavVectorEnv"]
 
 TASKS = ("spotting", "tracking", "coverage", "energy", "mixed")
 """Scenarios of conf/scenario that are registered, each as ``damian/NAME-v0``."""
@@ -22,11 +17,3 @@ for _task in TASKS:
         vector_entry_point="damian.recipes.shared.environments:gymnasium_env",
         kwargs={"task": _task},
     )
-
-
-def __getattr__(name: str) -> Any:
-    if name != "UavParallelEnv":
-        raise AttributeError(f"module damian.interop has no attribute {name}")
-    from damian.interop.pettingzoo import UavParallelEnv  # noqa: PLC0415 (PettingZoo need not be installed)
-
-    return UavParallelEnv

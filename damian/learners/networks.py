@@ -57,10 +57,6 @@ class LegalCategorical(Distribution):
         super().__init__(legal.shape[:-1], validate_args=False)
 
     @property
-    def arg_constraints(self) -> dict[str, Any]:
-        return {}
-
-    @property
     def probs(self) -> Tensor:
         """Probability of each action, [*, A]."""
         return self.logits.exp()

@@ -229,7 +229,7 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
     own, held = env.server.messages(message), env.server.messages(instants.get(keys.RECEIVED, message))
     dt = env.scenario.clock.dt
     time = torch.arange(len(sent), dtype=torch.float64) * dt
-    belief = instants.get(keys.BELIEF, None)
+    belief, grid = instants.get(keys.BELIEF, None), env.server.grid
     about = {**about, **_drawn(env, truth.drawn[:1])}
     return Episode(
         **fixed_of(env, about, int(env.server.region_of(own)[0])),
@@ -249,7 +249,7 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         age=np.asarray((held.age(time) / dt).round() * dt),  # times in messages are float32
         reward=np.asarray(cast(Tensor, instants[keys.REWARD])[..., 0]),
         reward_terms={name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()},
-        cells=None if belief is None else cells_of(env),
+        cells=None if belief is None or grid is None else np.asarray(grid.centres.cpu()),
         belief=None if belief is None else np.asarray(belief),
         requests=np.asarray(truth.requests) if env.simulation.widths.requests else None,
     )
@@ -282,11 +282,6 @@ def fixed_of(env: UavEnv, about: Mapping[str, Any], region: int) -> dict[str, An
         "landing_points": np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),
         "radius": env.simulation.radius,
     }
-
-
-def cells_of(env: UavEnv) -> Floats | None:
-    """Centres of the belief's cells, [K, 2]; None without a belief."""
-    return None if env.server.grid is None else np.asarray(env.server.grid.centres.cpu())
 
 
 def _listed(values: Any, digits: int = DIGITS) -> Any:

@@ -15,7 +15,8 @@ from torchrl.envs.utils import check_env_specs
 from damian import ObservationDelay, compose_scenario, keys
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
-from damian.interop import TASKS, UavGymEnv, UavParallelEnv, UavVectorEnv
+from damian.interop import TASKS, UavGymEnv, UavVectorEnv
+from damian.interop.pettingzoo import UavParallelEnv
 
 DELAYS = ["delay=none", "delay=paper", "delay.act=2", "delay.rew=1", "delay.history=3"]
 KINDS = product(TASKS, ("discrete", "continuous"), ("instant", "polynomial"))
