@@ -33,7 +33,6 @@ SHORTER = {
 """Settings that make the commands of a program short; they replace those of the document."""
 INSTEAD = {
     "seed=0,1,2": "seed=0",
-    "span=[600,900]": "span=[10,20]",
     "experiment=delays": "experiment=usecases",
     "hydra/launcher=submitit_slurm": "hydra/launcher=submitit_local",
     "hydra.launcher.partition=cpu": "hydra.launcher.timeout_min=60",

@@ -1,19 +1,36 @@
-"""The examples run from any folder, and do what their text says; docs/backupdating.md shows the same code."""
+"""The examples run from any folder, do what their text says, and learn under delay (slow)."""
 
+import os
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from episodes import flight
+from torchrl.envs import SerialEnv
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "examples" / "backupdating.py"
+EXAMPLES = ROOT / "examples"
 DOCUMENT = (ROOT / "docs" / "backupdating.md").read_text()
 
 
+def load(name: str) -> dict[str, Any]:
+    """The names that an example defines, whose program does not run."""
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"))
+
+
+def run(name: str) -> dict[str, Any]:
+    """The names that an example about transforms defines when its program runs."""
+    return runpy.run_path(str(EXAMPLES / "transforms" / f"{name}.py"), run_name="__main__")
+
+
 def test_back_updated_rewards_and_ends_are_the_true_ones_wherever_the_message_has_arrived(capsys):
-    example = runpy.run_path(str(EXAMPLE))
+    example = load("backupdating")
     steps, collected = example["main"]()
     after, n_steps = steps["next"], len(steps)
     arrived = torch.arange(n_steps).view(-1, 1, 1) + after["delay"] < n_steps
@@ -43,7 +60,96 @@ def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
 @pytest.mark.slow
 def test_a_belief_head_learns_to_predict_on_an_environment_that_is_not_ours(monkeypatch):
     pytest.importorskip("vmas")
-    monkeypatch.syspath_prepend(str(ROOT / "examples"))
-    example = runpy.run_path(str(ROOT / "examples" / "belief_head.py"))
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    example = load("belief_head")
     assert example["batch"]["agents", "timeline"].shape == (8, 16, 3, 12, 18 + 1)
     assert example["errors"][-1] < example["errors"][0]
+
+
+def test_a_late_pendulum_prints_the_age_of_what_it_observes(capsys):
+    age = run("late_pendulum")["steps"]["age"].mean()
+    assert 1 < age < 4
+    assert f"{age:.1f} steps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "entry"),
+    [
+        ("late_words", "age"),
+        pytest.param("late_vmas", "age", marks=pytest.mark.slow),
+        pytest.param("late_replay_buffer", "buffer", marks=pytest.mark.slow),
+    ],
+)
+def test_an_example_runs(name, entry):
+    pytest.importorskip("vmas")
+    found = run(name)[entry]
+    age = found[:]["age"] if entry == "buffer" else found
+    assert 0.5 < age.mean() < 5
+
+
+def test_workers_draw_the_same_delays_again_each_its_own():
+    draw = run("late_workers")["draw"]
+    one, other = draw(SerialEnv)
+    assert one != other
+    assert draw(SerialEnv) == [one, other]
+
+
+def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew():
+    storage, _ = load("sac_backupdating")["train"](delay=6, frames=150, warm_up=120)
+    learnt = storage.steps[storage.latest()[:-6]]
+    assert len(learnt) == 150 - 6
+    assert learnt["next", "state"].equal(learnt["next", "observation"])
+    assert learnt["known"][6:, :, :3].equal(learnt["state"][:-6])  # six steps old, then six actions
+    assert learnt["known"][6:, :, -1:].equal((learnt["action"][5:-1] + 2) / 4)
+
+
+def test_ppo_behind_delays_takes_a_few_steps():
+    (mean,) = load("ppo_gymnasium")["train"](delay=2, frames=1000)
+    assert 9 < mean < 60
+
+
+def test_multi_agent_ppo_behind_delays_takes_a_few_steps():
+    pytest.importorskip("vmas")
+    assert len(load("ppo_vmas")["train"](batches=1)) == 1
+
+
+@pytest.mark.slow
+def test_ppo_behind_delays_learns():
+    means = load("ppo_gymnasium")["train"](delay=3, frames=30_000)
+    assert sum(means[-10:]) / 10 > 150  # random actions last 22 steps
+
+
+@pytest.mark.slow
+def test_multi_agent_ppo_behind_delays_learns():
+    pytest.importorskip("vmas")
+    means = load("ppo_vmas")["train"](batches=40)
+    assert means[-1] > means[0] + 1
+
+
+@pytest.mark.slow
+def test_soft_actor_critic_with_back_updating_swings_the_pendulum_up():
+    _, returns = load("sac_backupdating")["train"](frames=12_000)
+    assert sum(returns[-10:]) / 10 > -400  # random actions return -1200
+
+
+def test_a_recording_for_rerun_has_the_places_and_the_detections_of_every_uav(tmp_path):
+    reader, rows = pytest.importorskip("rerun.chunk").RrdReader, {}
+    spotted = np.array([[False, False], [True, False], [True, False], [False, False]])
+    flown = flight(spotted=spotted, about={"uavs": ["A/1", "B"]})
+    load("rerun_episode")["save_recording"](flown, tmp_path / "flown.rrd")
+    for chunk in reader(tmp_path / "flown.rrd").stream():
+        if not chunk.is_static:
+            rows[chunk.entity_path] = chunk.to_record_batch().to_pydict().get("Points3D:positions")
+    assert [len(points) for points in rows[r"/detections/A\/1"]] == [0, 1, 1, 0]
+    assert rows["/uavs/B"] == [[[100.0, 100.0, 0.0]]] * 4
+
+
+@pytest.mark.slow
+def test_a_search_with_optuna_keeps_its_trials_and_goes_on(tmp_path):
+    pytest.importorskip("optuna")
+    words = ["frames=64", "worlds=2", "learner.steps=16", "eval_episodes=2", "episode.max_steps=8"]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for n in ("1", "2"):
+        command = [sys.executable, str(EXAMPLES / "tune.py"), n, *words]
+        subprocess.run(command, cwd=tmp_path, env=os.environ | {"PATH": path}, check=True)
+    assert len([*tmp_path.glob("runs/tune/*/result.csv")]) == 2

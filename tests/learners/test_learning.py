@@ -1,11 +1,13 @@
-"""MAPPO: policies and critics, advantages, losses, and importance ratios with back-updating."""
+"""MAPPO: policies and critics, advantages, losses, importance ratios with back-updating, divergence."""
 
 import itertools
+import math
 
 import pytest
 import torch
 from helpers import both_kinds, both_motions, everything, learning
 from tensordict import TensorDictBase
+from torch import nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -16,6 +18,7 @@ from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.envs.uav_env import UavEnv
+from damian.learners.base import divergence
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.replay.backupdate import BackupdateStorage, corrections_of
@@ -140,3 +143,15 @@ def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():
     assert not learnt["next", "agents", "global_observation"].equal(
         settled["next", "agents", "global_observation"]
     )
+
+
+def test_a_nan_counts_only_if_weights_are_wrong():
+    network = nn.Linear(2, 2)
+    components = {"actor": network, "optimizer": torch.optim.Adam(network.parameters()), "other": nn.ReLU()}
+    assert divergence(components, {"loss": 1.0, "not known yet": math.nan}) is None
+    assert divergence(components, {"a": 1.0, "b": -math.inf}) == "b is -inf"
+    for value in (math.nan, -2e5):
+        with torch.no_grad():
+            network.bias[1] = value
+        found = divergence(components, {})
+        assert found == f"a weight of actor is {abs(value):.3g}, not at most 100000"
