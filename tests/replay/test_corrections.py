@@ -289,6 +289,21 @@ def check_step(after: TensorDictBase, at: tuple[int, ...], twin: Twin, t: int, r
     assert after[observation][at].tolist() == pytest.approx(twin.held_before(t, row)), (twin.case, t)
 
 
+def test_what_follows_an_end_that_the_receiver_never_noticed_stays_invalid():
+    collected = rollout(make_env(()), 20)
+    for name in ("message", next_key("message"), next_key("received")):
+        collected[name][..., 1] = 0.5
+    collected[next_key("message")][:, 2, 1] = 0.0  # the alarm, which the next message overtakes
+    late = (torch.arange(20) == 2).view(1, 20, 1).expand(WORLDS, 20, 1)
+    collected[next_key("delay")], collected[next_key("age")] = late.long(), late.float()
+    collected["step_count"] = torch.arange(20).view(1, 20, 1).expand(WORLDS, 20, 1).clone()
+    collected[next_key("step_count")] = collected["step_count"] + 1
+    for name in ENDS:
+        collected[next_key(name)] = torch.zeros_like(late)
+    after = stored(make_storage(()), collected, 5)
+    assert after["valid"].squeeze(-1).T.tolist() == [[True] * 3 + [False] * 17] * WORLDS
+
+
 @both_layouts
 def test_neither_messages_nor_rewards_that_arrive_later_are_used(group):
     case = Case(4, 3, 2)

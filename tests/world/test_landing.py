@@ -35,8 +35,9 @@ def random_bookings(seed, n_worlds, n_agents, n_points, together):
         standing = rng.integers(0, min(n_points, 3), (n_worlds, n_agents))
     else:
         standing = np.stack([rng.permutation(n_points)[:n_agents] for _ in range(n_worlds)])
-    ranking = Ranking(torch.as_tensor(ranked).int(), torch.as_tensor(rng.random(ranked.shape)))
-    reach = torch.as_tensor(rng.uniform(-0.3, 1.2, row.shape))
+    # Rounded, so that some distances are just in reach.
+    ranking = Ranking(torch.as_tensor(ranked).int(), torch.as_tensor(rng.random(ranked.shape).round(1)))
+    reach = torch.as_tensor(rng.uniform(-0.3, 1.2, row.shape).round(1))
     return ranking, torch.as_tensor(row), torch.as_tensor(standing), reach
 
 
