@@ -1,4 +1,4 @@
-"""Settings of what is late, and when: delays, links and clocks."""
+"""Settings of what is late: delays and links."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -98,9 +98,9 @@ class TableSampler(Sampler):
     """Draws delays from a table of probabilities.
 
     Args:
-        states: for each of S states of a sender, the probabilities of the delays 0, 1, ... [steps]; if they
-            sum to less than 1, the rest is the probability that the message is lost.
-        transitions: probabilities of the transitions between the states per step, [S, S]; None for one state.
+        states: for the one state of a sender, or a good and a bad one, the probabilities of the delays 0, 1,
+            ... [steps]; if they sum to less than 1, the rest is the probability that the message is lost.
+        transitions: probabilities of the transitions between two states per step, [2, 2]; None for one state.
         loss: probability that a message is lost, whatever its delay.
     """
 

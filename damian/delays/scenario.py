@@ -40,7 +40,7 @@ class ScenarioDelays:
         """Whether a law, or the range of the links, needs to know where the UAVs are."""
         context_keys = {"position": keys.POSITION} if self.reads_positions else {}
         self.told: dict[str, Any] = {"dt": dt, "context_keys": context_keys}
-        """Arguments that every transform which delays something gets, beside its sampler."""
+        """Arguments that every transform which delays something gets, besides its sampler."""
 
     @property
     def longest(self) -> int:

@@ -1,4 +1,4 @@
-"""Transforms with a row for each world: nodes (server, belief, UAVs; paper, section 3.4), and totals."""
+"""Transforms with a row for each world: server node (paper, section 3.4), belief, and totals."""
 
 from collections.abc import Sequence
 

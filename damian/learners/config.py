@@ -62,7 +62,7 @@ class ModelConfig(Settings):
 
 
 class LearningSetup(NamedTuple):
-    """Properties of a run that a learner needs beside its own settings."""
+    """Properties of a run that a learner needs besides its own settings."""
 
     model: ModelConfig
     """Networks of actor and critic."""
@@ -224,7 +224,7 @@ class SacConfig(LearnerConfig):
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
 
     def critic_keys(self, setup: LearningSetup) -> "list[NestedKey]":
-        """Entries that the critics read, beside the action.
+        """Entries that the critics read, besides the action.
 
         Only the actor's observation holds the UAV's past actions: if a critic of late observations did not
         read them, the actor could not learn to use them.

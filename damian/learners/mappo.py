@@ -34,7 +34,7 @@ LOSS_KEYS: list[NestedKey] = [
     keys.VALUE_TARGET,
     keys.READY,
 ]
-"""Entries of a step that the loss reads, beside the critic's observation."""
+"""Entries of a step that the loss reads, besides the critic's observation."""
 
 
 class Mappo:

@@ -13,7 +13,7 @@ from torchrl.modules import recurrent_mode
 from damian import keys
 
 RECURRENT_KEYS: list[NestedKey] = [keys.HIDDEN_BEFORE, keys.IS_INIT]
-"""Entries, beside observations, that ``AgentGRU`` reads in recurrent mode."""
+"""Entries, besides observations, that ``AgentGRU`` reads in recurrent mode."""
 
 
 class AgentGRU(TensorDictModuleBase):

@@ -55,7 +55,7 @@ class Sac:
         self.unread = [key for key in _UNREAD if not (believes and key == keys.MESSAGE)]
 
     def components(self) -> dict[str, Any]:
-        """What a checkpoint stores, beside the replay buffer."""
+        """What a checkpoint stores, besides the replay buffer."""
         return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:

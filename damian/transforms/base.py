@@ -403,7 +403,7 @@ class StatefulTransform(Transform):
     # Random streams.
 
     def set_seed(self, seed: int | None) -> None:
-        """Set the seed and delete the memory; the next step or reset begins it anew."""
+        """Set the seed and delete the memory; the next step or reset allocates it again."""
         self._seed, self._world_seeds = seed, None
         self.clear_memory()
 

@@ -160,7 +160,7 @@ class ObservationTimeline(StatefulTransform):
         return found if self.group else found.squeeze(1)
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
-        """Writes the timeline anew if it is among ``keys``, with all that has arrived by the latest step."""
+        """Writes the timeline again if it is among ``keys``, with all that has arrived by the latest step."""
         return Correction(self._corrected, self.slots) if self.out_keys[0] in keys else None
 
     def _corrected(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:

@@ -30,7 +30,7 @@ class Cells(NamedTuple):
     """The landing points that may be nearest to a place, by the cell in which it lies: C in all, U used."""
 
     point: Tensor
-    """Ids of landing points within their region, W for each used cell, -1 behind the last, [U, W] int32."""
+    """Ids of landing points within their region, W for each used cell, -1 after the last, [U, W] int32."""
     row: Tensor
     """Row of each cell among these, [C] int32; 0 for cells that are not used."""
     first: Tensor
@@ -196,7 +196,7 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
 
 
 def _within_reach(lattice: Floats, place: Floats, n: int, side: float, farther: float) -> NDArray[np.int64]:
-    """Pairs, [2, P]: for each place the n nearest points and all that are up to ``farther`` behind them."""
+    """Pairs, [2, P]: for each place the n nearest points, and those farther by up to ``farther``."""
     tree, targets = shapely.STRtree(np.asarray(shapely.points(lattice))), shapely.points(place)
     reach = np.full(len(place), side * math.sqrt(n / math.pi))
     while True:

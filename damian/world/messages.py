@@ -1,4 +1,4 @@
-"""The messages that UAVs send; to add a field, declare it in ``Messages`` and fill it in ``_sense``."""
+"""The messages that UAVs send; a further field is declared in ``Messages`` and filled in ``Simulation``."""
 
 from typing import Annotated, NamedTuple, get_type_hints
 

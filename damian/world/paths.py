@@ -30,7 +30,7 @@ class Detours(NamedTuple):
     pair: Tensor
     """Which landing points each connects, ``origin * M + goal`` of M flat ids, ascending, [P]."""
     corners: Tensor
-    """Where each bends, in order, [P + 1, C, 2] metres; NaN behind the last; the last row stands for none."""
+    """Where each bends, in order, [P + 1, C, 2] metres; NaN after the last; last a row of none."""
     reached: Tensor
     """Whether the way leads to the goal at all, [P + 1]."""
     n_points: int
@@ -98,12 +98,12 @@ def detours(polygons: list[Polygon | MultiPolygon], points: list[Floats], longes
 
 
 def _with_corners(corners: Floats, n: int) -> Floats:
-    """Corners [P, C, 2] with more of NaN behind them, [P, n, 2]."""
+    """Corners [P, C, 2] filled up with NaN, [P, n, 2]."""
     return np.pad(corners, ((0, 0), (0, n - corners.shape[1]), (0, 0)), constant_values=np.nan)
 
 
 def _shortest(polygon: shapely.Geometry, points: Floats, pairs: NDArray[np.int64]) -> tuple[Floats, NDArray]:
-    """Corners [P, C, 2] of the shortest paths between pairs [P, 2], NaN behind the last, and which exist."""
+    """Corners [P, C, 2] of the shortest paths between pairs [P, 2], NaN after the last; which exist."""
     corners = _dents(polygon)
     ends, index = np.unique(pairs, return_inverse=True)
     origin, goal = index.reshape(pairs.shape).T + len(corners)

@@ -25,7 +25,7 @@ _FULL_DISC_ROUNDS, _ROUNDS = 256, 320
 class Walk(NamedTuple):
     """Walks of ``W`` sources over at most ``K`` stops; a static source has one stop and never leaves it.
 
-    Padded stops lie at the first stop (walks that begin anew have at least one), to which the walk
+    Padded stops lie at the first stop (walks that begin again have at least one), to which the walk
     then returns, or at the last one; they are left at the end of the walk and never reached.
 
     Attributes:

@@ -256,7 +256,7 @@ class PolynomialFlight(MotionModel):
         return on_ground & (state.elapsed == self.steps(state).clamp(min=1))
 
     def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
-        """Least number of steps after which the latest flight, and a time [s] behind it, are over, [B, N]."""
+        """Least number of steps after which the latest flight, and a time [s] after it, are over, [B, N]."""
         flight = 2 * state.vertical + state.cruise
         seconds = flight.double() * (1 - _FLIGHT_ERROR) + sensing_time
         return (seconds * ((1 - _ROUNDING) / self.dt)).ceil().long()
