@@ -106,6 +106,6 @@ def next_key(key: "NestedKey") -> "NestedKey":
     return ("next", *((key,) if isinstance(key, str) else key))
 
 
-def last_part(key: "NestedKey") -> "NestedKey":
+def last_part(key: "NestedKey") -> str:
     """The last part of a key, which is its name within the innermost TensorDict."""
-    return key if isinstance(key, str) else key[-1]
+    return key if isinstance(key, str) else last_part(key[-1])

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import hydra
@@ -129,7 +128,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
     results = kept.with_those_of(results_of(done, config.chosen("methods")))
     if done:
         results.write(folder)
-    results = results.only(partial(includes, config))
+    results = Results(*(rows[includes(config, rows)] for rows in results))
     if results.rows.empty:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
     report(config, results, [run.name for run in runs if not run.finished], folder)

@@ -31,8 +31,8 @@ class ExportedPolicy(nn.Module):
         self.recurrent = keys.HIDDEN in self.in_keys
         self.discrete = isinstance(spec, Categorical) and hasattr(self.last.distribution_class, "probs")
         self.parameter_keys: list[NestedKey] = [key for key in self.last.in_keys if key not in self.in_keys]
-        names = ["probability"] if self.discrete else map(last_name, self.parameter_keys)
-        self.inputs = [last_name(key) for key in self.in_keys]
+        names = ["probability"] if self.discrete else map(keys.last_part, self.parameter_keys)
+        self.inputs = [*map(keys.last_part, self.in_keys)]
         self.outputs = ["action", *names, *["hidden"] * self.recurrent]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -64,7 +64,7 @@ def exported(
     key = f"learner: {learner} cannot be exported"
     policy = ExportedPolicy(actor, env.full_action_spec_unbatched[keys.ACTION]).eval()
     steps = env.rollout(16, break_when_any_done=False).flatten()
-    missing = [last_name(each) for each in policy.in_keys if each not in steps.keys(True)]
+    missing = [str(each) for each in policy.in_keys if each not in steps.keys(True)]
     checks.require(
         not missing, key, ", ".join(missing), "is what its actor reads, and not in the environment"
     )
@@ -89,8 +89,3 @@ def exported(
         checks.require(found.allclose(live), key, "the actor's actions", should)
         onnx = torch.onnx.export(program, (), input_names=policy.inputs, output_names=outputs, verbose=False)
     return policy, program, onnx
-
-
-def last_name(key: NestedKey) -> str:
-    """The name of an entry, without those it is nested in."""
-    return str(keys.last_part(key))

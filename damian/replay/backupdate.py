@@ -240,7 +240,7 @@ def _rewards_changed(after: Entries, steps: TensorDictBase, changed: Tensor) -> 
 def _before(
     steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor, n_right: int
 ) -> dict[NestedKey, Tensor]:
-    """Entries before the steps [T, B] behind the right ones: what was after the step before."""
+    """Entries before the steps [T, B] that follow the right ones: those after the step before each."""
     keep = begins[n_right:].clone()
     keep[0] |= n_right == 0  # the step before the first one is not among these steps
     before: dict[NestedKey, Tensor] = {}

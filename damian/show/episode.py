@@ -230,9 +230,14 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
     dt = env.scenario.clock.dt
     time = torch.arange(len(sent), dtype=torch.float64) * dt
     belief, grid = instants.get(keys.BELIEF, None), env.server.grid
-    about = {**about, **_drawn(env, truth.drawn[:1])}
+    airspace, region = env.simulation.airspace, int(env.server.region_of(own)[0])
+    about, over = {**about, **_drawn(env, truth.drawn[:1])}, airspace.regions[region]
     return Episode(
-        **fixed_of(env, about, int(env.server.region_of(own)[0])),
+        about={**about, "region": over.name, "damian": damian.__version__},
+        region=over.polygon,
+        origin=over.origin,
+        landing_points=np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),
+        radius=env.simulation.radius,
         instant=env.simulation.vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
         time=np.asarray(time),
@@ -270,18 +275,6 @@ def _drawn(env: UavEnv, drawn: Tensor) -> dict[str, Any]:
     if env.simulation.vehicles.is_windy:
         about["wind"] = [float(values.get(f"wind.{name}", drawn)) for name in ("speed", "direction")]
     return about
-
-
-def fixed_of(env: UavEnv, about: Mapping[str, Any], region: int) -> dict[str, Any]:
-    """What an episode holds of the environment over one of its regions, beside the columns."""
-    airspace = env.simulation.airspace
-    return {
-        "about": {**about, "region": airspace.regions[region].name, "damian": damian.__version__},
-        "region": airspace.regions[region].polygon,
-        "origin": airspace.regions[region].origin,
-        "landing_points": np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),
-        "radius": env.simulation.radius,
-    }
 
 
 def _listed(values: Any, digits: int = DIGITS) -> Any:

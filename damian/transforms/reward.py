@@ -185,7 +185,7 @@ class RewardDelay(StatefulTransform):
         return entries | {key: torch.where(expand_mask(paid, earned), earned, torch.zeros_like(earned))}
 
     def _paid(self, steps: TensorDictBase, count: Tensor) -> Tensor:
-        """Whether the reward of each step has been paid by the last step, as the delay in shape."""
+        """Whether the reward of each step has been paid by the last step, in the shape of the delays."""
         delay = cast(Tensor, steps[next_key(cast(NestedKey, self.delay_key))])
         begins = expand_mask(count == 0, delay).expand_as(delay)
         step = expand_mask(torch.arange(len(delay), device=delay.device), delay).expand(delay.shape)

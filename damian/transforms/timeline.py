@@ -40,7 +40,7 @@ class ObservationTimeline(StatefulTransform):
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
         position_key: key of the observer's own position, [..., P], which it knows at once. Messages are then
             places relative to the observer (D is a multiple of P), and each slot moves them into its present
-            frame, by its own way since. Several rows of messages in order may belong to one observer.
+            frame, by its displacement since. Several rows of messages in order may belong to one observer.
         encode: function from messages [..., M] to the D numbers to keep; if not given, these are the message.
         group: every agent gets the messages of all agents: its own first, then those of the agents after it.
         own: whether an agent knows its own messages as soon as they are sent.

@@ -48,16 +48,18 @@ class Simulation:
         self.points = self.airspace.points.flatten(0, 1)
         if self.widths.requests:
             self.request_places = request_places(regions, rng)
-        shortest = self._shortest_flights()
         self.misses, self.false_alarms = (
             torch.tensor([getattr(source, name) for source in self.sources])
             for name in ("miss", "false_alarm")
         )
         """Probabilities of the reports about each source, [K]."""
         self.unsure = any(each.miss or each.false_alarm for each in self.sources)
+        """Whether reports about a source may be wrong."""
         self.draws = bool(self.sensors or self.vehicles.values.choices or self.unsure)
         """Whether first messages differ from episode to episode that begins alike."""
+        shortest = self._shortest_flights()  # refuses actions that lead nowhere
         self.shortest_flight = shortest if config.battery.enabled else None
+        """Length of the shortest flight from each landing point [m], [R*L]; None without batteries."""
         self.initial = self._initial_state(region, start, stops, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)

@@ -6,7 +6,7 @@ curves are two CSV files, which are enough for all tables and figures, without t
 
 import math
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -202,10 +202,6 @@ class Results(NamedTuple):
         again = pd.MultiIndex.from_frame(new.rows[RUN])
         kept = (old[~pd.MultiIndex.from_frame(old[RUN]).isin(again)] for old in self)
         return Results(*map(_joined, zip(kept, new, strict=True)))
-
-    def only(self, included: Callable[[pd.DataFrame], "pd.Series[bool]"]) -> "Results":
-        """Those of the rows that are included."""
-        return Results(*(rows[included(rows)] for rows in self))
 
     def write(self, folder: Path) -> None:
         """Write both files."""
