@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | test-browser | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | fleet | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | fleet | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -8,7 +8,7 @@ PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick fleet benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow coverage test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick fleet benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
@@ -29,6 +29,10 @@ test-order: $(VENV)/test
 # Property tests with thousands of new random examples each.
 test-deep: $(VENV)/test
 	$(PY) -m pytest -n 2 -m "property and not slow" --hypothesis-profile=deep $(ARGS)
+
+# Lines and branches that the tests run, programs in other processes not counted.
+coverage: $(VENV)/dev
+	$(PY) -m pytest -n 2 --cov=damian --cov=recipes --cov-branch --cov-report=term:skip-covered $(ARGS)
 
 test-slow: $(VENV)/slow
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist worksteal -m slow $(ARGS)

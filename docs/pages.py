@@ -19,7 +19,7 @@ from damian.recipes.known import SCHEMAS, Setting, default_options, groups, help
 
 ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
-TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff"}
+TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff", "SECURITY.md": "SECURITY.md"}
 TEXTS |= {"examples/fleet/README.md": "fleet.md", "examples/fleet/docs/mavlink.md": "mavlink.md"}
 """Files beside docs/, and what they are called in the site."""
 SHOWN = (*SCHEMAS,)
