@@ -21,7 +21,7 @@ from damian.common.text_files import read_text
 from damian.compare.config import CompareConfig
 from damian.learners.config import LEARNERS
 
-from .config import AdviseConfig, ExportConfig, FlyConfig, ResultsConfig, TrainConfig
+from .config import AdviseConfig, ExportConfig, FlyConfig, ResultsConfig, SubmitConfig, TrainConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 """Folder of the configuration files: one for each program, and in folders one for each option of a group."""
@@ -33,6 +33,7 @@ SCHEMAS: dict[str, type] = {
     "compare": CompareConfig,
     "export": ExportConfig,
     "results": ResultsConfig,
+    "submit": SubmitConfig,
 }
 """Settings of the programs."""
 SYNONYMS = {

@@ -1,0 +1,84 @@
+"""Check the runs of a method of delaybench, and write them as the one file of a submission.
+
+damian submit folder=runs/MYCOMPARISON method=mine "authors=A. Author, B. Author"
+
+The runs come from `damian compare` with the experiment delaybench, or one of your own that begins with it
+(docs/delaybench.md). What is submitted is the true return that damian's own evaluation has found.
+"""
+
+from pathlib import Path
+
+import hydra
+import pandas as pd
+from omegaconf import DictConfig
+from torch import Tensor
+
+from damian.common import checks
+from damian.common.tables import write_csv
+from damian.compare.comparison import RUN, TRAINED
+from damian.compare.config import Experiment
+from damian.compare.leaderboard import COLUMNS, check_submission
+from damian.runs.checkpoint import read_checkpoint
+from damian.runs.run_folder import CHECKPOINT, RESULTS, read_results
+from damian.runs.run_record import read_record
+
+from . import cli
+from .config import SubmitConfig
+from .shared.comparison_runs import stored_results
+
+
+def delaybench() -> Experiment:
+    """The experiment delaybench."""
+    return cli.settings("experiment=delaybench", program="compare").experiment
+
+
+def submission(folder: Path, method: str, authors: str) -> pd.DataFrame:
+    """The rows of a method in the folder of a comparison, beside what their run folders tell."""
+    rows = stored_results(folder).rows
+    checks.one_of("method", method, [*rows["method"].unique()])
+    rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
+    facts = []
+    for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
+        run = folder / task / delay / method / f"seed_{seed}"
+        should = "is no folder of a finished run: a submission needs those of all its runs"
+        checks.require((run / RESULTS).exists() and bool(read_record(run)), "folder", run, should)
+        found = read_results(run / RESULTS).set_index("policy")["return"]  # of damian's own evaluation
+        record = {name: read_record(run).get(name) for name in ("damian", "commit", "command")}
+        facts.append({"return": found[TRAINED], "parameters": parameters(run), **record})
+    known = rows.drop(columns=["return"]).join(pd.DataFrame(facts)).assign(authors=authors)
+    known["parameters"] = known["parameters"].max()  # of flights elsewhere there are none
+    return known[COLUMNS]
+
+
+def parameters(run: Path) -> int:
+    """Number of parameters of the networks that a run has trained; 0 if it has trained none."""
+    if not (run / CHECKPOINT).exists():
+        return 0
+    networks = read_checkpoint(run / CHECKPOINT, "folder").get("components", {})
+    return sum(_count(part) for name, part in networks.items() if "optimizer" not in name)
+
+
+def _count(value: object) -> int:
+    if isinstance(value, Tensor):
+        return value.numel()
+    return sum(map(_count, value.values())) if isinstance(value, dict) else 0
+
+
+def submit(config: SubmitConfig) -> None:
+    """Check a submission, and write its file."""
+    rows = submission(Path(config.folder), config.method, config.authors)
+    check_submission(rows, delaybench(), config.folder)
+    path = Path(f"{config.method}.csv")
+    write_csv(path, rows)
+    print(f"{path}: {len(rows)} runs; add it to docs/results/leaderboard in a pull request")
+
+
+@cli.one_line_errors("submit")
+@hydra.main(config_path="../conf", config_name="submit", version_base=None)
+@cli.one_line_errors("submit")
+def main(given: DictConfig) -> None:
+    submit(cli.checked(given, [], "submit"))
+
+
+if __name__ == "__main__":
+    main()
