@@ -37,6 +37,7 @@ from .shared.comparison_runs import (
     LOG,
     MARKDOWN,
     NO_RESULTS,
+    POINTS,
     PROFILES,
     ROWS,
     Results,
@@ -127,7 +128,8 @@ def compare(config: CompareConfig, folder: Path) -> None:
         sys.exit(1)
     results = kept.with_those_of(results_of(done, config.chosen("methods")))
     if done:
-        results.write(folder)
+        for name, rows in zip((ROWS, POINTS), results, strict=True):
+            write_csv(folder / name, rows)
     results = Results(*(rows[includes(config, rows)] for rows in results))
     if results.rows.empty:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")

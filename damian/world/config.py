@@ -11,8 +11,7 @@ from damian.common.fields import Settings, check_place, constant, rules, setting
 
 RANDOM, GEOJSON, FILES = ("random",), ("geojson",), ("fir", "geojson")
 POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
-
-
+"""Variants of a section that read a setting (``kinds``)."""
 IN_REACH = "in_reach"
 """The sensor that tells the truth about detections, for ``reward.detection=truth``."""
 RANDOMISED = (

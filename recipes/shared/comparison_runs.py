@@ -22,7 +22,6 @@ from tqdm import tqdm
 
 from damian.common import checks
 from damian.common.errors import InputError, RunError
-from damian.common.tables import write_csv
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, OF_METHOD, RUN, Method, regime
 from damian.compare.config import CompareConfig, HeldOut
 from damian.compare.figures import LABELS
@@ -202,11 +201,6 @@ class Results(NamedTuple):
         again = pd.MultiIndex.from_frame(new.rows[RUN])
         kept = (old[~pd.MultiIndex.from_frame(old[RUN]).isin(again)] for old in self)
         return Results(*map(_joined, zip(kept, new, strict=True)))
-
-    def write(self, folder: Path) -> None:
-        """Write both files."""
-        for name, rows in zip((ROWS, POINTS), self, strict=True):
-            write_csv(folder / name, rows)
 
 
 NO_RESULTS = Results(pd.DataFrame(columns=RUN), pd.DataFrame(columns=CURVE))
