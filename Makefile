@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | fleet | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | fleet | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -8,7 +8,7 @@ PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow coverage test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick fleet benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick fleet benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
@@ -37,10 +37,15 @@ coverage: $(VENV)/dev
 test-slow: $(VENV)/slow
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist worksteal -m slow $(ARGS)
 
-# The replay page in Chromium, which Debian and Ubuntu bring as these packages.
+# The replay page, and every page of the documentation site, in Chromium: Debian and Ubuntu have it in these packages.
+CHROMIUM = command -v chromium && command -v chromedriver || (apt-get update && apt-get install -y chromium chromium-driver)
 test-browser: $(VENV)/browser
-	command -v chromium && command -v chromedriver || (apt-get update && apt-get install -y chromium chromium-driver)
+	$(CHROMIUM)
 	$(PY) -m pytest -m browser tests/show/test_replay_browser.py $(ARGS)
+
+test-site: $(VENV)/browser $(VENV)/docs
+	$(CHROMIUM)
+	$(PY) -m pytest -m browser tests/test_site_browser.py $(ARGS)
 
 # With the lowest versions that pyproject.toml admits, and with the newest.
 test-lowest: build/lowest.txt

@@ -4,6 +4,7 @@ MkDocs calls the functions that begin with ``on_``.
 """
 
 import ast
+import base64
 import html
 import json
 import posixpath
@@ -16,6 +17,8 @@ from mkdocs.structure.files import File, Files
 import damian
 from damian.recipes.command import PROGRAMS
 from damian.recipes.known import SCHEMAS, Setting, default_options, groups, help_text, known_settings
+from damian.server import surroundings  # noqa: F401 (it registers features)
+from damian.server.features import FEATURES
 
 ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
@@ -50,45 +53,73 @@ NOTEBOOKS = sorted(ROOT.glob("docs/notebooks/*.ipynb"))
 
 
 def on_config(config: Any) -> Any:
-    """Add the made pages to the navigation."""
-    config.nav += [
-        {"Commands": ["commands/index.md", *[{f"damian {name}": f"commands/{name}.md"} for name in SHOWN]]},
-        {"API": ["api/index.md", *[{f"damian.{name}": f"api/{name}.md"} for name in PACKAGES]]},
-        {"Notebooks": [f"notebooks/{path.stem}.md" for path in NOTEBOOKS]},
-        {"Examples": [{path: f"examples/{path}.md"} for path in examples()]},
-        {"A service for fleets": ["fleet.md", "mavlink.md"]},
-        {"Project": [{"Contributing": "CONTRIBUTING.md"}, {"Changes": "CHANGELOG.md"}]},
-    ]
+    """Put the made pages into the navigation, in place of the folders that it names."""
+    config.nav = [with_pages(each) for each in config.nav]
     return config
 
 
+def with_pages(entry: Any) -> Any:
+    """An entry of the navigation, in which a folder's name stands for the pages made in it."""
+    if isinstance(entry, str):
+        return entry
+    ((title, content),) = entry.items()
+    if not isinstance(content, str):
+        return {title: [with_pages(each) for each in content]}
+    return {title: listed(content) if content.endswith("/") else content}
+
+
+def listed(folder: str) -> list[Any]:
+    """The made pages in a folder, its first page unnamed, as a part of the navigation."""
+    if folder == "commands/":
+        return ["commands/index.md", *({f"damian {name}": f"commands/{name}.md"} for name in SHOWN)]
+    if folder == "api/":
+        return ["api/index.md", *({f"damian.{name}": f"api/{name}.md"} for name in PACKAGES)]
+    inside = folder.removeprefix("examples/")
+    names = [path for path in examples() if (path.startswith(inside) if inside else "/" not in path)]
+    return [{path.removeprefix(inside): f"examples/{path}.md"} for path in names]
+
+
 def on_files(files: Files, config: Any) -> Files:
-    """Add the made pages."""
+    """Add the made pages, and the pictures in the outputs of notebooks."""
+    pages: dict[str, str | bytes]
     pages = {name: (ROOT / source).read_text(encoding="utf-8") for source, name in TEXTS.items()}
     pages |= {"commands/index.md": commands(), **{f"commands/{name}.md": settings(name) for name in SHOWN}}
     pages |= {"api/index.md": public_names(), **{f"api/{name}.md": package(name) for name in PACKAGES}}
-    pages |= {f"examples/{path}.md": example(path) for path in examples()}
-    pages |= {f"notebooks/{path.stem}.md": notebook(path) for path in NOTEBOOKS}
-    for name, text in pages.items():
-        files.append(File.generated(config, name, content=text))
+    pages |= {f"examples/{path}.md": example(path) for path in examples()} | {"features.md": features()}
+    for path in NOTEBOOKS:
+        pages |= notebook(path)
+    for name, content in pages.items():
+        files.append(File.generated(config, name, content=content))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Lead the links of the project's texts, which lead to its files, to pages of the site."""
+    """Lead the links of the project's texts, which lead to its files, to pages of the site; mend pictures."""
     page_name = page.file.src_uri
-    if page_name.startswith(("api/", "commands/", "examples/", "notebooks/")):
+    if page_name.startswith(("api/", "commands/", "examples/")):
         return markdown
+    markdown = re.sub(r"<img\s[^>]*>", picture, markdown)
     files = {name: path for path, name in TEXTS.items()}
-    folder = posixpath.dirname(files.get(page_name, "docs/"))
+    folder = posixpath.dirname(files.get(page_name, f"docs/{page_name}"))
 
     def lead(match: re.Match[str]) -> str:
-        path = posixpath.normpath(posixpath.join(folder, match[2]))
+        path = posixpath.normpath(posixpath.join(folder, match[1]))
         if path.startswith("examples/") and path not in TEXTS:
-            return f"{match[1]}{path}.md"
-        return match[1] + TEXTS.get(path, path.removeprefix("docs/"))
+            path += ".md"
+        if path.startswith("damian/"):  # a module; its page has a heading for it
+            module = path.removesuffix(".py").replace("/", ".")
+            path = f"api/{module.split('.')[1]}.md#{module}"
+        site = TEXTS.get(path, path.removeprefix("docs/"))
+        return f"]({posixpath.relpath(site, posixpath.dirname(page_name) or '.')}"
 
-    return re.sub(r'(\]\(|src=")((?!https?:|#)[^)#"]+)', lead, markdown)
+    return re.sub(r"\]\(((?!https?:|#)[^)#\"]+)", lead, markdown)
+
+
+def picture(tag: re.Match[str]) -> str:
+    """A picture in Markdown, of one in HTML: MkDocs leads only the former to where its file is."""
+    given = dict(re.findall(r'(\w+)="([^"]*)"', tag[0]))
+    text, width = " ".join(given["alt"].split()), given.get("width")
+    return f"![{text}]({given['src']})" + f'{{ width="{width}" }}' * (width is not None)
 
 
 def commands() -> str:
@@ -146,6 +177,17 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def features() -> str:
+    """The features that an observation may have, as a table."""
+    head, rows = ("feature", "scope", "meaning"), []
+    for name in FEATURES:
+        feature = FEATURES.get(name, "")
+        meaning = re.sub(r",? ?\[\*[^]]*\]", "", " ".join((feature.compute.__doc__ or "").split()))
+        rows.append((code(name), feature.scope, meaning.replace("``", "`").replace("|", "&#124;")))
+    text = "What settings of `observation` may name ([your own](extending.md))."
+    return "\n\n".join(["# Features of an observation", text, table(head, rows)])
+
+
 def public_names() -> str:
     """The names that ``import damian`` offers."""
     parts = ["# damian", "`import damian` offers these names, and loads each when it is first used.", ""]
@@ -180,13 +222,22 @@ def example(path: str) -> str:
     return f"# {path}\n\n```{language}\n{(ROOT / 'examples' / path).read_text(encoding='utf-8')}```\n"
 
 
-def notebook(path: Path) -> str:
-    """The page of a notebook, without the outputs."""
+def notebook(path: Path) -> dict[str, str | bytes]:
+    """The page of a notebook with its outputs, and their pictures."""
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    texts = [("".join(cell["source"]), cell["cell_type"] == "code") for cell in cells]
-    link = f"[{path.name}]({path.name}) runs in Jupyter."
-    parts = [f"```python\n{text}\n```" if is_code else text for text, is_code in texts]
-    return "\n\n".join([parts[0], link, *parts[1:]])
+    parts = ["".join(cells[0]["source"]), f"[{path.name}]({path.name}) runs in Jupyter."]
+    pictures: dict[str, str | bytes] = {}
+    for cell in cells[1:]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        for output in cell.get("outputs", ()):
+            if "text" in output:
+                parts.append(f"```text\n{''.join(output['text'])}```")
+            if data := output.get("data", {}).get("image/png"):
+                name = f"{path.stem}_{len(pictures)}.png"
+                pictures[f"notebooks/{name}"] = base64.b64decode(data)
+                parts.append(f"![Output of the code above]({name})")
+    return {f"notebooks/{path.stem}.md": "\n\n".join(parts), **pictures}
 
 
 def docstring(path: Path) -> str:

@@ -53,5 +53,13 @@ def test_every_file_that_a_document_links_to_exists(file):
     assert all((file.parent / (link or image)).exists() for link, image in links)
 
 
+def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
+    guide = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+    results = (ROOT / "RESULTS.md").read_text(encoding="utf-8")
+    numbers = {*re.findall(r"-?\d+\.\d|-\d{3,}", guide)}
+    assert len(numbers) > 20
+    assert [number for number in numbers if not re.search(rf"(?<![\d.]){number}(?![\d.]\d)", results)] == []
+
+
 def test_the_citation_names_this_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == damian.__version__

@@ -1,15 +1,15 @@
 """The replay page in a real browser: it shows the numbers of the episode, and every part of it draws.
 
-Run by `make test-browser`. Selenium is imported where it is used, so that the other tests do not need it.
+Run by `make test-browser`.
 """
 
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
-from shutil import which
 
 import numpy as np
 import pytest
+from chromium import chromium, problems, resize
 from episodes import crowd, flight
 
 from damian import compose_scenario
@@ -20,8 +20,7 @@ from damian.show.episode import record
 from damian.show.replay_page import save_page
 
 pytestmark = pytest.mark.browser
-FLAGS = ["--headless=new", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
-FLAGS += ["--enable-unsafe-swiftshader", "--hide-scrollbars"]
+WEBGL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LAST, LATE = 20, 4
 
 
@@ -38,14 +37,8 @@ def late_flight():
 @pytest.fixture(scope="module")
 def browser():
     """Chromium without a screen, whose WebGL is computed by the processor."""
-    webdriver = import_module("selenium.webdriver")
-    options = webdriver.ChromeOptions()
-    for flag in FLAGS:
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(which("chromedriver")))
-    yield driver
-    driver.quit()
+    with chromium(*WEBGL) as driver:
+        yield driver
 
 
 class Page:
@@ -107,15 +100,13 @@ def opened(browser, tmp_path):
     @contextmanager
     def open_page(episode):
         save_page([episode], tmp_path / "page.html")
-        size = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        resize(browser, 1280)
         browser.get((tmp_path / "page.html").as_uri())
         page = Page(browser)
         page.wait(lambda: page.run("return document.documentElement.dataset.ready"))
         page.settle()
         yield page
-        problems = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
-        assert problems == []
+        assert problems(browser) == []
 
     return open_page
 
