@@ -3,7 +3,6 @@
 python docs/figures.py    (make pictures)
 """
 
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -124,7 +123,7 @@ def main() -> None:
 def plot_matrix(path: Path) -> None:
     """Draw delaybench: returns over the delay of the flight, a line for each training."""
     config = cli.settings(*SHOWN, program="compare")
-    results = stored_results(path.parent).only(partial(includes, config))
+    results = (rows[includes(config, rows)] for rows in stored_results(path.parent))
     table = Comparison(*results, config.experiment.methods).table
     rows = table.set_index(["method", "delay", "task", "policy"])[["return" + end for end in ENDS]]
     constant = [str(steps) for steps in range(9)]
