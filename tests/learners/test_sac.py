@@ -48,6 +48,11 @@ def test_the_target_entropy_is_a_share_of_the_entropy_of_a_uniform_choice_among_
     assert unmasked.item() == pytest.approx(math.log(n_actions) / 2)
 
 
+def test_the_target_entropy_of_continuous_actions_is_minus_one_for_each_on_an_interval_of_length_two():
+    learner = learner_of(UavEnv(everything(kind="continuous"), 2))  # whose actions lie in [0, 1]
+    assert float(learner.loss.target_entropy) == pytest.approx(2 * (math.log(0.5) - 1))
+
+
 @pytest.mark.parametrize("mask", [True, False])
 def test_the_discrete_losses_and_their_gradients_are_torchrls(mask):
     env = UavEnv(everything("polynomial", actions=ActionConfig(kind="discrete", mask=mask)), 8)
