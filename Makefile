@@ -105,8 +105,8 @@ pictures: $(VENV)/base
 	cp build/flight/episode_0.gif docs/images/flight.gif
 	$(PY) docs/figures.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
-	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench "delays=['4']" \
-	  "methods=[undelayed,naive,naive+history,naive+gru,naive+gru+tuned,backupdate,backupdate+history,backupdate+gru,untrained,deployed]" > build/delaybench.md
+	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench "tasks=[crowded]" \
+	  "delays=['1-7',lag,paper]" "methods=[undelayed,naive,naive+gru,naive+timeline,backupdate,backupdate+gru,backupdate+gru+hold,timeline,timeline+gru]" > build/delaybench.md
 
 # The documentation site, in build/site.
 docs: $(VENV)/docs
