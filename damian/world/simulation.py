@@ -53,6 +53,8 @@ class Simulation:
             for name in ("miss", "false_alarm")
         )
         """Probabilities of the reports about each source, [K]."""
+        self.pairs = torch.arange(config.agents * len(self.sources)).view(config.agents, -1)
+        """Numbers of the pairs of a UAV and a source, [N, K]; made within a step, they would not compile."""
         self.unsure = any(each.miss or each.false_alarm for each in self.sources)
         """Whether reports about a source may be wrong."""
         self.draws = bool(self.sensors or self.vehicles.values.choices or self.unsure)
@@ -201,10 +203,9 @@ class Simulation:
             return in_reach
         miss = miss.unsqueeze(-1) if isinstance(miss, Tensor) else self.misses
         alarm = alarm.unsqueeze(-1) if isinstance(alarm, Tensor) else self.false_alarms
-        number = torch.arange(in_reach[0].numel(), device=in_reach.device).view(in_reach.shape[1:])
         counters = torch.full_like(state.episode, _REPORT), state.episode, state.steps
         seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
-        share = counter_rng.uniform(seed, *counters, number)
+        share = counter_rng.uniform(seed, *counters, self.pairs)
         return torch.where(in_reach, share >= miss, listens & (share < alarm))
 
     def _stops(

@@ -50,6 +50,8 @@ class MotionModel(ABC):
         if not self.instant:
             check_levels(levels, airspace)
         self.levels = torch.tensor(levels)
+        self.gusts = torch.arange(2 * config.agents).view(-1, 2)
+        """Numbers of the two draws of each UAV's gust, [N, 2]; made within a step, they would not compile."""
         self.chargers = _charging_points(config, airspace)
 
     @abstractmethod
@@ -222,12 +224,9 @@ class PolynomialFlight(MotionModel):
         """Way of each flight through the air that begins now [m], gusts included, [B, N]."""
         if not self.is_windy:
             return self.airspace.length(state.origin, state.goal)
-        uav = torch.arange(state.goal.shape[1], device=state.goal.device)
-        seed, episode, steps = (each.unsqueeze(-1) for each in (state.seed, state.episode, state.steps))
-        size, turn = (
-            counter_rng.uniform(seed, torch.full_like(episode, _GUST), episode, steps, 2 * uav + i)
-            for i in (0, 1)
-        )
+        counters = torch.full_like(state.episode, _GUST), state.episode, state.steps
+        seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
+        size, turn = counter_rng.uniform(seed, *counters, self.gusts).unbind(-1)
         size = times((-2 * (1 - size).log()).sqrt(), self.values.get("wind.gusts", state.drawn))
         gust = displacement(size, 2 * math.pi * turn)  # normal east and north (Box and Muller, 1958)
         return self._through(state, state.origin, state.goal, self._wind(state).unsqueeze(-2) + gust)[0]

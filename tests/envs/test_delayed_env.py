@@ -27,6 +27,7 @@ from damian.keys import (
     RECEIVED,
     REWARD,
 )
+from damian.recipes.shared.environments import compose_scenario
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
 from damian.world.landing import ActionConfig
 
@@ -200,6 +201,18 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, kin
 def test_a_compiled_step_equals_torchrls_too(motion, route):
     scenario = everything(motion, **ROUTES[route])
     check_equals_torchrls_way(scenario, delayed(scenario).compile(backend="eager"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["search_and_rescue", "convoy", "patrol", "requests"])
+def test_a_scenario_compiles_to_kernels(name):
+    scenario = compose_scenario(f"scenario={name}", "delay.obs=1..3", "delay.loss=0.1")
+    eager, compiled = (make_env(scenario, 4, seed=0) for _ in range(2))
+    compiled.compile()
+    actions = choices(eager, 8)
+    for expected, found in zip(steps_of(eager, actions), steps_of(compiled, actions), strict=True):
+        for key, value in expected.items(True, True):
+            torch.testing.assert_close(found[key], value, msg=str(key), equal_nan=True)
 
 
 def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None:
