@@ -53,10 +53,10 @@ POSITION = (AGENTS, "position")
 """True position of each UAV at this instant, east and north [m], [B, N, 2]; for delay laws, never for an
 actor."""
 BELIEF = "belief"
-"""Probability that the source is in each cell of the server's grid, as far as the messages tell that have
-arrived, [B, K]."""
+"""Probability that each source is in each cell of the server's grid, as far as the messages tell that have
+arrived, [B, K, C]."""
 OWN_BELIEF = (AGENTS, "belief")
-"""The same as each UAV knows it, whose own messages are not delayed for it, [B, N, K]."""
+"""The same as each UAV knows it, whose own messages are not delayed for it, [B, N, K, C]."""
 STATE = "state"
 """The simulator's true state, [B, S]: of each UAV the position (east, north, up [m]), of each the battery
 level [%], whether the source emits, and its position [m]. For drawing and references, never an actor."""

@@ -96,7 +96,9 @@ def describe(run: Path, policy: ExportedPolicy, env: DelayedEnv, any_number: boo
 
 def columns(scenario: ScenarioConfig, n_columns: int) -> list[dict[str, Any]]:
     """Describe the columns of an observation, in order; the server has scaled them already."""
-    widths, found = {"agent_distances": scenario.agents - 1, "belief_gain": scenario.actions.n_actions}, []
+    sources, found = scenario.source.count, []
+    widths = {"agent_distances": scenario.agents - 1, "belief_gain": scenario.actions.n_actions}
+    widths |= {"belief_moments": 4 * sources, "belief_map": 24 * sources}
     for name in scenario.observation.actor:
         feature = feature_of(name)
         width = widths.get(name, feature.width)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from damian.server.belief import SourceGrid
@@ -12,22 +13,20 @@ Steps = Sequence[tuple[list[int], list[int]]]
 
 
 def belief(
-    grid: SourceGrid, region: int, first: list[int], steps: Steps, now: int, viewer: int | None = None
+    grid: SourceGrid, place: int, first: list[int], steps: Steps, now: int, viewer: int | None = None
 ) -> list[float]:
     """Probability of each cell after the last of the steps, knowing what has arrived by step ``now``.
 
+    ``place`` is the index of the tables of the source for its region.
     ``viewer`` is the UAV that knows its own messages at once; None is the server.
     """
-    prior = grid.prior[region].tolist()
+    prior, moves = grid.prior[place].tolist(), moves_of(grid, place)
     cells = range(len(prior))
-    probable, before = _weighed(grid, prior, first), first
+    probable, before = _weighed(grid, place, prior, first), first
     for sent_at, (rows, delays) in enumerate(steps, 1):
         moved = [0.0] * len(prior)
         for a in cells:
-            if grid.moves is None:
-                moved[a] = probable[a]
-                continue
-            inside = [float(grid.moves[a, b]) if prior[b] > 0 else 0.0 for b in cells]
+            inside = [float(moves[a, b]) if prior[b] > 0 else 0.0 for b in cells]
             for b in cells:
                 moved[b] += probable[a] * inside[b] / sum(inside) if probable[a] else 0.0
         known = [
@@ -38,36 +37,44 @@ def belief(
             row + grid.no_report // 2 if row == earlier != grid.no_report else row
             for row, earlier in zip(known, before, strict=True)
         ]
-        probable, before = _weighed(grid, moved, again), known
+        probable, before = _weighed(grid, place, moved, again), known
     return probable
 
 
-def _weighed(grid: SourceGrid, probable: list[float], rows: list[int]) -> list[float]:
-    weighed = []
+def moves_of(grid: SourceGrid, place: int) -> Tensor:
+    """Weights of the moves of a source from cell to cell, [C, C]."""
+    if grid.moves is None:
+        return torch.eye(len(grid.centres))
+    return grid.moves[place * len(grid.moves) // len(grid.prior)]
+
+
+def emission_of(grid: SourceGrid, place: int) -> float:
+    """Probability that a source emits in a step."""
+    return 1.0 if grid.emits is None else float(grid.emits[place])
+
+
+def _weighed(grid: SourceGrid, place: int, probable: list[float], rows: list[int]) -> list[float]:
+    weighed, emits, alarm = [], emission_of(grid, place), float(grid.false_alarm[place])
     for cell, chance in enumerate(probable):
         heard, silent = 1.0, 1.0
         for row in rows:
             heard *= math.exp(float(grid.log_reports[row, cell]))
-            alarm = grid.false_alarm
             silent *= alarm if row % 2 == 1 else 1.0 if row == grid.no_report else 1 - alarm
-        weighed.append(chance * (grid.emits * heard + (1 - grid.emits) * silent))
+        weighed.append(chance * (emits * heard + (1 - emits) * silent))
     return [each / sum(weighed) for each in weighed]
 
 
 def detection_table(grid: SourceGrid) -> Tensor:
-    """Probability that a UAV on a landing point detects a source that emits in a cell, [R*L, K]."""
+    """Probability that a UAV on a landing point detects a source that emits in a cell, [P*L, C]."""
     return grid.log_reports[1 : grid.no_report // 2 : 2].exp()
 
 
-def chance_at(grid: SourceGrid, region: int, probable: Tensor, point: int) -> float:
+def chance_at(grid: SourceGrid, place: int, probable: Tensor, point: int) -> float:
     """Probability of detecting the source in the next step from a landing point, by its flat id."""
-    prior, total, detects = grid.prior[region].tolist(), 0.0, detection_table(grid)[point]
+    prior, total, detects = grid.prior[place].tolist(), 0.0, detection_table(grid)[point]
+    moves, emits = moves_of(grid, place), emission_of(grid, place)
     for a, chance in enumerate(probable.tolist()):
-        inside = {
-            b: float(grid.moves[a, b]) if grid.moves is not None else float(a == b)
-            for b in range(len(prior))
-            if prior[b] > 0
-        }
+        inside = {b: float(moves[a, b]) for b in range(len(prior)) if prior[b] > 0}
         if chance:
             total += sum(chance * w / sum(inside.values()) * float(detects[b]) for b, w in inside.items())
-    return grid.emits * total + (1 - grid.emits) * grid.false_alarm
+    return emits * total + (1 - emits) * float(grid.false_alarm[place])

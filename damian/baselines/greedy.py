@@ -15,7 +15,7 @@ from damian.common import checks
 from damian.common.tensors import distances, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
-from damian.server.belief import chance_of_staying, detection_chance, report_rows
+from damian.server.belief import any_of, chance_of_staying, detection_chance, places, report_rows
 from damian.server.surroundings import known_requests
 from damian.world.messages import Messages
 
@@ -185,23 +185,23 @@ class Searcher(Greedy):
         own_belief: Tensor | None = None,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M] and beliefs [B, K].
+        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M] and beliefs [B, K, C].
 
         Where each UAV knows its own messages, ``own_message`` [B, N, M] are these, and
-        ``own_belief`` [B, N, K] follows from them.
+        ``own_belief`` [B, N, K, C] follows from them.
         """
         known = self.unpack(message)
         own = known if own_message is None else self.unpack(own_message)
         region = self.region_of(known)
         belief = belief.unsqueeze(1) if own_belief is None else own_belief
         assert self.grid is not None
-        regions = region.unsqueeze(1).expand(belief.shape[:2])
+        place = places(self.grid, region).unsqueeze(1).expand(belief.shape[:3])
         ground = self.points[region]
-        chance = detection_chance(self.grid, belief, regions).expand(-1, known.time.shape[1], -1)
+        chance = any_of(detection_chance(self.grid, belief, place)).expand(-1, known.time.shape[1], -1)
         here = own.trail[..., :1] % self.points.shape[1]
-        rows = report_rows(self.grid, own)
+        rows = report_rows(self.grid, own).movedim(-1, -2)
         each = belief.expand(*rows.shape, -1)
-        stays = chance_of_staying(self.grid, each, rows.unsqueeze(-1))
+        stays = any_of(chance_of_staying(self.grid, each, rows.unsqueeze(-1)))
         chance = chance.scatter(-1, here, stays).masked_fill(self.taken(known), 0.0)
         near = distances(own.target, ground) <= self.from_others(known, ground)
         probable = chance.amax(-1, keepdim=True) >= PROBABLE

@@ -90,8 +90,6 @@ class ScenarioConfig(WorldConfig):
         self.refuse(observation.own and links == "updown", "observation.own", problem)
         problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
         self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
-        problem = "does not go with several sources: the filter follows one"
-        self.refuse(observation.belief and self.source.count > 1, "observation.belief", problem)
         drawn = any(key.startswith("source.") for key in self.randomise)
         problem = "does not go with randomise of the source: the filter knows its settings"
         self.refuse(observation.belief and drawn, "observation.belief", problem)

@@ -16,6 +16,7 @@ from damian.server.belief import (
     advance_beliefs,
     begin_beliefs,
     empty_window,
+    places,
     report_rows,
 )
 from damian.server.server import Server
@@ -125,11 +126,11 @@ class ServerNode(WorldTransform):
 
 
 class Belief(WorldTransform):
-    """Writes the probability that the source is in each cell of a grid, by Bayes' rule.
+    """Writes the probability that each source is in each cell of a grid, by Bayes' rule.
 
     The belief is exact for the messages that have arrived by now, whenever they were sent: when one comes in
-    late, the filter runs again from the step in which it was sent. It writes ``belief`` [B, K] and, if
-    ``own``, that of each UAV, which knows its own messages at once, ``("agents", "belief")`` [B, N, K].
+    late, the filter runs again from the step in which it was sent. It writes ``belief`` [B, K, C] and, if
+    ``own``, that of each UAV, which knows its own messages at once, ``("agents", "belief")`` [B, N, K, C].
 
     Args:
         server: server node, whose grid the belief is about.
@@ -145,28 +146,37 @@ class Belief(WorldTransform):
         self.step_keys = reads
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]
-        return empty_window(self.grid, self.longest, n_worlds, n_agents, self.own)._asdict()
+        n_beliefs, n_agents = self.rows.numel() * len(self.grid.first), tensordict[keys.MESSAGE].shape[-2]
+        return empty_window(self.grid, self.longest, n_beliefs, n_agents, self.own)._asdict()
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         messages = self.server.messages(self.to_rows(entries[keys.MESSAGE]))
-        region = self.server.region_of(messages)
-        return memory, self._written(begin_beliefs(self.grid, Window(**memory), messages, region, mask))
+        rows, place = report_rows(self.grid, messages), places(self.grid, self.server.region_of(messages))
+        beliefs = begin_beliefs(
+            self.grid, Window(**memory), rows.flatten(0, 1), place.flatten(), self._of_each(mask)
+        )
+        return memory, self._written(beliefs)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         rows = {key: self.to_rows(entries[key]) for key in self.in_keys}
         messages = self.server.messages(rows[keys.MESSAGE])
         report = report_rows(self.grid, messages, rows[keys.MESSAGE_SENT])
-        delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(report)
         region = self.server.region_of(messages)
+        delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(messages.motions)
         every = torch.ones_like(region, dtype=torch.bool)
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        window, beliefs = advance_beliefs(self.grid, Window(**memory), report, delay, region, stepped)
+        told = report.flatten(0, 1), self._of_each(delay), places(self.grid, region).flatten()
+        window, beliefs = advance_beliefs(self.grid, Window(**memory), *told, self._of_each(stepped))
         return window._asdict(), self._written(beliefs)
 
+    def _of_each(self, values: Tensor) -> Tensor:
+        """Values of worlds [B, ...] for the belief about each source, [B K, ...]."""
+        return values.repeat_interleave(len(self.grid.first), 0)
+
     def _written(self, beliefs: Beliefs) -> Entries:
-        pairs = zip(self.out_keys, beliefs, strict=False)  # the own ones are none if they are not wanted
-        return {key: self.from_rows(belief) for key, belief in pairs}
+        server, own = (each.unflatten(0, (-1, len(self.grid.first))) for each in beliefs)
+        pairs = zip(self.out_keys, (server, own.transpose(1, 2)), strict=False)  # own ones if they are wanted
+        return {key: self.from_rows(belief.contiguous()) for key, belief in pairs}
 
     @property
     def grid(self) -> SourceGrid:
@@ -176,10 +186,10 @@ class Belief(WorldTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         worlds, n_agents = observation_spec[keys.MESSAGE].shape[:-2], observation_spec[keys.MESSAGE].shape[-2]
-        n_cells = self.grid.prior.shape[-1]
+        cells = len(self.grid.first), self.grid.prior.shape[-1]
         for key, shape in ((keys.BELIEF, worlds), (keys.OWN_BELIEF, (*worlds, n_agents))):
             if key in self.out_keys:
-                size = torch.Size((*shape, n_cells))
+                size = torch.Size((*shape, *cells))
                 observation_spec[key] = Bounded(0.0, 1.0, size, device=observation_spec.device)
         return observation_spec
 
@@ -233,6 +243,7 @@ def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, age
         messages = transform.server.messages(message.view(1, 1, -1))
         slot = (memory["slot"] + 1 - lag) % len(memory["report"])
         every = torch.ones_like(messages.spotted)
-        memory["report"][slot, agent] = report_rows(transform.grid, messages, every).view(-1)
+        source = torch.arange(len(slot), device=slot.device)
+        memory["report"][slot, agent, source] = report_rows(transform.grid, messages, every).view(-1)
         memory["delay"][slot, agent] = lag
     return memory

@@ -10,7 +10,7 @@ from damian import keys
 from damian.keys import next_key
 from damian.replay.backupdate import Recompute
 from damian.replay.hindsight import arrived_by_now
-from damian.server.belief import likelihood, predict, repeated, report_rows, weigh
+from damian.server.belief import likelihood, places, predict, repeated, report_rows, weigh
 from damian.server.server import Server
 
 CORRECTED = {"reward": keys.REWARD, "critic": keys.GLOBAL_OBSERVATION, "actor": keys.OBSERVATION}
@@ -47,22 +47,23 @@ def server_recompute(
 
 
 def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
-    """The belief after each stored step, from what has arrived by now, [T, B, K]; the first is final."""
+    """The belief after each stored step, from what has arrived by now, [T, B, K, C]; the first is final."""
     assert server.grid is not None
     grid, messages = server.grid, server.messages(steps[next_key(keys.MESSAGE)])
     delay = steps[next_key(keys.DELAY)].squeeze(-1)
     step = torch.arange(len(delay), device=delay.device).view(-1, 1, 1)
     arrived = arrived_by_now(delay, len(delay) - 1 - step)
-    begins = steps[keys.STEP_COUNT] == 0
+    begins = (steps[keys.STEP_COUNT] == 0).unsqueeze(-1)
     before, after = steps[keys.BELIEF], steps[next_key(keys.BELIEF)]
     rows, first = report_rows(grid, messages, arrived), server.messages(steps[keys.MESSAGE])
     first = report_rows(grid, first, torch.ones_like(first.spotted))
     previous = torch.where(begins, first, rows.roll(1, 0))
-    likely, region = likelihood(grid, repeated(grid, rows, previous)), server.region_of(messages)
+    place = places(grid, server.region_of(messages))
+    likely = likelihood(grid, repeated(grid, rows, previous), place)
     belief, corrected = before[0], []
     for i in range(len(delay)):  # each belief follows from the one before
         belief = torch.where(begins[i], before[i], belief)
-        belief = weigh(predict(grid, belief, region[i]), likely[i])
+        belief = weigh(predict(grid, belief, place[i]), likely[i])
         if i == 0:  # where its episode began earlier, what had been reported then is not known
             belief = torch.where(begins[0], belief, after[0])
         corrected.append(belief)

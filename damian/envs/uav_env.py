@@ -53,7 +53,8 @@ class UavEnv(EnvBase):
       ``message_sent``: whether it was sent in this step, [B, N];
     - ``position``: true position, east and north in the coordinates of the settings [m], [B, N, 2];
     - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, with the belief
-      that the source is in its cell, and the offset to it (over the region's size, [-1, 1]), [B, N, G + 2];
+      that each source is in its cell, and the offset to the nearest (over the region's size, [-1, 1]),
+      [B, N, G + 2];
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
     At the root lie ``state`` (the simulator's truth, never for an actor), ``success``, and TorchRL's
@@ -239,7 +240,7 @@ class UavEnv(EnvBase):
         """Observation of a critic that knows the simulator's true state, [B, N, G + 2]."""
         grid = self.server.grid
         if global_observation is None or grid is not None:
-            belief = None if grid is None else certain_belief(grid, state.source[:, 0])
+            belief = None if grid is None else certain_belief(grid, state.source)
             features = self.server.features(state.sent, state.steps, belief=belief)
             _, global_observation = self.server.observations(features)
         scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)

@@ -1,15 +1,23 @@
-"""Where the source is, as far as messages tell: a Bayes filter over the cells of a grid.
+"""Where the sources are, as far as messages tell: a Bayes filter of each over the cells of a grid.
 
-``SourceGrid`` tabulates what a server assumes of the source, the filter turns reports into probabilities, and
-a ``Window`` repeats its latest steps when messages of them come in late: a belief is exact for the messages
-that have arrived. All functions of the filter are pure and batched.
+``SourceGrid`` tabulates what a server assumes of the sources, the filter turns reports into probabilities,
+and a ``Window`` repeats its latest steps when messages of them come in late: a belief is exact for the
+messages that have arrived. All functions of the filter are pure and batched.
+
+A message tells which sources its UAV reports. Misses and false alarms of one source are drawn independently
+of those of the others: in each step, a listening UAV out of reach of a source reports that very source with
+its probability ``false_alarm``. So what is reported of the others says nothing of a source, and each one's
+filter is exact without them.
 
 Everywhere, ``grid`` is a ``SourceGrid``, ``rows`` are rows of its table ``log_reports`` [*, N], a ``belief``
-is the probability of each of its K cells [*, K], and ``region`` the index of the region [*].
+is the probability of each of its C cells [*, C], and ``place`` the index of a source's table for its region
+(``places``) [*]. One of the dimensions * is that of the K sources.
 """
 
+import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +30,7 @@ from damian.common import checks, devices
 from damian.common.tensors import gather_rows, tree_map
 from damian.world.airspace import Airspace
 from damian.world.messages import Messages
-from damian.world.signal_source import SourceConfig, draw_walks, locate
+from damian.world.signal_source import SourceConfig, draw_walks, footprint_radius, locate
 
 # The grid: cells, and tables over them.
 
@@ -45,48 +53,89 @@ _RARE = 1e-6
 
 
 class SourceGrid(NamedTuple):
-    """Cells in which the source may be, ``K`` of them, in ``R`` regions with ``L`` landing points each."""
+    """``C`` cells in which the sources may be, in ``R`` regions with ``L`` landing points each.
+
+    Sources that are alike share their tables. The tables of each of G kinds of sources lie behind each other,
+    as if they were of further regions: P = G R places.
+    """
 
     centres: Tensor
-    """Centres of the cells, east, north [m], [K, 2]."""
+    """Centres of the cells, east, north [m], [C, 2]."""
     prior: Tensor
-    """Share of each region's area that lies in each cell, [R, K]."""
+    """Share of each region's area that lies in each cell, [P, C]."""
     moves: Tensor | None
-    """Weights of the source's moves in a step, from cell to cell, [K, K]; None if it does not move. If there
-    is only one region, they are probabilities."""
+    """Weights of a source's moves in a step, from cell to cell, [G, C, C]; None if none moves. If there is
+    only one region, they are probabilities."""
     staying: Tensor
-    """Sum of the weights of the moves from each cell that end in the region, [R, K]."""
+    """Sum of the weights of the moves from each cell that end in the region, [P, C]."""
     next_detection: Tensor
-    """Probability that a UAV that lands next on a point detects the source in a cell now, [R*L, K]."""
+    """Probability that a UAV that lands next on a point detects the source in a cell now, [P*L, C]."""
     next_staying: Tensor
-    """The same for one that stays, [2*R*L + 1, K]: row 2p if it detects nothing now on the landing point of
+    """The same for one that stays, [2*P*L + 1, C]: row 2p if it detects nothing now on the landing point of
     flat id p, row 2p + 1 if it detects the source. The last row, of zeros: it is in flight."""
     log_reports: Tensor
-    """Log-probability of what a UAV reports if the source emits in a cell, [4*R*L + 1, K]: rows as above;
-    2*R*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
-    emits: float
-    """Probability that the source emits in a step."""
-    false_alarm: float
-    """Probability of a report from out of reach."""
+    """Log-probability of what a UAV reports if the source emits in a cell, [4*P*L + 1, C]: rows as above;
+    2*P*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
+    emits: Tensor | None
+    """Probability that the source emits in a step, [P] in double precision; None if all always emit."""
+    false_alarm: Tensor
+    """Probability of a report from out of reach, [P] in double precision."""
+    first: Tensor
+    """Index of the first region's tables for each source, [K]."""
 
     @property
     def no_report(self) -> int:
         """The row of ``log_reports`` that stands for no report."""
         return len(self.log_reports) - 1
 
+    @property
+    def n_points(self) -> int:
+        """Largest number of landing points in a region, L."""
+        return self.no_report // 4 // len(self.prior)
+
+
+def build_source_grids(
+    airspace: Airspace, sources: Sequence[SourceConfig], dt: float, cell: float | None = None
+) -> SourceGrid:
+    """The grid of K sources: ``build_source_grid`` of each kind, with cells as for the faintest of them."""
+    alike = [replace(each, position=None) for each in sources]
+    kinds = [each for number, each in enumerate(alike) if each not in alike[:number]]
+    cell = cell or _edge([region.polygon for region in airspace.regions], min(map(footprint_radius, kinds)))
+    grids = [build_source_grid(airspace, kind, footprint_radius(kind), dt, cell) for kind in kinds]
+    still, half = torch.eye(len(grids[0].centres)).unsqueeze(0), grids[0].no_report // 2
+    moves = [still if each.moves is None else each.moves for each in grids]
+    reports = [each.log_reports[rows] for rows in (slice(half), slice(half, -1)) for each in grids]
+    last, emits = grids[0].log_reports[-1:], torch.cat([each.emits for each in grids])
+    return SourceGrid(
+        centres=grids[0].centres,
+        prior=torch.cat([each.prior for each in grids]),
+        moves=None if all(each.moves is None for each in grids) else torch.cat(moves),
+        staying=torch.cat([each.staying for each in grids]),
+        next_detection=torch.cat([each.next_detection for each in grids]),
+        next_staying=torch.cat([*(each.next_staying[:-1] for each in grids), last]),
+        log_reports=torch.cat([*reports, last]),
+        emits=emits if (emits < 1).any() else None,
+        false_alarm=torch.cat([each.false_alarm for each in grids]),
+        first=torch.tensor([kinds.index(each) for each in alike]) * len(airspace.regions),
+    )
+
+
+def _edge(polygons: list, radius: float) -> float:
+    """Edge of a cell that the settings do not give [m]."""
+    return max(CELL * radius, math.sqrt(max(polygon.area for polygon in polygons) / MOST_CELLS))
+
 
 def build_source_grid(
     airspace: Airspace, source: SourceConfig, radius: float, dt: float, cell: float | None = None
 ) -> SourceGrid:
-    """Lay the grid over all regions, and tabulate what is known of the source (lengths in metres).
+    """Lay the grid over all regions, and tabulate what is known of one source (lengths in metres).
 
     How it moves is counted from walks as the settings draw them. Whether it emits is taken as drawn anew at
     every step: with ``emission=per_stop``, silence counts for too much.
     """
     polygons = [region.polygon for region in airspace.regions]
-    area = max(polygon.area for polygon in polygons)
-    edge = cell or max(CELL * radius, math.sqrt(area / MOST_CELLS))
-    n_cells = math.ceil(area / edge**2)  # at least
+    edge = cell or _edge(polygons, radius)
+    n_cells = math.ceil(max(polygon.area for polygon in polygons) / edge**2)  # at least
     should = f"makes {n_cells} cells, more than {_MAX_CELLS}: take larger ones"
     checks.require(n_cells <= _MAX_CELLS, "observation.belief_cell", f"{edge:g} m", should)
     columns = _columns(polygons, edge)
@@ -99,21 +148,31 @@ def build_source_grid(
         moves = _moves(columns, _displacements(polygons, source, dt) / edge)
         staying = (prior > 0).float() @ moves.T
         if len(polygons) == 1:
-            moves = moves * (prior > 0) / staying.T
+            moves, staying = moves * (prior > 0) / staying.T, torch.ones_like(prior)
     shares = [
         _detected_shares(*each, columns * edge, edge, radius)
         for each in zip(polygons, airspace.points, strict=True)
     ]
     covered = LEAST_REPORT_PROBABILITY + (1 - 2 * LEAST_REPORT_PROBABILITY) * torch.cat(shares)
     log_reports = _log_reports(covered, source, _renewed(centres, moves, edge))
-    chances = source.emits, source.false_alarm
     reports = source.false_alarm + covered * (1 - source.miss - source.false_alarm)
-    grid = SourceGrid(centres, prior, moves, staying, reports, reports, log_reports, *chances)
-    return grid._replace(next_detection=_one_step_before(grid, reports), next_staying=_staying(grid))
+    chances = torch.tensor([[source.emits], [source.false_alarm], [0]], dtype=torch.float64)
+    emits, alarm, first = chances.expand(3, len(polygons))
+    moves = None if moves is None else moves.unsqueeze(0)
+    grid = SourceGrid(
+        centres, prior, moves, staying, reports, reports, log_reports, emits, alarm, first[:1].long()
+    )
+    again = log_reports[grid.no_report // 2 : -1].exp()
+    again[::2] = 1 - again[::2]
+    stays = _one_step_before(grid, source, again)
+    return grid._replace(
+        next_detection=_one_step_before(grid, source, reports),
+        next_staying=torch.cat([stays, torch.zeros_like(stays[:1])]),
+    )
 
 
 def _columns(polygons: list, edge: float) -> np.ndarray:
-    """Column and row numbers of all cells that any of the polygons touches, [K, 2]."""
+    """Column and row numbers of all cells that any of the polygons touches, [C, 2]."""
     bounds = np.array([polygon.bounds for polygon in polygons])
     first, last = np.floor(bounds[:, :2].min(0) / edge), np.ceil(bounds[:, 2:].max(0) / edge)
     axes = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
@@ -142,7 +201,7 @@ def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarra
 
 
 def _moves(columns: np.ndarray, displacement: np.ndarray) -> Tensor:
-    """Weight of each move from cell to cell, [K, K], from moves [S, 2] in cells."""
+    """Weight of each move from cell to cell, [C, C], from moves [S, 2] in cells."""
     reach = int(np.ptp(columns, axis=0).max())
     weight = np.full((2 * reach + 1, 2 * reach + 1), _RARE)
     near = displacement[(np.abs(displacement) < reach - 1).all(-1)] if reach > 1 else displacement[:0]
@@ -166,7 +225,7 @@ def _renewed(centres: Tensor, moves: Tensor | None, edge: float) -> float:
 
 
 def _log_reports(covered: Tensor, source: SourceConfig, renewed: float) -> Tensor:
-    """The table ``SourceGrid.log_reports``, from the share of each cell that a footprint covers, [P, K].
+    """The table ``SourceGrid.log_reports``, from the share of each cell that a footprint covers, [R*L, C].
 
     A source that stays may be in the part of its cell that a footprint does not cover. So a repeated report
     counts only as far as it may have moved: with probability ``renewed`` it is anywhere in its cell. Where it
@@ -187,30 +246,23 @@ def _log_reports(covered: Tensor, source: SourceConfig, renewed: float) -> Tenso
     return torch.cat([fresh, repeated, torch.ones_like(fresh[:1])]).log()
 
 
-def _one_step_before(grid: SourceGrid, chances: Tensor) -> Tensor:
-    """Probability of a detection by the cell of the source one step before, from that by its cell, [P, K]."""
-    alarm = (1 - grid.emits) * grid.false_alarm
+def _one_step_before(grid: SourceGrid, source: SourceConfig, chances: Tensor) -> Tensor:
+    """Probability of a detection by the cell of the source one step before, from that by its cell, [*, C]."""
+    alarm = (1 - source.emits) * source.false_alarm
     if grid.moves is None:
-        return grid.emits * chances + alarm
+        return source.emits * chances + alarm
     if len(grid.prior) == 1:
-        return grid.emits * chances @ grid.moves.T + alarm
+        return source.emits * chances @ grid.moves[0].T + alarm
     inside = (grid.prior > 0).unsqueeze(1)
     by_region = chances.view(len(grid.prior), -1, chances.shape[-1]) * inside
-    before = (by_region @ grid.moves.T) / grid.staying.unsqueeze(1)
-    return grid.emits * before.view_as(chances) + alarm
-
-
-def _staying(grid: SourceGrid) -> Tensor:
-    """The table ``SourceGrid.next_staying``, from the repeated reports of ``SourceGrid.log_reports``."""
-    again = grid.log_reports[grid.no_report // 2 : -1].exp()
-    again[::2] = 1 - again[::2]
-    return torch.cat([_one_step_before(grid, again), torch.zeros_like(again[:1])])
+    before = (by_region @ grid.moves[0].T) / grid.staying.unsqueeze(1)
+    return source.emits * before.view_as(chances) + alarm
 
 
 def _detected_shares(
     polygon: shapely.Geometry, points: Tensor, centres: np.ndarray, edge: float, radius: float
 ) -> Tensor:
-    """Share of each cell's part of the polygon in the footprint about each landing point, [L, K]."""
+    """Share of each cell's part of the polygon in the footprint about each landing point, [L, C]."""
     axis = ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * edge
     sample = centres[:, None] + np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     shapely.prepare(polygon)
@@ -234,57 +286,69 @@ def repeated(grid: SourceGrid, rows: Tensor, before: Tensor) -> Tensor:
     return torch.add(rows, same, alpha=grid.no_report // 2)  # takes a third of the time of ``where``
 
 
+def places(grid: SourceGrid, region: Tensor) -> Tensor:
+    """Index of the tables of each source in the regions of worlds [*], [*, K]."""
+    return region.unsqueeze(-1) + grid.first
+
+
 def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor | bool = True) -> Tensor:
-    """The rows of messages [*, N], if ``sent`` in this step [*, N] bool; a UAV in flight detects nothing."""
-    row = 2 * messages.trail[..., 0] + messages.spotted
-    return torch.where(sent & ~messages.in_flight, row, grid.no_report)
+    """The rows of messages [*, N], if ``sent`` in this step [*, N] bool, by source [*, K, N].
+
+    A UAV in flight detects nothing.
+    """
+    point = messages.trail[..., 0].unsqueeze(-2) + (grid.first * grid.n_points).unsqueeze(-1)
+    row = 2 * point + messages.spots.movedim(-1, -2)
+    return torch.where((sent & ~messages.in_flight).unsqueeze(-2), row, grid.no_report)
 
 
-def likelihood(grid: SourceGrid, rows: Tensor) -> Tensor:
-    """Probability of N reports of one step by the cell of the source, [*, K]."""
+def likelihood(grid: SourceGrid, rows: Tensor, place: Tensor) -> Tensor:
+    """Probability of N reports of one step by the cell of the source, [*, C]."""
     log = embedding_bag(rows.flatten(0, -2), grid.log_reports, mode="sum")  # gathers and sums at once
     match = log.exp_().view(*rows.shape[:-1], log.shape[-1])
-    if grid.emits < 1:
+    if grid.emits is not None:
         reported = rows % 2 == 1  # the row of no report is even
-        silent = ~reported.any(-1, keepdim=True)
-        if grid.false_alarm:
-            alarms, reports = reported.sum(-1, True), (rows != grid.no_report).sum(-1, True)
-            silent = grid.false_alarm**alarms * (1 - grid.false_alarm) ** (reports - alarms)
-        match = grid.emits * match + (1 - grid.emits) * silent
+        alarms, reports = reported.sum(-1, True), (rows != grid.no_report).sum(-1, True)
+        emits, alarm = (gather_rows(each, place).unsqueeze(-1) for each in (grid.emits, grid.false_alarm))
+        silent = alarm.to(match) ** alarms * (1 - alarm).to(match) ** (reports - alarms)
+        match = emits.to(match) * match + (1 - emits).to(match) * silent
     return match.add_(_LEAST)
 
 
-def predict(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
-    """The belief one step later, before any message of that step, [*, K]."""
+def predict(grid: SourceGrid, belief: Tensor, place: Tensor) -> Tensor:
+    """The belief one step later, before any message of that step, [*, C]."""
     if grid.moves is None:
         return belief
     if len(grid.prior) == 1:  # the moves are probabilities
-        return belief @ grid.moves
-    moved = (belief / gather_rows(grid.staying, region)) @ grid.moves
-    return moved * (gather_rows(grid.prior, region) > 0)
+        return belief @ grid.moves[0]
+    stays, kind = belief / gather_rows(grid.staying, place), place // (len(grid.prior) // len(grid.moves))
+    moved = stays @ grid.moves[0]
+    for number in range(1, len(grid.moves)):
+        moved = torch.where((kind == number).unsqueeze(-1), stays @ grid.moves[number], moved)
+    return moved * (gather_rows(grid.prior, place) > 0)
 
 
 def weigh(predicted: Tensor, likely: Tensor) -> Tensor:
-    """The belief after the messages of a step, from that before them and their ``likelihood``, [*, K]."""
+    """The belief after the messages of a step, from that before them and their ``likelihood``, [*, C]."""
     weighed = predicted * likely
     return weighed.div_(weighed.sum(-1, keepdim=True))
 
 
-def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
-    """The belief at the beginning of an episode, when everyone's first message is known, [*, K]."""
-    return weigh(gather_rows(grid.prior, region), likelihood(grid, rows))
+def first_belief(grid: SourceGrid, rows: Tensor, place: Tensor) -> Tensor:
+    """The belief at the beginning of an episode, when everyone's first message is known, [*, C]."""
+    return weigh(gather_rows(grid.prior, place), likelihood(grid, rows, place))
 
 
 def certain_belief(grid: SourceGrid, source: Tensor) -> Tensor:
-    """The belief of somebody who knows the place of the source, east, north [m], [*, 2]; [*, K]."""
-    return one_hot(torch.cdist(source, grid.centres).argmin(-1), len(grid.centres)).to(source.dtype)
+    """The belief of somebody who knows the place of the source, east, north [m], [*, 2]; [*, C]."""
+    nearest = torch.cdist(source.flatten(0, -2), grid.centres).argmin(-1)
+    return one_hot(nearest, len(grid.centres)).to(source.dtype).unflatten(0, source.shape[:-1])
 
 
-def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
+def detection_chance(grid: SourceGrid, belief: Tensor, place: Tensor) -> Tensor:
     """Probability, one step before, that a UAV detects the source on each landing point, [*, L]."""
     if len(grid.prior) == 1:
         return belief @ grid.next_detection.T
-    here = gather_rows(grid.next_detection.view(len(grid.prior), -1, belief.shape[-1]), region)
+    here = gather_rows(grid.next_detection.view(len(grid.prior), -1, belief.shape[-1]), place)
     return (here @ belief.unsqueeze(-1)).squeeze(-1)
 
 
@@ -294,9 +358,14 @@ def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
     return chance.mul_(belief.unsqueeze(-2)).sum(-1)
 
 
+def any_of(chances: Tensor) -> Tensor:
+    """Probability of any of independent events, from those of each [*, K, M], [*, M]."""
+    return functools.reduce(lambda some, one: some + one - some * one, chances.unbind(-2))
+
+
 @torch.library.custom_op("damian::entropy", mutates_args=())
 def entropy(belief: Tensor) -> Tensor:
-    """The entropy of each belief [*, K], in nats, [*]."""
+    """The entropy of each belief [*, C], in nats, [*]."""
     return belief.clamp(min=1e-12).log_().mul_(belief).sum(-1).neg_()
 
 
@@ -309,7 +378,7 @@ def _(belief: Tensor) -> Tensor:
 
 
 class Window(NamedTuple):
-    """The latest steps, in a ring of S slots, for B worlds and V receivers of the messages in each world.
+    """The latest steps, in a ring of S slots, of B beliefs of V receivers each: of each source in each world.
 
     A message that comes in late changes what is known of its step; from there the filter runs again. No
     message is later than the longest delay, so that older beliefs are final. The first receiver is the
@@ -318,7 +387,7 @@ class Window(NamedTuple):
     """
 
     belief: Tensor
-    """Probability of each cell after the messages of the step, [S, V, B, K]."""
+    """Probability of each cell after the messages of the step, [S, V, B, C]."""
     same_as_server: Tensor
     """Whether the belief of the receiver is that of the server, and lies only there, [S, V, B] bool."""
     report: Tensor
@@ -329,38 +398,36 @@ class Window(NamedTuple):
     """The slot of the latest step, [B]."""
 
 
-def empty_window(grid: SourceGrid, longest: int, n_worlds: int, n_agents: int, own: bool) -> Window:
+def empty_window(grid: SourceGrid, longest: int, n_beliefs: int, n_agents: int, own: bool) -> Window:
     """A window for messages that are at most ``longest`` steps late; with ``own`` also for each UAV."""
     device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
-    belief = torch.ones(n_slots, n_viewers, n_worlds, grid.prior.shape[-1], device=device)
-    report = torch.full((n_slots, n_agents, n_worlds), grid.no_report, device=device)
+    belief = torch.ones(n_slots, n_viewers, n_beliefs, grid.prior.shape[-1], device=device)
+    report = torch.full((n_slots, n_agents, n_beliefs), grid.no_report, device=device)
     same = torch.ones(belief.shape[:-1], dtype=torch.bool, device=device)
     slot, delay = torch.zeros_like(report[0, 0]), torch.full_like(report, -1)
     return Window(belief, same, report, delay, slot)
 
 
 Beliefs = tuple[Tensor, Tensor]
-"""Probability of each cell after the latest step, as the server believes, [B, K], and as each of the other
-receivers does, [B, V - 1, K]."""
+"""Probability of each cell after the latest step, as the server believes, [B, C], and as each of the other
+receivers does, [B, V - 1, C]."""
 
 
-def begin_beliefs(
-    grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor
-) -> Beliefs:
-    """Begin new episodes in the worlds of the mask [B], in place; all receivers know the first messages."""
-    _begin(*_parts(grid, window), report_rows(grid, messages), region, mask)
+def begin_beliefs(grid: SourceGrid, window: Window, report: Tensor, place: Tensor, mask: Tensor) -> Beliefs:
+    """Begin new episodes for the beliefs of the mask [B], in place; all receivers know the first reports."""
+    _begin(*_parts(grid, window), report, place, mask)
     return latest(window, window.slot)
 
 
 def advance_beliefs(
-    grid: SourceGrid, window: Window, report: Tensor, delay: Tensor, region: Tensor, stepped: Tensor
+    grid: SourceGrid, window: Window, report: Tensor, delay: Tensor, place: Tensor, stepped: Tensor
 ) -> tuple[Window, Beliefs]:
-    """Take one step in the worlds ``stepped`` [B], and correct the beliefs by what arrives, in place.
+    """Take one step of the beliefs ``stepped`` [B], and correct them by what arrives, in place.
 
     ``report`` [B, N]: what the messages of this step report (``report_rows``); ``delay`` [B, N]: their delays
     [steps], negative if they never arrive.
     """
-    slot, on_server, own = _advance(*_parts(grid, window), report, delay, region, stepped)
+    slot, on_server, own = _advance(*_parts(grid, window), report, delay, place, stepped)
     return window._replace(slot=slot), (on_server, own)
 
 
@@ -372,34 +439,33 @@ def latest(window: Window, slot: Tensor) -> Beliefs:
     return held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:])
 
 
-# Custom operators, because the number of worlds to work on depends on data, which no compiler can trace. An
-# operator takes no named tuples, so grid and window come in parts: all tensors of the grid, the number
-# ``chances``, the tensors of the window that change, and its slot.
+# Custom operators, because the number of beliefs to compute depends on data, which no compiler can trace. An
+# operator takes no named tuples, so grid and window come in parts: the tensors of the grid, those of the
+# window that change, and its slot.
 
 _Tables = list[Tensor | None]
 _Ring = list[Tensor]
 
 
-def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, list[float], _Ring, Tensor]:
-    return list(grid[:-2]), list(grid[-2:]), list(window[:-1]), window.slot
+def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, _Ring, Tensor]:
+    return list(grid), list(window[:-1]), window.slot
 
 
 @torch.library.custom_op("damian::begin_belief", mutates_args=["ring"])
 def _begin(
     tables: _Tables,
-    chances: list[float],
     ring: _Ring,
     slot: Tensor,
     first: Tensor,
-    region: Tensor,
+    place: Tensor,
     mask: Tensor,
 ) -> None:
-    grid, window = SourceGrid._make([*tables, *chances]), Window._make([*ring, slot])
+    grid, window = SourceGrid._make(tables), Window._make([*ring, slot])
     (world,) = _chosen(mask)
     if not len(world):
         return
-    begun, at, known, region = (each.index_select(0, world) for each in (mask, slot, first, region))
-    _write(window.belief, _row(window, at, 0, world), first_belief(grid, known, region), begun)
+    begun, at, known, place = (each.index_select(0, world) for each in (mask, slot, first, place))
+    _write(window.belief, _row(window, at, 0, world), first_belief(grid, known, place), begun)
     window.report.masked_fill_(mask, grid.no_report)  # nothing is in transit
     _write_step(window.same_as_server, slot, mask.unsqueeze(0), mask)
     _write_step(window.report, slot, first.T, mask)
@@ -407,38 +473,37 @@ def _begin(
 
 
 @_begin.register_fake
-def _(tables, chances, ring, slot, first, region, mask):
+def _(tables, ring, slot, first, place, mask):
     pass
 
 
 @torch.library.custom_op("damian::advance_belief", mutates_args=["ring"])
 def _advance(
     tables: _Tables,
-    chances: list[float],
     ring: _Ring,
     slot: Tensor,
     sent: Tensor,
     sent_delay: Tensor,
-    region: Tensor,
+    place: Tensor,
     stepped: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    grid, window = SourceGrid._make([*tables, *chances]), Window._make([*ring, slot])
+    grid, window = SourceGrid._make(tables), Window._make([*ring, slot])
     n_slots = len(window.belief)
     slot = torch.where(stepped, (slot + 1) % n_slots, slot)
     _write_step(window.report, slot, sent.T, stepped)
     _write_step(window.delay, slot, sent_delay.T, stepped)
     slot_age = (slot - torch.arange(n_slots, device=slot.device).unsqueeze(-1)) % n_slots
     outdated = _first_outdated(grid, window, slot_age, stepped)
-    for before, row, changes, within, reports in _to_compute(grid, window, slot_age, outdated, region):
+    for before, row, changes, within, reports in _to_compute(grid, window, slot_age, outdated, place):
         old = window.belief.flatten(0, 2).index_select(0, before)
-        new = weigh(predict(grid, old, within), likelihood(grid, reports))
+        new = weigh(predict(grid, old, within), likelihood(grid, reports, within))
         _write(window.belief, row, new, changes)
     on_server, known = latest(window, slot)
     return slot, on_server, known
 
 
 @_advance.register_fake
-def _(tables, chances, ring, slot, sent, sent_delay, region, stepped):
+def _(tables, ring, slot, sent, sent_delay, place, stepped):
     _, n_viewers, n_worlds, n_cells = ring[0].shape
     server, own = (n_worlds, n_cells), (n_worlds, n_viewers - 1, n_cells)
     return torch.empty_like(slot), ring[0].new_empty(server), ring[0].new_empty(own)
@@ -467,12 +532,12 @@ def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped:
 
 
 def _to_compute(
-    grid: SourceGrid, window: Window, slot_age: Tensor, outdated: Tensor, region: Tensor
+    grid: SourceGrid, window: Window, slot_age: Tensor, outdated: Tensor, place: Tensor
 ) -> Iterator[tuple[Tensor, ...]]:
-    """The C beliefs to compute from those of the step before, step by step, the oldest step first.
+    """The M beliefs to compute from those of the step before, step by step, the oldest step first.
 
-    Yields the rows in the flattened ring of the beliefs before [C] and after [C], which change [C] bool,
-    their regions [C], and what their receivers know of the step, as rows of ``log_reports`` [C, N].
+    Yields the rows in the flattened ring of the beliefs before [M] and after [M], which change [M] bool,
+    their places [M], and what their receivers know of the step, as rows of ``log_reports`` [M, N].
     """
     n_worlds, n_steps = outdated.shape[1], len(slot_age) - 1
     due = torch.arange(n_steps, device=slot_age.device).view(-1, 1, 1) <= outdated
@@ -491,7 +556,7 @@ def _to_compute(
     counts = [due[0].numel()] * n_steps
     if devices.data_dependent(due.device):
         counts = age.bincount().tolist()  # as far as the oldest step of any
-    work = (before, row, changes, region.index_select(0, world), reports)
+    work = (before, row, changes, place.index_select(0, world), reports)
     return reversed([*zip(*(each.split(counts) for each in work), strict=True)])
 
 
@@ -514,7 +579,7 @@ def _chosen(mask: Tensor) -> tuple[Tensor, ...]:
 
 
 def _write(held: Tensor, row: Tensor, new: Tensor, mask: Tensor) -> None:
-    """Write new values [C, K] into rows [C] of the flattened ring [S, V, B, K], where a mask [C] is true."""
+    """Write new values [M, C] into rows [M] of the flattened ring [S, V, B, C], where a mask [M] is true."""
     flat = held.flatten(0, 2)
     if devices.data_dependent(held.device):
         flat.numpy()[row.numpy()] = new.numpy()  # takes a third of the time of ``index_copy_``
@@ -523,6 +588,6 @@ def _write(held: Tensor, row: Tensor, new: Tensor, mask: Tensor) -> None:
 
 
 def _write_step(held: Tensor, slot: Tensor, new: Tensor, mask: Tensor) -> None:
-    """Write values [N, B] into the slots [B] of a ring [S, N, B] in place, in the worlds of a mask [B]."""
+    """Write values [N, B] into the slots [B] of a ring [S, N, B] in place, where a mask [B] is true."""
     at = slot.expand(1, *held.shape[1:])
     held.scatter_(0, at, torch.where(mask, new, held.gather(0, at)))

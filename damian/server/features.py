@@ -14,10 +14,12 @@ from damian.common.registry import Registry
 from damian.common.tensors import distances, gather_rows
 from damian.server.belief import (
     SourceGrid,
+    any_of,
     chance_of_staying,
     detection_chance,
     entropy,
     first_belief,
+    places,
     report_rows,
 )
 from damian.server.config import ObservationConfig
@@ -64,9 +66,9 @@ class ServerContext(NamedTuple):
     places_inside: Tensor | None = None
     """For ``coverage_map``: whether the places about each landing point lie in its region, [R*L, 24]."""
     grid: SourceGrid | None = None
-    """Cells in which the source may be; None if no feature reads the belief."""
+    """Cells in which the sources may be; None if no feature reads the belief."""
     belief: Tensor | None = None
-    """Probability that the source is in each cell, [*, K]; None: as after these first messages."""
+    """Probability that each source is in each cell, [*, K, C]; None: as after these first messages."""
     coverage: KnownCoverage | None = None
     """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be computed."""
 
@@ -117,14 +119,14 @@ class FeatureCache:
 
     @property
     def grid(self) -> SourceGrid:
-        """Cells in which the source may be."""
+        """Cells in which the sources may be."""
         if self.context.grid is None:
             raise InputError('belief: only a feature of scope "belief" may read it')
         return self.context.grid
 
     @property
     def belief(self) -> Tensor:
-        """Probability that the source is in each cell of ``grid``, [*, K]."""
+        """Probability that each source is in each cell of ``grid``, [*, K, C]."""
         return self(_belief)
 
     @property
@@ -134,10 +136,10 @@ class FeatureCache:
 
 
 def _belief(v: FeatureCache) -> Tensor:
-    """The belief of the context, or that after the first messages, [*, K]."""
+    """The belief of the context, or that after the first messages, [*, K, C]."""
     if v.context.belief is not None:
         return v.context.belief
-    return first_belief(v.grid, report_rows(v.grid, v.messages), v.region)
+    return first_belief(v.grid, report_rows(v.grid, v.messages), places(v.grid, v.region))
 
 
 class Feature(NamedTuple):
@@ -397,7 +399,7 @@ def _age(v: FeatureCache) -> Tensor:
     return (v.messages.age(v.context.now) / v.context.observation.age_scale).clamp(max=1)
 
 
-# Where the source is believed to be (``damian.server.belief``); beyond the paper's Table 2.
+# Where the sources are believed to be (``damian.server.belief``); beyond the paper's Table 2.
 
 BELIEF_RINGS = (1.0, 3.0)
 """Outer radii of the inner rings of ``belief_map``, in footprint radii; the outermost ring has no end."""
@@ -407,16 +409,16 @@ BELIEF_SECTORS = 8
 
 @feature("belief", width=None, name="belief_gain")
 def _belief_gain(v: FeatureCache) -> Tensor:
-    """Probability of detecting the source next from where each discrete action leads, [*, N, A].
+    """Probability of detecting any source next from where each discrete action leads, [*, N, A].
 
     Actions begin at the latest landing point, are taken to be flown at once, and lead to the nearest landing
     point, or to the second nearest if another UAV is known to stand there.
     """
     everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
     standing = v.wanted(v.messages.trail[..., 0])
-    rows = v.wanted(report_rows(v.grid, v.messages))
-    stays = chance_of_staying(v.grid, v.belief, rows).unsqueeze(-1)
-    chance = detection_chance(v.grid, v.belief, v.region)
+    rows = v.wanted(report_rows(v.grid, v.messages).movedim(-2, -1)).movedim(-1, -2)
+    stays = any_of(chance_of_staying(v.grid, v.belief, rows)).unsqueeze(-1)
+    chance = any_of(detection_chance(v.grid, v.belief, places(v.grid, v.region)))
     chance = chance.scatter(-1, everyone, -chance.gather(-1, everyone))  # negative where a UAV stands
     chance = chance.unsqueeze(-2).expand(*standing.shape, -1)
     chance = chance.scatter(-1, (standing % n_points).unsqueeze(-1), stays)
@@ -426,28 +428,33 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     return torch.where(nearest < 0, second.abs(), nearest).clamp(max=1)
 
 
-@feature("belief", width=4, low=-1.0, name="belief_moments")
+@feature("belief", width=None, low=-1.0, name="belief_moments")
 def _belief_moments(v: FeatureCache) -> Tensor:
-    """Way to the mean place (east, north), spread (over the region's size), share of the largest entropy."""
+    """Way to the mean place (east, north), spread (over the region's size), share of the largest entropy.
+
+    These four of each source, [*, N, 4 K].
+    """
     belief, centres = v.belief, v.grid.centres
     *mean, square = (belief @ torch.cat([centres, centres.square().sum(-1, True)], -1)).unbind(-1)
     mean = torch.stack(mean, -1)
     variance = (square - mean.square().sum(-1)).clamp(min=0)
-    offset = (mean.unsqueeze(-2) - v.wanted(v.messages.position)) / v.scale.unsqueeze(-1)
+    position = v.wanted(v.messages.position).unsqueeze(-2)
+    offset = (mean.unsqueeze(-3) - position) / v.scale[..., None, None]  # [*, N, K, 2]
     unsure = entropy(belief) / math.log(max(belief.shape[-1], 2))
-    shared = torch.stack([variance.sqrt() / v.context.scale, unsure], -1).unsqueeze(-2)
-    return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
+    shared = torch.stack([variance.sqrt() / v.scale, unsure], -1).unsqueeze(-3)
+    return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1).flatten(-2)
 
 
-@feature("belief", width=(len(BELIEF_RINGS) + 1) * BELIEF_SECTORS, name="belief_map")
+@feature("belief", width=None, name="belief_map")
 def _belief_map(v: FeatureCache) -> Tensor:
-    """Probability that the source is in each sector of three rings about the UAV, [*, N, 24]."""
+    """Probability that each source is in each sector of three rings about the UAV, [*, N, 24 K]."""
     position = v.wanted(v.messages.position)
-    east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, K]
+    east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, C]
     distance = torch.hypot(east, north) / v.context.radius
     ring = sum((distance > edge).long() for edge in BELIEF_RINGS)
     turn = torch.atan2(east, north) / (2 * math.pi)
     part = ring * BELIEF_SECTORS + (turn * BELIEF_SECTORS).round().long() % BELIEF_SECTORS
-    share = v.belief.unsqueeze(-2).expand_as(east)
-    bins = share.new_zeros(*part.shape[:-1], (len(BELIEF_RINGS) + 1) * BELIEF_SECTORS)
-    return bins.scatter_add(-1, part, share).clamp(max=1)
+    share = v.belief.unsqueeze(-3)
+    share = share.expand(*part.shape[:-1], *share.shape[-2:])  # [*, N, K, C]
+    bins = share.new_zeros(*share.shape[:-1], (len(BELIEF_RINGS) + 1) * BELIEF_SECTORS)
+    return bins.scatter_add(-1, part.unsqueeze(-2).expand_as(share), share).clamp(max=1).flatten(-2)

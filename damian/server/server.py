@@ -14,7 +14,7 @@ from torch import Tensor
 from damian import keys
 from damian.common import checks
 from damian.common.tensors import gather_rows, move_attributes
-from damian.server.belief import SourceGrid, build_source_grid
+from damian.server.belief import SourceGrid, build_source_grids
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext, check_features, feature_of, observe, observe_own, stack
 from damian.server.rewards import Counters, final_reward, reward, terms_of
@@ -58,9 +58,9 @@ class Server:
 
     In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of the episode
     [*], ``source_over`` tells whether the source has finished its walk [*], ``coverage`` is that of an
-    earlier step of the same worlds, which saves time, and ``belief`` the probability that the source is in
-    each cell of ``grid`` [*, K]; without it, these are the first messages of the episode. ``time_scale`` is
-    what time features are divided by [s].
+    earlier step of the same worlds, which saves time, and ``belief`` the probability that each source is in
+    each cell of ``grid`` [*, K, C]; without it, these are the first messages of the episode. Time features
+    are divided by ``time_scale`` [s].
     """
 
     def __init__(
@@ -89,8 +89,7 @@ class Server:
             footprints = build_tables(polygons, airspace.points.double().cpu().numpy(), simulation.radius)
         grid = None
         if observation.belief:
-            cell = observation.belief_cell
-            grid = build_source_grid(airspace, simulation.config.source, simulation.radius, self.dt, cell)
+            grid = build_source_grids(airspace, simulation.sources, self.dt, observation.belief_cell)
         gains, surrounded = "belief_gain" in observation.belief, "coverage_map" in self.names
         self._context = ServerContext(
             now=torch.zeros(()),
@@ -215,14 +214,14 @@ class Server:
         """Observations of actors that know their own messages at once, [*, N, F].
 
         ``received`` and ``sent`` are packed messages [*, N, M] as the server holds them, and as the UAVs sent
-        them last. ``belief``: that of each UAV, [*, N, K].
+        them last. ``belief``: that of each UAV, [*, N, K, C].
         """
         own = torch.eye(received.shape[-2], dtype=torch.bool, device=received.device).unsqueeze(-1)
         known = torch.where(own, sent.unsqueeze(-3), received.unsqueeze(-3))  # [*, N receivers, N senders]
         return self.observe_each(self.messages(known), steps, belief)
 
     def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
-        """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K]."""
+        """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K, C]."""
         return stack(self.own_features(known, steps, self.observation.actor, belief), self.observation.actor)
 
     def own_features(

@@ -77,8 +77,8 @@ class Episode:
     reward_terms: Annotated[Mapping[str, Floats], "their weighted terms by name, each [T + 1, N]"] = field(
         default_factory=dict
     )
-    cells: Annotated[Floats | None, "centres of the belief's cells: east, north [m], [K, 2]"] = None
-    belief: Annotated[Floats | None, "probability that the source is in a cell, [T + 1, K]"] = None
+    cells: Annotated[Floats | None, "centres of the belief's cells: east, north [m], [C, 2]"] = None
+    belief: Annotated[Floats | None, "probability that each source is in a cell, [T + 1, K, C]"] = None
     requests: Annotated[
         Floats | None,
         "latest requests: east, north [m], 1 while it is open; null if there are none, [T + 1, M, 3]",
@@ -133,7 +133,7 @@ class Episode:
 
     @cached_property
     def squares(self) -> NDArray[np.object_]:
-        """What of each of the belief's square cells lies in the region, [K] polygons or several of them."""
+        """What of each of the belief's square cells lies in the region, [C] polygons or several of them."""
         if self.cells is None:
             return np.zeros(0, object)
         gaps = np.diff(np.unique(self.cells[:, 0].round(3)))
@@ -142,8 +142,8 @@ class Episode:
         return np.asarray(shapely.intersection(boxes, self.region))
 
     def entropy(self, step: int) -> float:
-        """Entropy of the belief at an instant [bit]."""
-        return float(sum(-p * np.log2(p) for p in np.asarray(self.belief)[step] if p > 0))
+        """Entropy of the beliefs at an instant, summed over the sources [bit]."""
+        return float(sum(-p * np.log2(p) for p in np.asarray(self.belief)[step].flat if p > 0))
 
     def save(self, path: Path) -> None:
         """Write the episode as JSON."""

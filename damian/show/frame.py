@@ -47,14 +47,14 @@ class Frame:
     requests: Floats
     """Places of open requests, east, north [m], [M, 2]."""
     cells: list[tuple[Any, float]]
-    """Where the source may well be: polygons or several of them, with their probabilities."""
+    """Where a source may well be: polygons or several of them, with the probability that any is there."""
 
 
 def frame_of(episode: Episode, step: int) -> Frame:
     """An episode after ``step`` steps."""
     begin = max(step - (CROWDED_TRAIL if episode.is_crowded else TRAIL), 0)
     known, emits, asked = episode.source, episode.emits, episode.requests
-    belief = [] if episode.belief is None else episode.belief[step]
+    belief = [] if episode.belief is None else 1 - (1 - episode.belief[step]).prod(0)
     uavs = [
         Uav(
             id=episode.ids[uav],

@@ -34,7 +34,7 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     ``track`` (of a UAV, with ``times`` [s] of its points, ``times_utc`` if known, and ``altitudes_m`` above
     the ground; in coordinates they would be above the ellipsoid), ``source track`` (if it is known),
     ``footprint`` and ``coverage`` (what its footprints have covered) of a UAV, ``believed position`` (with
-    ``age_s``), and ``belief`` (a cell, with the ``probability`` that the source is in it). Across the
+    ``age_s``), and ``belief`` (a cell, with the ``probability`` that any source is in it). Across the
     antimeridian, longitudes go beyond 180.
     """
     origin = origin_of(episode)

@@ -24,7 +24,7 @@ from damian.show.frame import INK, Frame, Uav, limits
 TURN = 0.7
 """Angle by which the space turns in each step [deg]."""
 HEAT = LinearSegmentedColormap.from_list("belief", [(0.45, 0.2, 0.6, 0.0), (0.45, 0.2, 0.6, 0.75)])
-"""Colours of the belief about the source."""
+"""Colours of the belief about the sources."""
 _NORM = LogNorm(LIKELY, 1.0)
 _BLOWS = Path([[0.0, 1.0], [0.0, -1.0], [-0.4, -0.4], [0.0, -1.0], [0.4, -0.4]], [1, 2, 2, 1, 2])
 """Arrow of a wind from the north."""
@@ -176,7 +176,7 @@ def height_of_rows(n_agents: int) -> float:
 def draw_scale(axis: Axes) -> None:
     """Draw the scale of the belief into an axis of its own."""
     axis.figure.colorbar(ScalarMappable(_NORM, HEAT), cax=axis, orientation="horizontal")
-    axis.set_title("belief: source in a cell", loc="left", fontsize="medium")
+    axis.set_title("belief: a source in a cell", loc="left", fontsize="medium")
 
 
 def legend_marks(episode: Episode) -> list[Any]:

@@ -108,6 +108,11 @@ class Messages(NamedTuple):
         )
 
     @property
+    def spots(self) -> Tensor:
+        """Whether the UAV spots each source, [*, N, K]."""
+        return self.detected_time == self.time.unsqueeze(-1)
+
+    @property
     def in_flight(self) -> Tensor:
         """Whether the message was sent at a takeoff, so that its UAV flies to another point, [*, N]."""
         return (self.position != self.target).any(-1)

@@ -31,7 +31,7 @@ from damian.envs.pipeline import make_env
 from damian.keys import next_key
 from damian.recipes.shared.environments import compose_scenario
 from damian.runs.metrics import evaluation
-from damian.server import server
+from damian.server import belief
 from damian.server.belief import SourceGrid, build_source_grid
 from damian.world.airspace import Airspace
 from damian.world.config import SourceConfig
@@ -68,16 +68,16 @@ def velocity_grid(airspace: Airspace, source: SourceConfig, *options: float | No
     joint = joint.flatten(2).flatten(0, 1)
     joint = joint / joint.sum(-1, keepdim=True)  # the source stays in its region
     share = torch.bincount(kind.flatten(), minlength=n_kinds) / kind.numel()
-    reports = grid.log_reports.repeat(1, n_kinds)
+    reports, emits = grid.log_reports.repeat(1, n_kinds), source.emits
     again = reports[grid.no_report // 2 : -1].exp()
     again[::2] = 1 - again[::2]
     return grid._replace(
         centres=grid.centres.repeat(n_kinds, 1),
         prior=(share.unsqueeze(-1) * grid.prior).view(1, -1),
-        moves=joint,
+        moves=joint.unsqueeze(0),
         staying=joint.new_ones(1, len(joint)),
-        next_detection=grid.emits * reports[1 : grid.no_report // 2 : 2].exp() @ joint.T,
-        next_staying=torch.cat([grid.emits * again @ joint.T, joint.new_zeros(1, len(joint))]),
+        next_detection=emits * reports[1 : grid.no_report // 2 : 2].exp() @ joint.T,
+        next_staying=torch.cat([emits * again @ joint.T, joint.new_zeros(1, len(joint))]),
         log_reports=reports,
     )
 
@@ -116,7 +116,7 @@ def moves_of(step: Tensor, column: Tensor) -> Tensor:
 
 def flown(scenario: ScenarioConfig, build: GridBuilder, worlds: int, seed: int) -> tuple[float, float]:
     """Return of the script by a filter, and the mean log-probability that this gives to the true cell."""
-    with patch.object(server, "build_source_grid", build):
+    with patch.object(belief, "build_source_grid", build):
         env = make_env(scenario, worlds, seed, extras=["message", "state"])
     limit = scenario.episode.max_steps
     assert limit
@@ -125,7 +125,7 @@ def flown(scenario: ScenarioConfig, build: GridBuilder, worlds: int, seed: int) 
     cells = len(env.server.grid.centres.unique(dim=0))
     place = Truth.unpack(rollout[next_key(keys.STATE)]).source[..., 0, :].float()
     true = torch.cdist(place, env.server.grid.centres[:cells]).argmin(-1, keepdim=True)
-    probable = rollout[next_key(keys.BELIEF)].unflatten(-1, (-1, cells)).sum(-2).gather(-1, true)
+    probable = rollout[next_key(keys.BELIEF)].squeeze(-2).unflatten(-1, (-1, cells)).sum(-2).gather(-1, true)
     return evaluation(rollout, env.server).return_, probable.clamp(min=1e-9).log().mean().item()
 
 

@@ -24,7 +24,7 @@ from damian.recipes.cli import settings
 from damian.recipes.config import TrainConfig
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import results_table
-from damian.server.belief import SourceGrid
+from damian.server.belief import SourceGrid, places
 from damian.world.state import Truth
 
 KNOWN_ON_TIME = ("what has arrived", "its own messages", "all messages", "the source's place")
@@ -55,13 +55,14 @@ def script_rows(config: TrainConfig) -> dict[str, Evaluation]:
 
 
 def true_belief(env: DelayedEnv) -> TensorDictModule:
-    """A module that replaces the server's belief by certainty about the source's cell."""
+    """A module that replaces the server's belief by certainty about each source's cell."""
     server = env.server
     grid = cast(SourceGrid, server.grid)
 
     def know(state: Tensor, message: Tensor) -> Tensor:
-        inside = grid.prior[server.region_of(server.messages(message))] > 0
-        distance = torch.cdist(Truth.unpack(state).source[..., 0, :].to(grid.centres), grid.centres)
+        inside = grid.prior[places(grid, server.region_of(server.messages(message)))] > 0
+        truth = Truth.unpack(state, env.uav_env.simulation.widths)
+        distance = torch.cdist(truth.source.to(grid.centres), grid.centres)
         return one_hot(distance.where(inside, torch.inf).argmin(-1), distance.shape[-1]).to(distance)
 
     return TensorDictModule(know, in_keys=[keys.STATE, keys.MESSAGE], out_keys=[keys.BELIEF])

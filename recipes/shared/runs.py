@@ -280,6 +280,7 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
         "learner": learner.name if own_actor else "an actor as mappo and sac have",
         **{key: settings[key] for key in (*keys, *(key for key in settings if key.startswith("model.")))},
         "observation.global_features": [*observation.global_features] * sees_all,
+        "source.count, of a belief": bool(observation.belief) and config.source.count,
         "agents": "any number of UAVs" if any_number_of_uavs(config) else config.agents,
         "number of actions.distances": discrete and len(config.actions.distances),
         "number of actions.headings": discrete and len(config.actions.headings),

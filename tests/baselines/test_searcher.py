@@ -41,7 +41,7 @@ def test_all_uavs_fly_to_where_they_detect_the_source(own):
     cell = (
         (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()
     )  # the cell in which the source certainly is
-    td[keys.BELIEF] = torch.nn.functional.one_hot(cell, len(centres)).float().unsqueeze(0)
+    td[keys.BELIEF] = torch.nn.functional.one_hot(cell, len(centres)).float().view(1, 1, -1)
     if own:
         td[keys.OWN_BELIEF] = td[keys.BELIEF].unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()
     after = env.step(greedy_policy(env)(td))["next"][keys.MESSAGE]

@@ -1,17 +1,19 @@
 """The features of a belief against plain loops."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from belief_twin import chance_at
+from belief_twin import chance_at, emission_of
 from helpers import everything, square, walking
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
-from damian.server.belief import predict
+from damian.server.belief import places, predict
 from damian.server.features import BELIEF_RINGS, BELIEF_SECTORS, ObservationConfig, feature
+from damian.world.config import SourceConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
 
@@ -23,12 +25,15 @@ def believing(own: bool = False, **changed) -> ScenarioConfig:
 
 @pytest.fixture(scope="module")
 def flown():
-    """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K] of worlds in several regions."""
-    env = UavEnv(believing(), messages_only=True)
+    """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K, C] of worlds in several regions."""
+    sources = SourceConfig(
+        count=2, motion="dynamic", emission="per_step", each=[{}, {"level_db": 136.0, "emission": "constant"}]
+    )
+    env = UavEnv(replace(believing(), source=sources), messages_only=True)
     simulation, server = env.simulation, env.server
     messages, steps = simulation.initial.sent, simulation.initial.steps
     torch.manual_seed(0)
-    possible = server.grid.prior[server.region_of(messages)] > 0
+    possible = server.grid.prior[places(server.grid, server.region_of(messages))] > 0
     weight = torch.rand(possible.shape).square() * possible
     belief = weight / weight.sum(-1, keepdim=True)
     return simulation, server, messages, server.features(messages, steps, belief=belief), belief
@@ -45,43 +50,50 @@ def test_gain_is_the_chance_of_detecting_the_source_where_an_action_leads(flown)
             first, base = standing * n_actions + action, region * simulation.airspace.max_points
             nearest, second = candidates.ranking.point[first, :2].tolist()
             point = second if base + nearest in others else nearest
-            flat = region * simulation.airspace.max_points + point
-            expected = chance_at(server.grid, region, belief[world], flat)
-            if flat == standing:  # the UAV stays
-                row = 2 * standing + int(messages.spotted[world, uav]) + server.grid.no_report // 2
-                again = server.grid.log_reports[row].exp()
-                found = again if messages.spotted[world, uav] else 1 - again
-                next_ = predict(server.grid, belief[world : world + 1], torch.tensor([region]))[0]
-                expected = server.grid.emits * float(found @ next_)
-            assert features["belief_gain"][world, uav, action].item() == pytest.approx(expected, rel=1e-3)
+            flat, missed = region * simulation.airspace.max_points + point, 1.0
+            for source in range(2):
+                place = region + len(server.grid.prior) // 2 * source
+                at = standing + len(simulation.points) * source
+                chance = chance_at(server.grid, place, belief[world, source], flat - standing + at)
+                if flat == standing:  # the UAV stays
+                    spots = bool(messages.spots[world, uav, source])
+                    again = server.grid.log_reports[2 * at + spots + server.grid.no_report // 2].exp()
+                    found = again if spots else 1 - again
+                    next_ = predict(server.grid, belief[world, source], torch.tensor(place))
+                    chance = emission_of(server.grid, place) * float(found @ next_)
+                missed *= 1 - chance
+            found = features["belief_gain"][world, uav, action].item()
+            assert found == pytest.approx(1 - missed, rel=1e-3)
 
 
 def test_moments_are_mean_spread_and_entropy(flown):
     simulation, server, messages, features, belief = flown
-    for world, uav in ((0, 0), (5, 2)):
+    for world, uav, source in ((0, 0, 0), (5, 2, 0), (5, 2, 1)):
         scale = float(simulation.airspace.scale[server.region_of(messages)[world]])
-        chance, cells = belief[world].tolist(), server.grid.centres.tolist()
+        chance, cells = belief[world, source].tolist(), server.grid.centres.tolist()
         east, north = (sum(p * cell[i] for p, cell in zip(chance, cells, strict=True)) for i in (0, 1))
         squares = ((x - east) ** 2 + (y - north) ** 2 for x, y in cells)
         variance = sum(p * square for p, square in zip(chance, squares, strict=True))
         entropy = -sum(p * math.log(p) for p in chance if p) / math.log(len(chance))
         x, y = messages.position[world, uav].tolist()
         expected = [(east - x) / scale, (north - y) / scale, math.sqrt(variance) / scale, entropy]
-        found = features["belief_moments"][world, uav]
+        found = features["belief_moments"][world, uav].view(2, 4)[source]
         torch.testing.assert_close(found, torch.tensor(expected).clamp(-1, 1), rtol=1e-3, atol=1e-4)
 
 
 def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
     simulation, server, messages, features, belief = flown
-    for world, uav in ((0, 0), (5, 2)):
+    for world, uav, source in ((0, 0, 0), (5, 2, 0), (5, 2, 1)):
         expected = [0.0] * (len(BELIEF_RINGS) + 1) * BELIEF_SECTORS
         x, y = messages.position[world, uav].tolist()
-        for p, (east, north) in zip(belief[world].tolist(), server.grid.centres.tolist(), strict=True):
+        for p, (east, north) in zip(
+            belief[world, source].tolist(), server.grid.centres.tolist(), strict=True
+        ):
             distance = math.hypot(east - x, north - y)
             ring = sum(distance > radius * simulation.radius for radius in BELIEF_RINGS)
             sector = round(math.atan2(east - x, north - y) / (2 * math.pi) * BELIEF_SECTORS) % BELIEF_SECTORS
             expected[ring * BELIEF_SECTORS + sector] += p
-        found = features["belief_map"][world, uav]
+        found = features["belief_map"][world, uav].view(2, -1)[source]
         torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-5)
         assert found.sum().item() == pytest.approx(1, abs=1e-4)
 
@@ -99,12 +111,12 @@ def test_a_uavs_own_features_are_those_of_its_own_belief():
 
 @feature("belief")
 def surest(cache):
-    return cache.belief.amax(-1, keepdim=True).expand_as(cache.messages.time)
+    return cache.belief.flatten(-2).amax(-1, keepdim=True).expand_as(cache.messages.time)
 
 
 def test_a_feature_of_ones_own_may_read_the_belief():
     observation = ObservationConfig(belief=[f"{__name__}:surest"])
     env = make_env(square(observation=observation, source=walking()), 2, extras=["message"])
     td = env.rollout(3)[:, -1]["next"]
-    expected = td["belief"].amax(-1, keepdim=True).expand(2, 3)
+    expected = td["belief"].amax(-1).expand(2, 3)
     torch.testing.assert_close(td["agents", "observation"][..., -1], expected)

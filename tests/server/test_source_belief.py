@@ -16,6 +16,7 @@ from damian.server.belief import (
     _begin,
     _parts,
     build_source_grid,
+    build_source_grids,
     detection_chance,
     empty_window,
     latest,
@@ -39,6 +40,12 @@ grids = {
     "static": make_grid(1.0, moves=False),
     "several regions": make_grid(regions=3),
     "misses and false alarms": make_grid(miss=0.3, false_alarm=0.1),
+    "unlike sources": build_source_grids(
+        UavEnv(square()).simulation.airspace,
+        [walking(emission="per_step", false_alarm=0.1), SourceConfig(level_db=138.0), walking(miss=0.2)],
+        dt=1.0,
+        cell=45.0,
+    ),
 }
 
 

@@ -53,8 +53,8 @@ def test_rewards_and_beliefs_are_those_of_the_rollout_after_each_step(flown):
         assert np.array_equal(episode.reward, reward)
         np.testing.assert_allclose(sum(episode.reward_terms.values()), reward, atol=1e-5)
         assert np.array_equal(episode.belief[1:], after[keys.BELIEF].numpy())
-        assert episode.belief.shape[1] == len(episode.cells)
-        assert replace(episode, belief=np.full((1, 8), 1 / 8)).entropy(0) == 3
+        assert episode.belief.shape[2] == len(episode.cells)
+        assert replace(episode, belief=np.full((1, 2, 8), 1 / 8)).entropy(0) == 6
         assert episode.perceived_return == pytest.approx(reward.mean(-1).sum())
 
 

@@ -57,7 +57,7 @@ def test_a_page_holds_the_episodes_as_their_files_do(tmp_path):
 def test_a_page_is_small_and_loads_nothing():
     rng = np.random.default_rng(0)
     steps, cells = 150, 256
-    belief = rng.dirichlet(np.ones(cells), steps + 1)
+    belief = rng.dirichlet(np.ones(cells), (steps + 1, 1))
     ordinary = flight(steps, cells=rng.uniform(-200, 200, (cells, 2)), belief=belief)
     text = page([ordinary])
     assert len(text.encode()) < 2_000_000

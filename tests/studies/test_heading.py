@@ -21,7 +21,7 @@ def test_the_filter_with_velocity_is_a_chain_over_the_cells_of_the_built_in_one(
     n_cells, n_kinds = len(place.centres), 1 + DIRECTIONS
     assert velocity.centres.view(n_kinds, n_cells, 2).equal(place.centres.expand(n_kinds, -1, -1))
     torch.testing.assert_close(velocity.prior.view(n_kinds, n_cells).sum(0), place.prior[0])
-    torch.testing.assert_close(velocity.moves.sum(-1), torch.ones(n_kinds * n_cells))
+    torch.testing.assert_close(velocity.moves[0].sum(-1), torch.ones(n_kinds * n_cells))
     # From the middle, at rest a source stays nearer than in flight, and to the east it goes east.
     middle = place.centres.square().sum(-1).argmin()
     mean = velocity.moves.view(n_kinds, n_cells, n_kinds, n_cells)[:, middle].sum(1) @ place.centres

@@ -34,7 +34,7 @@ def test_the_true_belief_is_certain_of_the_cell_with_the_nearest_centre():
     env = make_env(scenario, 12, seed=0, extras=["message", "state"])
     steps = env.rollout(5, break_when_any_done=False)[:, -1]
     grid = env.server.grid
-    belief = true_belief(env)(steps.clone())[keys.BELIEF]
+    belief = true_belief(env)(steps.clone())[keys.BELIEF].squeeze(1)
     assert torch.equal(belief.sum(-1), torch.ones(12))
     region = env.server.region_of(env.server.messages(steps[keys.MESSAGE]))
     for world in range(12):

@@ -19,9 +19,11 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.replay.backupdate import BackupdateStorage
-from damian.server.belief import report_rows
+from damian.server.belief import SourceGrid, build_source_grid
 from damian.server.features import ObservationConfig
+from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
+from damian.world.signal_source import footprint_radius
 
 LONGEST = 7
 
@@ -51,17 +53,34 @@ def episodes(data: TensorDictBase) -> list[tuple[int, int]]:
 def expected(
     env: DelayedEnv, data: TensorDictBase, begin: int, end: int, now: int, viewer: int | None = None
 ):
-    """The slow twin's belief after step ``end`` of an episode that begins at ``begin``, of one world [T]."""
-    grid, server = env.server.grid, env.server
-    assert grid is not None
+    """The slow twin's beliefs after step ``end`` of an episode that begins at ``begin``, of one world [T].
+
+    Each source is followed as if it were the only one, [K, C].
+    """
+    server, found = env.server, []
     first = server.messages(data[keys.MESSAGE][begin])
     sent = server.messages(data["next", *keys.MESSAGE])
     flag = data["next", *keys.MESSAGE_SENT]
-    rows = report_rows(grid, sent, flag)
     delay = data.get(("next", *keys.DELAY), torch.where(flag, 0, -1).unsqueeze(-1)).squeeze(-1)
-    steps = [(rows[t].tolist(), delay[t].tolist()) for t in range(begin, end + 1)]
-    first_rows = report_rows(grid, first, torch.ones_like(flag[0])).tolist()
-    return torch.tensor(belief(grid, 0, first_rows, steps, now - begin + 1, viewer))
+    for number, grid in enumerate(grids_of(env)):
+        rows = rows_of(grid, sent, number).where(flag, grid.no_report)
+        steps = [(rows[t].tolist(), delay[t].tolist()) for t in range(begin, end + 1)]
+        first_rows = rows_of(grid, first, number).tolist()
+        found.append(belief(grid, 0, first_rows, steps, now - begin + 1, viewer))
+    return torch.tensor(found)
+
+
+def grids_of(env: DelayedEnv) -> list[SourceGrid]:
+    """The tables of each source alone."""
+    simulation = env.uav_env.simulation
+    of_each = [(each, footprint_radius(each)) for each in simulation.sources]
+    return [build_source_grid(simulation.airspace, *each, dt=1.0, cell=50.0) for each in of_each]
+
+
+def rows_of(grid: SourceGrid, messages: Messages, source: int) -> Tensor:
+    """Rows of what messages report of a source, [*, N]."""
+    spots = messages.detected_time[..., source] == messages.time
+    return torch.where(messages.in_flight, grid.no_report, 2 * messages.trail[..., 0] + spots)
 
 
 def check(actual: Tensor, wanted: Tensor) -> None:
@@ -73,6 +92,15 @@ SCENARIOS = {
     "late": tracking(),
     "late, each UAV": tracking(own=True),
     "in flight": tracking(motion=MotionConfig(kind="polynomial"), own=True),
+    "several sources": replace(
+        tracking(own=True),
+        source=walking(
+            count=3,
+            false_alarm=0.1,
+            emission="per_step",
+            each=[{}, {"motion": "static", "level_db": 138.0}, {"miss": 0.3, "emission": "constant"}],
+        ),
+    ),
     "arrival": replace(tracking(), delay=DelayConfig(obs=PAPER, order="arrival")),
 }
 
@@ -92,16 +120,16 @@ def test_a_belief_knows_what_has_arrived_and_nothing_else(scenario):
                     check(after[keys.OWN_BELIEF][uav], expected(env, world, begin, end, end, uav))
 
 
-@pytest.mark.parametrize("batch", [9])
-def test_back_updated_beliefs_know_what_has_arrived_since(batch):
-    env = make_env(tracking(), 2, extras=["message"])
+@pytest.mark.parametrize("name", ["late", "several sources"])
+def test_back_updated_beliefs_know_what_has_arrived_since(name):
+    env = make_env(SCENARIOS[name], 2, extras=["message"])
     counted = TransformedEnv(env, Compose(StepCounter()))
-    data = counted.rollout(5 * batch, break_when_any_done=False)
+    data = counted.rollout(45, break_when_any_done=False)
     recompute = server_recompute(env.server)
     storage = BackupdateStorage(1000, recompute, LONGEST)
     buffer = ReplayBuffer(storage=storage, batch_size=1)
     corrected = 0
-    for part in data.split(batch, 1):
+    for part in data.split(9, 1):
         buffer.extend(part)
     stored = storage[storage.latest(data.shape[1])].transpose(0, 1)
     for world, raw in zip(stored, data, strict=True):

@@ -1,7 +1,5 @@
 """Several sources, against one source at a time and plain loops; and the script that shares them out."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -120,8 +118,3 @@ def test_the_script_finds_more_than_chance():
 def test_sources_that_cannot_be_are_refused(changed, message):
     with pytest.raises(InputError, match=message):
         SourceConfig(**changed)
-
-
-def test_a_belief_follows_one_source():
-    with pytest.raises(InputError, match=r"observation.belief: .* the filter follows one"):
-        replace(scenario(SourceConfig(count=2)), observation=ObservationConfig(belief=["belief_map"]))

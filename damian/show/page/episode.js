@@ -107,9 +107,9 @@ export class Episode {
     return this.spotted[step].flatMap((flag, uav) => (flag ? [uav] : []));
   }
 
-  /** Entropy of the belief at an instant [bit]. */
+  /** Entropy of the beliefs at an instant, summed over the sources [bit]. */
   entropy(step) {
-    return this.belief[step].reduce((sum, p) => (p > 0 ? sum - p * Math.log2(p) : sum), 0);
+    return this.belief[step].flat().reduce((sum, p) => (p > 0 ? sum - p * Math.log2(p) : sum), 0);
   }
 
   /** Edge of the belief's square cells [m]. */

@@ -96,7 +96,9 @@ export class Ground {
 
   #belief(context, frame, step, theme) {
     const size = this.edge * frame.scale;
-    this.episode.belief[step].forEach((probability, cell) => {
+    const sources = this.episode.belief[step];
+    sources[0].forEach((_, cell) => {
+      const probability = 1 - sources.reduce((none, one) => none * (1 - one[cell]), 1); // of any source
       if (probability <= this.likely) return;
       const strength = 1 - Math.log(probability) / Math.log(this.likely);
       const [x, y] = frame.pixel(this.episode.cells[cell]);
