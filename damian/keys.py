@@ -52,6 +52,8 @@ EARNED_REWARD = (AGENTS, "earned_reward")
 POSITION = (AGENTS, "position")
 """True position of each UAV at this instant, east and north [m], [B, N, 2]; for delay laws, never for an
 actor."""
+LOSS = (AGENTS, "loss")
+"""Probability with which messages to the server are lost, if it is drawn, [B, N, 1]; never for an actor."""
 BELIEF = "belief"
 """Probability that each source is in each cell of the server's grid, as far as the messages tell that have
 arrived, [B, K, C]."""

@@ -43,12 +43,12 @@ ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError)
 
 
 def _schema(kind: type) -> DictConfig:
-    """The settings of a dataclass at their defaults; sections take any key, which ``filled`` checks."""
+    """The settings of a dataclass at their defaults; mappings take any key, which ``filled`` checks."""
     found = OmegaConf.create()
     for key, each in described(kind).items():
         if not key.startswith("learner."):  # the group fills it in
             OmegaConf.update(found, key, {} if each.is_section else each.default)
-            if each.is_section:
+            if each.is_section or isinstance(each.default, dict):
                 OmegaConf.set_struct(OmegaConf.select(found, key), False)
     return found
 

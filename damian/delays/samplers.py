@@ -199,6 +199,23 @@ class HeldSampler(Sampler):
         return torch.where(delay < self.lost, self.longest, self.lost), state
 
 
+class LossSampler(HeldSampler):
+    """Loses messages of another sampler with the probability that the entry ``loss`` of each world tells."""
+
+    def __init__(self, drawn: Sampler) -> None:
+        super().__init__(drawn)
+        self.loses, self.constant_delay, self.sees_context = True, None, True
+        self.reads = (*drawn.reads, "loss")
+
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        delay, state = self.drawn(streams, clock, state, context)
+        draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
+        chance = cast(MessageContext, context).entries["loss"].view_as(draw)
+        return torch.where(draw < chance, self.lost, delay), state
+
+
 class LagSampler(Sampler):
     """Draws a delay (a lag) from a table, and holds it for a period (None: an episode); losses are not held.
 

@@ -6,17 +6,19 @@ from damian import keys
 from damian.common import checks
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.laws import LOSES, link_sampler, sampler_of
-from damian.delays.samplers import HeldSampler, Sampler
+from damian.delays.samplers import HeldSampler, LossSampler, Sampler
 
 
 class ScenarioDelays:
     """The samplers of all that can be late in a scenario; ``ScenarioConfig.delays`` makes it once.
 
+    With ``draws_loss``, the loss of messages to the server differs by world and episode (``randomise``).
     Raises ``InputError`` if a law is wrong, reads what no message carries, or loses rewards.
     """
 
-    def __init__(self, delay: DelayConfig, links: LinkConfig, dt: float) -> None:
-        obs = sampler_of(delay.obs, dt, delay.loss, "delay.obs")
+    def __init__(self, delay: DelayConfig, links: LinkConfig, dt: float, draws_loss: bool = False) -> None:
+        law = sampler_of(delay.obs, dt, 0.0 if draws_loss else delay.loss, "delay.obs")
+        obs = LossSampler(law) if draws_loss else law
         self.obs: Sampler = HeldSampler(obs) if delay.hold == "max" else obs
         """Of the messages to the server, with their losses, and as the server holds them back."""
         self.act, self.rew = (sampler_of(getattr(delay, n), dt, key=f"delay.{n}") for n in ("act", "rew"))
@@ -25,7 +27,7 @@ class ScenarioDelays:
         """Of what the UAVs receive from the server (updown), or from each other (matrix)."""
         checks.require(not self.rew.loses, "delay.rew", delay.rew, LOSES)
         laws = {
-            "delay.obs": self.obs,
+            "delay.obs": law,
             "delay.act": self.act,
             "delay.rew": self.rew,
             "links.delay": self.links,
@@ -39,6 +41,7 @@ class ScenarioDelays:
         self.reads_positions = links.range is not None or any(sampler.reads for sampler in laws.values())
         """Whether a law, or the range of the links, needs to know where the UAVs are."""
         context_keys = {"position": keys.POSITION} if self.reads_positions else {}
+        context_keys |= {"loss": keys.LOSS} if draws_loss else {}
         self.told: dict[str, Any] = {"dt": dt, "context_keys": context_keys}
         """Arguments that every transform which delays something gets, besides its sampler."""
 
@@ -48,10 +51,10 @@ class ScenarioDelays:
         return max(self.obs.longest, self.rew.longest)
 
 
-def delays_of(delay: DelayConfig, links: LinkConfig, dt: float) -> ScenarioDelays:
+def delays_of(delay: DelayConfig, links: LinkConfig, dt: float, draws_loss: bool = False) -> ScenarioDelays:
     """The delays of these settings, which ``delay`` keeps for as long as none of them changes."""
-    kept, written = vars(delay).setdefault("_delays", {}), repr((delay, links, dt))
+    kept, written = vars(delay).setdefault("_delays", {}), repr((delay, links, dt, draws_loss))
     if written not in kept:
         kept.clear()
-        kept[written] = ScenarioDelays(delay, links, dt)
+        kept[written] = ScenarioDelays(delay, links, dt, draws_loss)
     return kept[written]

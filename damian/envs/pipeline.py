@@ -38,7 +38,8 @@ from damian.transforms import (
 from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
-_REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.BELIEF, keys.OWN_BELIEF]
+_REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LOSS]
+_REPORTED += [keys.BELIEF, keys.OWN_BELIEF]
 """Entries that only the extra ``message`` outputs."""
 
 

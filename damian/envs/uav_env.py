@@ -224,6 +224,10 @@ class UavEnv(EnvBase):
         if "position" in self.extras:
             offset = gather_rows(self.simulation.airspace.offset, state.region).unsqueeze(-2)
             outputs[keys.POSITION] = state.position[..., :2] + offset
+        values = self.simulation.vehicles.values
+        if "delay.loss" in values.choices:
+            loss = values.get("delay.loss", state.drawn)
+            outputs[keys.LOSS] = torch.as_tensor(loss).unsqueeze(-1).expand(-1, state.track.shape[1], 1)
         if "privileged" in self.extras:
             outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, global_observation)
         if self.scenario.episode.end_with_source:

@@ -18,7 +18,7 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -105,17 +105,15 @@ def build_source_grids(
     still, half = torch.eye(len(grids[0].centres)).unsqueeze(0), grids[0].no_report // 2
     moves = [still if each.moves is None else each.moves for each in grids]
     reports = [each.log_reports[rows] for rows in (slice(half), slice(half, -1)) for each in grids]
-    last, emits = grids[0].log_reports[-1:], torch.cat([each.emits for each in grids])
-    return SourceGrid(
-        centres=grids[0].centres,
-        prior=torch.cat([each.prior for each in grids]),
+    by_place = ("prior", "staying", "next_detection", "emits", "false_alarm")
+    joined: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in grids]) for name in by_place}
+    joined["emits"] = joined["emits"] if (joined["emits"] < 1).any() else None
+    last = grids[0].log_reports[-1:]
+    return grids[0]._replace(
+        **joined,
         moves=None if all(each.moves is None for each in grids) else torch.cat(moves),
-        staying=torch.cat([each.staying for each in grids]),
-        next_detection=torch.cat([each.next_detection for each in grids]),
-        next_staying=torch.cat([*(each.next_staying[:-1] for each in grids), last]),
+        next_staying=torch.cat([*(each.next_staying[:-1] for each in grids), torch.zeros_like(last)]),
         log_reports=torch.cat([*reports, last]),
-        emits=emits if (emits < 1).any() else None,
-        false_alarm=torch.cat([each.false_alarm for each in grids]),
         first=torch.tensor([kinds.index(each) for each in alike]) * len(airspace.regions),
     )
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from damian.common import checks, devices
 from damian.common.errors import InputError
 from damian.common.registry import Registry
-from damian.common.tensors import distances, gather_rows
+from damian.common.tensors import distances, expand_mask, gather_rows
 from damian.server.belief import (
     SourceGrid,
     any_of,
@@ -49,14 +49,18 @@ class ServerContext(NamedTuple):
     """For the feature ``coverage``; None if it is not needed."""
     points: Tensor
     """Landing points by flat id, [R*L, 2] metres."""
+    scaled_points: Tensor
+    """The same for each radius of footprints, in the unit of the first one (``tables_of_all``)."""
     observation: ObservationConfig
     """Gives scales, and the numbers of landing points and steps that features look at."""
     dt: float = 1.0
     """Length of a step [s]."""
     readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
     """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
-    radius: float = 0.0
-    """Radius of a UAV's footprint [m]."""
+    radius: float | Tensor = 0.0
+    """Radius of a UAV's footprint [m]; [*] if it is drawn."""
+    footprint: Tensor | None = None
+    """Number of the drawn radius in tables, [*]."""
     kinds: Tensor | None = None
     """Speed limit and battery capacity of each UAV, over the largest ones, [N, 2]."""
     n_points: int = 0
@@ -64,7 +68,8 @@ class ServerContext(NamedTuple):
     goals: Tensor | None = None
     """For ``belief_gain``: landing points to which discrete actions lead, as ``Candidates.goals``."""
     places_inside: Tensor | None = None
-    """For ``coverage_map``: whether the places about each landing point lie in its region, [R*L, 24]."""
+    """For ``coverage_map``: whether the places about each landing point lie in its region, [R*L, 24], those
+    for each radius behind each other."""
     grid: SourceGrid | None = None
     """Cells in which the sources may be; None if no feature reads the belief."""
     belief: Tensor | None = None
@@ -111,6 +116,11 @@ class FeatureCache:
     def trail(self) -> Tensor:
         """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
         return self.messages.trail[..., : self.context.observation.window]
+
+    def tabled(self, point: Tensor) -> Tensor:
+        """Ids in tables for each radius of footprints, from the flat ids of landing points [*, ...]."""
+        number = self.context.footprint
+        return point if number is None else point + expand_mask(number, point) * len(self.context.points)
 
     @property
     def region(self) -> Tensor:
@@ -342,10 +352,11 @@ def _agent_distances(v: FeatureCache) -> Tensor:
 def _coverage(v: FeatureCache) -> Tensor:
     """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
     assert v.context.footprints is not None
-    trail, points, known = v.trail, v.context.points, v.context.coverage
+    trail, points, known = v.tabled(v.trail), v.context.scaled_points, v.context.coverage
     if v.own_only:
         return own_covered_share(v.context.footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
     if known is not None and devices.data_dependent(trail.device):
+        known = known._replace(trail=v.tabled(known.trail))
         return updated_share(v.context.footprints, trail, points, known)
     return covered_share(v.context.footprints, trail, gather_rows(points, trail))
 

@@ -5,6 +5,7 @@ replay storage with those that have arrived by the time of learning.
 """
 
 import itertools
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -20,9 +21,10 @@ from damian.server.features import ServerContext, check_features, feature_of, ob
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
-from damian.world.config import IN_REACH
-from damian.world.coverage import KnownCoverage, build_tables
+from damian.world.config import FOOTPRINT, IN_REACH
+from damian.world.coverage import KnownCoverage, tables_of_all
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
+from damian.world.signal_source import footprint_radius
 from damian.world.simulation import Simulation
 
 Features = dict[str, Tensor]
@@ -83,14 +85,24 @@ class Server:
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._widths = simulation.widths
-        footprints = None
+        footprints, surrounded = None, "coverage_map" in self.names
+        levels = simulation.vehicles.values.choices.get("source.level_db")
+        source, radii = simulation.config.source, [simulation.radius]
+        if levels is not None:
+            ranged = len(levels) == 2 and (surrounded or "coverage" in self.names)
+            problem = (
+                "is a range, but coverage has a table for each footprint: give a list, as in [138,140,142]"
+            )
+            checks.require(not ranged, "randomise.source.level_db", levels, problem)
+            radii = [*map(footprint_radius, (replace(source, level_db=level) for level in levels))]
+        self._radii = None if levels is None else torch.tensor(radii)
         if "coverage" in self.names:
-            polygons = [region.polygon for region in airspace.regions]
-            footprints = build_tables(polygons, airspace.points.double().cpu().numpy(), simulation.radius)
+            polygons, points = [region.polygon for region in airspace.regions], airspace.points.double().cpu()
+            footprints = tables_of_all(polygons, points.numpy(), radii)
         grid = None
         if observation.belief:
             grid = build_source_grids(airspace, simulation.sources, self.dt, observation.belief_cell)
-        gains, surrounded = "belief_gain" in observation.belief, "coverage_map" in self.names
+        gains = "belief_gain" in observation.belief
         self._context = ServerContext(
             now=torch.zeros(()),
             scale=torch.zeros(()),
@@ -98,6 +110,7 @@ class Server:
             battery=battery,
             footprints=footprints,
             points=airspace.points.flatten(0, 1),
+            scaled_points=torch.cat([airspace.points.flatten(0, 1) * (radii[0] / each) for each in radii]),
             observation=observation,
             dt=simulation.dt,
             readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
@@ -105,7 +118,7 @@ class Server:
             kinds=simulation.vehicles.kinds(simulation.config.agents),
             n_points=airspace.max_points,
             goals=simulation.candidates.goals() if gains else None,
-            places_inside=places_inside(airspace, simulation.radius) if surrounded else None,
+            places_inside=torch.cat([places_inside(airspace, r) for r in radii]) if surrounded else None,
             grid=grid,
         )
         # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.
@@ -233,7 +246,13 @@ class Server:
 
     def _known(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages now."""
-        return self._context._replace(now=steps * self.dt, scale=self.scales(messages))
+        context = self._context._replace(now=steps * self.dt, scale=self.scales(messages))
+        if self._radii is None:
+            return context
+        first, _ = context.readings[FOOTPRINT]
+        told = messages.readings[..., 0, first]
+        number = (told.unsqueeze(-1) - self._radii).abs().argmin(-1)
+        return context._replace(radius=told, footprint=number)
 
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""

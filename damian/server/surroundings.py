@@ -30,11 +30,14 @@ _OLDEST = 0.5
 """How new ground in the oldest footprint of the window nearly is, in [0, 1]; in the newest one it is 0."""
 
 
-def ring_places(radius: float, device: torch.device | None = None) -> Tensor:
-    """Offsets of the places of ``coverage_map`` from a UAV [m], [24, 2]; the inner ring first."""
+def ring_places(radius: float | Tensor, device: torch.device | None = None) -> Tensor:
+    """Offsets of the places of ``coverage_map`` from a UAV [m], [24, 2]; the inner ring first.
+
+    For radii [*, 1, 1, 1], [*, 1, 24, 2].
+    """
     angle = torch.arange(SECTORS, device=device) * (2 * math.pi / SECTORS)
     ring = torch.stack([angle.sin(), angle.cos()], -1)
-    return torch.cat([ring * distance * radius for distance in RINGS])
+    return torch.cat([ring * distance * radius for distance in RINGS], -2)
 
 
 def places_inside(airspace: Airspace, radius: float) -> Tensor:
@@ -193,12 +196,13 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     """
     context, trail = v.context, v.trail
     assert context.places_inside is not None
-    standing = v.wanted(trail[..., 0])
-    offsets = ring_places(context.radius, standing.device)
-    places = gather_rows(context.points, standing).unsqueeze(-2) + offsets
+    standing, radius = v.wanted(trail[..., 0]), context.radius
+    if isinstance(radius, Tensor):
+        radius = radius[..., None, None, None]
+    places = gather_rows(context.points, standing).unsqueeze(-2) + ring_places(radius, standing.device)
     landed = gather_rows(context.points, trail)  # [*, N, n, 2]
     distance = distances(places.flatten(-3, -2), landed.flatten(-3, -2))
     nearest = distance.view(*places.shape[:-1], *trail.shape[-2:]).amin(-2)  # of all UAVs
     age = torch.arange(trail.shape[-1], device=trail.device) / trail.shape[-1]
-    new = (nearest / (2 * context.radius) + _OLDEST * age).amin(-1)
-    return new.clamp(max=1) * gather_rows(context.places_inside, standing)
+    new = (nearest / (2 * radius) + _OLDEST * age).amin(-1)
+    return new.clamp(max=1) * gather_rows(context.places_inside, v.tabled(standing))

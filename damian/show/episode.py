@@ -5,7 +5,7 @@ Films, figures and replay pages are made from it. As a file it is JSON that says
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -25,6 +25,7 @@ from damian.common.errors import InputError
 from damian.common.plotting import COLOURS
 from damian.common.text_files import named, one_line, read_text
 from damian.envs.uav_env import UavEnv
+from damian.world.signal_source import footprint_radius
 from damian.world.state import Truth
 
 SCHEMA, VERSION = "damian-episode", 3
@@ -232,12 +233,13 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
     belief, grid = instants.get(keys.BELIEF, None), env.server.grid
     airspace, region = env.simulation.airspace, int(env.server.region_of(own)[0])
     about, over = {**about, **_drawn(env, truth.drawn[:1])}, airspace.regions[region]
+    level, source = about.get("drawn", {}).get("source.level_db"), env.scenario.source
     return Episode(
         about={**about, "region": over.name, "damian": damian.__version__},
         region=over.polygon,
         origin=over.origin,
         landing_points=np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),
-        radius=env.simulation.radius,
+        radius=footprint_radius(replace(source, level_db=level) if level else source),
         instant=env.simulation.vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
         time=np.asarray(time),

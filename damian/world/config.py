@@ -1,6 +1,5 @@
 """Settings of the simulated world: UAVs, region, motion, signal source, batteries and actions."""
 
-import functools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,6 +13,8 @@ POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 """Variants of a section that read a setting (``kinds``)."""
 IN_REACH = "in_reach"
 """The sensor that tells the truth about detections, for ``reward.detection=truth``."""
+FOOTPRINT = "footprint"
+"""The sensor that tells the radius of a UAV's footprint, if it is drawn."""
 RANDOMISED = (
     "motion.max_speed",
     "motion.max_acceleration",
@@ -21,8 +22,10 @@ RANDOMISED = (
     "wind.speed",
     "wind.direction",
     "wind.gusts",
+    "source.level_db",
     "source.miss",
     "source.false_alarm",
+    "delay.loss",
 )
 """Settings that may be drawn for each world and episode."""
 
@@ -367,7 +370,7 @@ class WorldConfig(Settings):
     randomise: dict[str, Any] = setting(
         {},
         "Settings that are drawn for each world and episode, such as {wind.speed: [0, 6]}: from a range, or "
-        "from a list of more than two values.",
+        "from a list of more than two values; [6] is always 6.",
     )
     sensors: list[Any] = setting(
         [], "Sensors of your own: package.module:name, or {sensor: package.module:name, parameter: ...}."
@@ -399,8 +402,8 @@ class WorldConfig(Settings):
         for key, values in self.randomise.items():
             own = f"randomise.{key}"
             checks.require(key in RANDOMISED, own, values, f"cannot be drawn, only {', '.join(RANDOMISED)}")
-            good = isinstance(values, list) and 2 <= len(values) <= 8
+            good = isinstance(values, list) and 1 <= len(values) <= 8
             checks.require(good, own, values, "is not a range or a list of at most 8 values")
-            section, _, name = key.rpartition(".")
+            section, _, name = key.partition(".")
             for value in values:
-                functools.reduce(getattr, section.split("."), self).checked(name, value)
+                replace(getattr(self, section), **{name: value})

@@ -56,6 +56,17 @@ def build_tables(
     return FootprintTables(masks, (_GRID - 1) / (4 * radius))
 
 
+def tables_of_all(
+    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon], points: np.ndarray, radii: Sequence[float]
+) -> FootprintTables:
+    """The tables of several radii: the landing points of each follow as if they were further ones.
+
+    Their positions are to be given in the unit of the first radius: times this one, over their own.
+    """
+    first, *others = [build_tables(polygons, points, radius) for radius in radii]
+    return first._replace(masks=torch.cat([first.masks, *(each.masks[_GRID**2 :] for each in others)]))
+
+
 def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
     """Coverage c_a in [0, 1], ``[*, N]``: mean share of each UAV's last n footprints that counts.
 

@@ -60,12 +60,12 @@ def appear(
 
 
 def serve(
-    requests: Tensor, served: Tensor, position: Tensor, lands: Tensor, radius: float
+    requests: Tensor, served: Tensor, position: Tensor, lands: Tensor, radius: float | Tensor
 ) -> tuple[Tensor, Tensor]:
     """What each UAV has served after its landing, [B, N, M], and whether it serves one now, [B, N] bool.
 
-    Each UAV of ``lands`` [B, N] serves the oldest open request within ``radius`` [m] of its ``position``
-    [B, N, 2]; of several UAVs that would serve the same one, the first does.
+    Each UAV of ``lands`` [B, N] serves the oldest open request within ``radius`` [m], or [B, 1, 1], of its
+    ``position`` [B, N, 2]; of several UAVs that would serve the same one, the first does.
     """
     time = requests[..., 2].unsqueeze(-2)  # [B, 1, M]
     near = (position.unsqueeze(-2) - requests[..., None, :, :2]).square().sum(-1) <= radius**2

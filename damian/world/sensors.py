@@ -4,11 +4,12 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from damian.common import checks
 from damian.common.registry import Registry, check_parameters, name_of
-from damian.world.config import IN_REACH
+from damian.world.config import FOOTPRINT, IN_REACH
 from damian.world.messages import Messages
 from damian.world.state import State
 
@@ -64,6 +65,14 @@ def in_reach(state: State, world: Any) -> Tensor:
     """Whether a UAV is where it would spot a source if it never missed one, [B, N]: the simulator's truth."""
     _, emits, _ = world.source_now(state)
     return world.in_reach(state, emits, world.vehicles.on_ground(state)).any(-1).float()
+
+
+@SENSORS.register(FOOTPRINT)
+@sensor()
+def footprint(state: State, world: Any) -> Tensor:
+    """Radius of the UAV's footprint [m], [B, N]."""
+    drawn = world.radii(state)
+    return torch.full_like(state.track, world.radius) if drawn is None else drawn.expand_as(state.track)
 
 
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:

@@ -64,6 +64,11 @@ def footprint_radius(config: SourceConfig) -> float:
     return 10 ** ((config.level_db - config.microphone_db) / 20)
 
 
+def drawn_radius(level: Tensor, config: SourceConfig) -> Tensor:
+    """As ``footprint_radius``, of drawn levels [dB], [*]."""
+    return 10 ** ((level - config.microphone_db) / 20)
+
+
 def draw_walks(
     polygon: _Polygon,
     config: SourceConfig,

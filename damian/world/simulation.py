@@ -19,7 +19,7 @@ from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
 from damian.world.requests import appear, request_places, serve
 from damian.world.sensors import sensors_of
-from damian.world.signal_source import Walk, draw_walks, footprint_radius, locate
+from damian.world.signal_source import Walk, draw_walks, drawn_radius, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import MOTION_MODELS
 
@@ -189,10 +189,17 @@ class Simulation:
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
 
+    def radii(self, state: State) -> Tensor | None:
+        """Radius of the footprints of each world's UAVs [m], [B, 1], if it is drawn."""
+        level = self.vehicles.values.get("source.level_db", state.drawn)
+        return drawn_radius(level, self.config.source) if isinstance(level, Tensor) else None
+
     def in_reach(self, state: State, emits: Tensor, on_ground: Tensor) -> Tensor:
         """Whether UAVs ``on_ground`` [B, N] are within the radius of sources that emit [B, K]; [B, N, K]."""
         ways = state.position[..., None, :2] - state.source.unsqueeze(-3)
-        near = ways.square().sum(-1) <= self.reach.square()
+        drawn = self.radii(state)
+        reach = self.reach if drawn is None else drawn.unsqueeze(-1)
+        near = ways.square().sum(-1) <= reach.square()
         return on_ground.unsqueeze(-1) & emits.unsqueeze(-2) & near
 
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
@@ -233,7 +240,9 @@ class Simulation:
         requests = appear(state.requests, served, probability, self.request_places, counters, now)
         lands = self.vehicles.new_stop(state, on_ground, action_valid)
         lands = on_ground if lands is None else lands
-        served, serves = serve(requests, served, state.position[..., :2], lands, self.radius)
+        drawn = self.radii(state)
+        radius = self.radius if drawn is None else drawn.unsqueeze(-1)
+        served, serves = serve(requests, served, state.position[..., :2], lands, radius)
         return state._replace(requests=requests), served, serves.unsqueeze(-1).to(now.dtype)
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:

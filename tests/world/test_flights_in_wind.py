@@ -9,10 +9,20 @@ import torch
 from helpers import clock
 
 from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
+from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
-from damian.server.config import RewardConfig
-from damian.world.config import ActionConfig, BatteryConfig, MotionConfig, RegionConfig, WindConfig
+from damian.recipes.shared.environments import compose_scenario
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
+from damian.world.config import (
+    ActionConfig,
+    BatteryConfig,
+    MotionConfig,
+    RegionConfig,
+    RequestConfig,
+    WindConfig,
+)
 
 DENTED = [[0, 0], [600, 0], [600, 400], [320, 400], [300, 240], [280, 400], [0, 400]]
 SPEED, HARDEST, LEAST = [8.0, 12.0, 20.0], [1.0, 2.0, 4.0], 2.0
@@ -119,6 +129,75 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
     for column, (low, high) in enumerate([(0, 6), (1, 3), (0, 0.5), (0, 360)]):
         assert ((seen[:, column] >= low) & (seen[:, column] <= high)).all(), keys[column]
     assert set(seen[:, 1].tolist()) <= {1.0, 2.0, 3.0}
+
+
+@pytest.mark.parametrize("kind", ["instant", "polynomial"])
+def test_worlds_with_a_drawn_level_are_those_of_this_level(kind):
+    levels, flying = [138.0, 142.0, 145.0], MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
+    base = replace(
+        WORLD,
+        motion=flying,
+        battery=BatteryConfig(),
+        observation=ObservationConfig(global_features=["coverage", "source_distance", "coverage_map"]),
+        reward=RewardConfig(coverage=1.0, served=1.0),
+        requests=RequestConfig(rate=30.0),
+        episode=EpisodeConfig(15),
+    )
+    scenarios = [replace(base, source=replace(base.source, level_db=level)) for level in levels]
+    envs = [UavEnv(replace(base, randomise={"source.level_db": levels}), 8, seed=0)]
+    envs += [UavEnv(scenario, 8, seed=0) for scenario in scenarios]
+    for env in envs:
+        env.simulation.draws = True  # requests of the first step, too, are drawn in each episode
+        env.set_seed(1)
+    tds, met = [env.reset() for env in envs], set()
+    for step in range(40):
+        action, steps = torch.randint(24, (8, 3), generator=torch.Generator().manual_seed(step)), []
+        for i, env in enumerate(envs):
+            before, tds[i] = env.step_and_maybe_reset(tds[i].set(("agents", "action"), action))
+            steps.append(before["next"])
+        if step % 15 == 14:  # these outputs belong to an episode whose level is gone
+            continue
+        for world, level in enumerate(envs[0].state.drawn[:, 0].tolist()):
+            one = steps[1 + levels.index(level)]["agents"][world]
+            met.add(level)
+            for name in ("observation", "reward"):
+                torch.testing.assert_close(steps[0]["agents", name][world], one[name], rtol=0, atol=3e-3)
+    assert met == {*levels}
+
+
+def test_words_say_what_is_drawn():
+    drawn = compose_scenario("scenario=patrol", "randomise={source.level_db: [150], delay.loss: [0, 0.2]}")
+    assert drawn.randomise == {"source.level_db": [150], "delay.loss": [0, 0.2]}
+
+
+def test_coverage_of_a_range_of_levels_is_refused():
+    watched = replace(WORLD, observation=ObservationConfig(global_features=["coverage_map"]))
+    with pytest.raises(InputError, match=r"randomise.source.level_db: .* is a range, .* give a list"):
+        UavEnv(replace(watched, randomise={"source.level_db": [138, 142]}))
+
+
+def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
+    losses, law = [0.0, 0.3, 0.9], {"law": "lag", "lag": {"law": "uniform", "low": 1, "high": 4}}
+    base = replace(WORLD, motion=MotionConfig(), battery=BatteryConfig(), delay=DelayConfig(obs=law))
+    envs = [make_env(replace(base, randomise={"delay.loss": losses}), 12, 0, extras=["message"])]
+    envs += [
+        make_env(replace(base, delay=DelayConfig(law, loss=loss)), 12, 0, extras=["message"])
+        for loss in losses
+    ]
+    actions = [torch.randint(24, (12, 3), generator=torch.Generator().manual_seed(i)) for i in range(60)]
+    flown = []
+    for env in envs:
+        td, steps = env.reset(), []
+        for action in actions:
+            before, td = env.step_and_maybe_reset(td.set(("agents", "action"), action))
+            steps.append(before["next"])
+        flown.append(torch.stack(steps, 1))
+    drawn = flown[0]["agents", "loss"][..., 0, 0]
+    assert len(drawn.unique()) == 3
+    for loss, one in zip(losses, flown[1:], strict=True):
+        chosen = drawn == torch.tensor(loss)
+        for name in ("delay", "received", "age"):
+            assert flown[0]["agents", name][chosen].equal(one["agents", name][chosen])
 
 
 def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
