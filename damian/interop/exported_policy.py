@@ -1,5 +1,6 @@
 """A policy as programs of torch and ONNX, which run without damian and TorchRL."""
 
+import copy
 import logging
 import warnings
 from contextlib import redirect_stderr
@@ -11,7 +12,7 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.data import Categorical, TensorSpec
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import MultiAgentMLP, ProbabilisticActor
 
 from damian import keys
 from damian.common import checks
@@ -24,7 +25,11 @@ class ExportedPolicy(nn.Module):
 
     def __init__(self, actor: ProbabilisticActor, spec: TensorSpec) -> None:
         super().__init__()
-        *layers, last = actor.module
+        *layers, last = copy.deepcopy(actor.module)
+        for layer in layers:
+            for name, network in [*layer.named_modules()]:
+                if isinstance(network, MultiAgentMLP):
+                    layer.set_submodule(name, OwnLayers(network))
         self.last: Any = last
         self.last.return_log_prob = False
         self.layers, self.in_keys = nn.ModuleList(layers), [*actor.in_keys]
@@ -51,6 +56,27 @@ class ExportedPolicy(nn.Module):
             Distribution.set_default_validate_args(checked)
         shown = shown or [entries[key] for key in self.parameter_keys]
         return action, *shown, *([entries[keys.HIDDEN]] if self.recurrent else [])
+
+
+class OwnLayers(nn.Module):
+    """The layers of an actor for each UAV, for observations [*, N, F]; TorchRL's form cannot be exported."""
+
+    def __init__(self, network: MultiAgentMLP) -> None:
+        super().__init__()
+        parts = dict(network._empty_net.named_children())
+        self.linear = [isinstance(part, nn.Linear) for part in parts.values()]
+        self.parts = nn.ModuleList(
+            nn.ParameterList([network.params[name, "weight"], network.params[name, "bias"].unsqueeze(-1)])
+            if isinstance(part, nn.Linear)
+            else part
+            for name, part in parts.items()
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        features = features.unsqueeze(-1)
+        for part, is_linear in zip(self.parts, self.linear, strict=True):
+            features = part[0] @ features + part[1] if is_linear else part(features)
+        return features.squeeze(-1)
 
 
 def exported(
@@ -83,7 +109,7 @@ def exported(
         warnings.simplefilter("ignore", FutureWarning)  # torch's own
         live, name = actor(steps)[keys.ACTION], policy.last.distribution_class.__name__
         should = "needs a property deterministic_sample: without it the action is drawn by chance"
-        checks.require(policy(*inputs)[0].equal(live), key, name, should)
+        checks.require(policy(*inputs)[0].allclose(live), key, name, should)
         program = torch.export.export(policy, examples, dynamic_shapes=((sizes,) * len(examples),))
         found, should = program.module()(*inputs)[0], "are not those of the program"
         checks.require(found.allclose(live), key, "the actor's actions", should)

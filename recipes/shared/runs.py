@@ -265,7 +265,8 @@ def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
 def any_number_of_uavs(config: TrainConfig) -> bool:
     """Do the layers of a policy's networks have the same sizes for any number of UAVs?"""
     observation, both = config.observation, config.learner.actor_follows_critic
-    return "agent_distances" not in (observation.critic if both else observation.actor)
+    same = "agent_distances" not in (observation.critic if both else observation.actor)
+    return same and config.model.shared
 
 
 def _shape(config: TrainConfig) -> dict[str, Any]:

@@ -27,12 +27,13 @@ HISTORY, GRU = ["delay.history=2"], ["model=gru"]
 CONTINUOUS = ["learner=sac", "actions=continuous", "learner.warm_up=8", "learner.batch_size=8"]
 BELIEF = ["observation.belief=[belief_gain]", "model.skip=true"]
 BELIEF += ["observation.global_features=[agent_distances]"]  # for three UAVs alone
+OWN = ["model.shared=false", "source.count=2", "observation.belief=[belief_moments]"]
 
 
 @pytest.mark.parametrize(
     "words",
-    [HISTORY, *(pytest.param(words, marks=pytest.mark.slow) for words in (GRU, CONTINUOUS, BELIEF))],
-    ids=["history", "gru", "continuous", "belief"],
+    [HISTORY, *(pytest.param(words, marks=pytest.mark.slow) for words in (GRU, CONTINUOUS, BELIEF, OWN))],
+    ids=["history", "gru", "continuous", "belief", "own"],
 )
 def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path):
     main(["train", *TRAINED, *words, f"hydra.run.dir={tmp_path / 'run'}"])
