@@ -124,7 +124,7 @@ def report(
     except InputError as error:  # the region is too large for the script, but not for the networks
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
-    succeeds = config.episode.success_share is not None
+    succeeds = config.episode.can_succeed
     table = save_results(rows, folder, succeeds, config.delays.obs.late, MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
     return rows

@@ -122,7 +122,7 @@ class ScenarioConfig(WorldConfig):
     def seeks_source(self) -> bool:
         """Whether anything is won by finding the source."""
         terms = {*self.reward.terms} - {"coverage", "battery", "mean_distance", "served"}
-        return bool(terms) or self.episode.success_share is not None
+        return bool(terms) or self.episode.can_succeed
 
     @property
     def time_scale(self) -> float:

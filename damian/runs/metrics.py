@@ -26,7 +26,7 @@ class Evaluation:
     episodes: int
     """Number of episodes."""
     success_rate: float
-    """Share of the episodes in which as many UAVs as required spotted the source at the same time."""
+    """Share of the episodes that ended with success."""
     steps: float
     """Length of an episode; where success is possible, an episode without it counts the horizon."""
     return_: float
@@ -81,7 +81,7 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     if sent.any() and keys.DELAY in next_step.keys(True):
         delay = cast(Tensor, next_step[keys.DELAY]).squeeze(-1)[in_episode][sent]
         late, lost = _mean(delay > 0), _mean(delay < 0)
-    can_succeed = server.episode.success_share is not None
+    can_succeed = server.episode.can_succeed
     true_end = in_episode & _up_to_first_end(truth.status.terminated)
     return Evaluation(
         len(in_episode),

@@ -161,3 +161,8 @@ class EpisodeConfig(Settings):
     )
     end_with_source: bool = setting(False, "End the episode when the source has stopped for good.")
     all_sources: bool = setting(False, "Success when each source is spotted, by any UAV, at the same time.")
+
+    @property
+    def can_succeed(self) -> bool:
+        """Whether an episode can end with success."""
+        return self.success_share is not None or self.all_sources

@@ -65,7 +65,7 @@ class Episode:
     target: Annotated[Floats, "landing points to which the UAVs fly: east, north [m], [T + 1, N, 2]"]
     track: Annotated[Floats, "headings, clockwise from north [rad], [T + 1, N]"]
     battery: Annotated[Floats, "battery levels [%], [T + 1, N]"]
-    spotted: Annotated[Flags, "whether the UAV spots the source, [T + 1, N]"]
+    spotted: Annotated[Flags, "whether the UAV spots a source, [T + 1, N]"]
     source: Annotated[
         Floats | None, "positions of the sources: east, north [m]; null if nobody knows them, [T + 1, K, 2]"
     ]

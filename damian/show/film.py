@@ -91,7 +91,8 @@ class Film:
         with matplotlib.rc_context(_STYLE):
             self._moving = [*self.view.draw(frame), *self._now(frame.time)]
         won = f"return {self.episode.reward[: step + 1].mean(-1).sum():.2f}"
-        spots = f"{sum(uav.spots for uav in frame.uavs)} of {len(frame.uavs)} UAVs spot the source"
+        which = "a" if len(frame.sources) > 1 else "the"
+        spots = f"{sum(uav.spots for uav in frame.uavs)} of {len(frame.uavs)} UAVs spot {which} source"
         if self.episode.belief is not None:
             spots += f"   ·   belief {self.episode.entropy(step):.1f} bit"
         self.figure.suptitle(f"{frame.time:g} s   ·   {won}   ·   {spots}", x=0.085, ha="left", fontsize=10)

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
-from matplotlib.patches import Circle, PathPatch
+from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
@@ -31,6 +31,7 @@ _BLOWS = Path([[0.0, 1.0], [0.0, -1.0], [-0.4, -0.4], [0.0, -1.0], [0.4, -0.4]],
 DART = Path([[0.0, 1.0], [0.62, -0.8], [0.0, -0.42], [-0.62, -0.8], [0.0, 1.0]])
 """Outline of a UAV that flies to the north."""
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
+_ZONE = {"facecolor": "white", "edgecolor": _EDGE, "linewidth": 0.6, "hatch": "////"}
 _CORNERS = 48
 """Corners of a footprint in space."""
 _HALO = [withStroke(linewidth=1.8, foreground="white")]
@@ -46,6 +47,8 @@ class MapView:
         self.axis, self.radius, self.crowded = axis, episode.radius, episode.is_crowded
         style = {"facecolor": _LAND, "edgecolor": _EDGE, "linewidth": 1.2, "zorder": 0}
         axis.add_patch(PathPatch(_outline(episode.region), **style))
+        for zone in _zones(episode):
+            axis.add_patch(PathPatch(zone, zorder=0.1, **_ZONE))
         axis.plot(*episode.landing_points.T, ".", color=_POINT, markersize=2, zorder=1)
         (west, south), (east, north) = limits(episode)
         axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
@@ -188,6 +191,8 @@ def legend_marks(episode: Episode) -> list[Any]:
     if episode.source is not None:
         for does, style in (("emits", {}), ("silent", {"markerfacecolor": "white"})):
             marks.append(_mark(f"source, {does}", marker="*", color=INK, markersize=11, **style))
+    if _zones(episode):
+        marks.append(Patch(label="no-fly zone", **_ZONE))
     if episode.requests is not None:
         marks.append(_mark("open request", marker="s", color=INK, markerfacecolor="none"))
     if "wind" in episode.about:
@@ -254,6 +259,12 @@ def _outline(area: Any) -> Path:
     """A region, or a part of it, with its holes as a path."""
     rings = shapely.get_rings(shapely.orient_polygons(_polygons(area)))
     return Path.make_compound_path(*[Path(shapely.get_coordinates(ring), closed=True) for ring in rings])
+
+
+def _zones(episode: Episode) -> list[Path]:
+    """The holes of the region, which are its no-fly zones."""
+    holes = [hole for part in _polygons(episode.region) for hole in part.interiors]
+    return [Path(shapely.get_coordinates(hole), closed=True) for hole in holes]
 
 
 def _short(name: str) -> str:

@@ -70,4 +70,4 @@ def true_belief(env: DelayedEnv) -> TensorDictModule:
 
 if __name__ == "__main__":
     config = settings(*sys.argv[1:])
-    print(results_table(script_rows(config), config.episode.success_share is not None, late=True))
+    print(results_table(script_rows(config), config.episode.can_succeed, late=True))

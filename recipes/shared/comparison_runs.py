@@ -88,7 +88,7 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
                 check_policy_fits(run.config, by_folder[Path(run.config.checkpoint)])
             except InputError as error:
                 raise InputError(f"{run.task}/{run.delay}/{run.method}: {error}") from None
-    succeeds = any(run.config.episode.success_share is not None for run in runs)
+    succeeds = any(run.config.episode.can_succeed for run in runs)
     should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
     checks.require(succeeds or "success" not in config.score, "score", config.score, should)
     return sorted(runs, key=lambda run: (run.stage, run.config.seed))
@@ -232,7 +232,7 @@ def _of_run(run: Run, methods: Mapping[str, Method]) -> Results:
     spread = np.linspace(0, len(metrics) - 1, min(len(metrics), MOST_POINTS)).round().astype(int)
     points = metrics.iloc[spread].reindex(columns=CURVE[len(RUN) :])
     points = points.map(lambda number: float(f"{number:.5g}")).assign(**label)[CURVE]
-    if run.config.episode.success_share is None:  # nothing can succeed, and a share of it means nothing
+    if not run.config.episode.can_succeed:  # nothing can succeed, and a share of it means nothing
         for table in (rows, points):
             table[table.filter(like="success_rate").columns] = math.nan
     return Results(rows, points)

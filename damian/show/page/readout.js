@@ -34,11 +34,14 @@ export class Readout {
     if (key === this.shown) return;
     this.shown = key;
     const spots = episode.spotters(step).length;
+    const { wind } = episode.about;
+    const which = episode.source?.[0].length > 1 ? "a" : "the";
     const parts = [
       ["time", `${plain(episode.time[step])} s`],
       ["return", `return ${episode.returns[step].toFixed(2)}`],
-      ["spots", `${spots} of ${episode.nAgents} spot the source`],
+      ["spots", `${spots} of ${episode.nAgents} spot ${which} source`],
       ["age", `mean age ${episode.meanAge[step].toFixed(1)} s`],
+      ["wind", wind ? `wind ${wind[0].toFixed(1)} m/s from ${Math.round(wind[1])}°` : ""],
       ["belief", episode.belief ? `belief ${episode.entropy(step).toFixed(1)} bit` : ""],
       ["ended", ended ? (episode.success ? "ended with success" : "ended") : ""],
     ];
