@@ -1,8 +1,9 @@
-"""Draws the figures of docs/concepts.md, what a delay is and what the laws do, and one of delaybench.
+"""Draws the figures of docs/concepts.md (delays and their laws), of docs/world.md, and one of delaybench.
 
 python docs/figures.py    (make pictures)
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,15 +12,23 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 from torchrl.envs import GymEnv, TransformedEnv
 
 from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
+from damian.baselines.greedy import greedy_policy
 from damian.common.plotting import COLOURS, STYLE
 from damian.compare.comparison import ENDS, TRAINED, Comparison
+from damian.envs.pipeline import make_env
+from damian.envs.uav_env import EXTRAS
 from damian.recipes import cli
 from damian.recipes.compare import includes
 from damian.recipes.shared.comparison_runs import stored_results
+from damian.recipes.shared.environments import compose_scenario
 from damian.runs.run_folder import RANDOM
+from damian.show.episode import record
+from damian.show.frame import frame_of
+from damian.show.views import MapView, legend_marks
 
 IMAGES = Path(__file__).parent / "images"
 DELAYBENCH = Path(__file__).parent / "results" / "delaybench"
@@ -52,6 +61,20 @@ LAWS_FLOWN = {
     "trace": "measured\nlink",
 }
 """Labels of the laws that are no constant delay."""
+SEARCH = ["scenario=search_and_rescue", "source.count=3", "region.zones=0"]
+BELIEF = [*SEARCH, "source.miss=0", "source.false_alarm=0", "observation.belief=[belief_moments]"]
+RANDOMISED = "randomise={source.level_db: [134, 138, 142], wind.speed: [0, 8]}"
+WORLDS = {
+    "all": ([*SEARCH[:2], "motion.max_speed=[10,15,20]", "wind.speed=4", "delay=paper"], 39),
+    "several_sources": (BELIEF, 60),
+    "unequal_uavs": (["scenario=convoy", "motion.max_speed=[5,15,25]", "region=random"], 10),
+    "zones": (["scenario=patrol", "wind.speed=0", "wind.gusts=0", "region.zones=8"], 25),
+    "wind": (["scenario=patrol", "wind.speed=6", "wind.direction=270", "wind.gusts=2"], 20),
+    "detection": ([*SEARCH, "source.miss=0.3", "source.false_alarm=0.1"], 40),
+    "randomisation": ([*SEARCH, RANDOMISED], 20),
+    "requests": (["scenario=requests"], 20),
+}
+"""Pictures of docs/world.md: what is flown by the script, and the step that is shown."""
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 
 
@@ -118,6 +141,29 @@ def main() -> None:
         panel.set_xlabel("step", fontsize=8)
     figure.savefig(IMAGES / "delay_laws.png", dpi=110)
     plot_matrix(DELAYBENCH / "matrix.png")
+    for name, (words, step) in WORLDS.items():
+        plot_world(IMAGES / f"world_{name}.png", words, step, 1 + (name == "randomisation"))
+
+
+def plot_world(path: Path, words: list[str], step: int, worlds: int) -> None:
+    """Draw an instant of an episode that the script flies, of several worlds beside each other."""
+    env = make_env(compose_scenario(*words), worlds, seed=2, extras=EXTRAS)
+    torch.manual_seed(0)
+    rollout = env.rollout(step + 1, greedy_policy(env), break_when_any_done=False)
+    with matplotlib.rc_context({**STYLE, "font.size": 8}):
+        figure = Figure(figsize=(2.2 + 3.2 * worlds, 3.2), layout="constrained")
+        axes = np.atleast_1d(figure.subplots(1, worlds))
+        for axis, flown in zip(axes, record(rollout, env.uav_env, {}), strict=True):
+            sought = env.uav_env.scenario.seeks_source
+            nowhere = {"source": None, "emits": None, "spotted": np.zeros_like(flown.spotted)}
+            episode = flown if sought else replace(flown, **nowhere)
+            MapView(axis, episode).draw(frame_of(episode, min(step, episode.n_steps)))
+            wind = episode.about.get("wind")
+            if worlds > 1 and wind:
+                axis.set_title(f"{episode.radius:.0f} m around a UAV, wind {wind[0]:.1f} m/s", loc="left")
+        figure.legend(handles=legend_marks(episode), loc="outside right upper", frameon=False)
+        figure.savefig(path, dpi=110)
+    Image.open(path).convert("RGB").quantize(dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def plot_matrix(path: Path) -> None:
