@@ -76,7 +76,7 @@ class Greedy:
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
-        self.emits = source.emits
+        self.emits, self.hears_all = source.emits, scenario.requests.range is None
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
         near = distances(self.points, self.points) <= self.radius
@@ -274,19 +274,26 @@ class Rescuer(Coverer):
         times = heard.sum(1).clamp(min=1).unsqueeze(-1)
         place = (known.detected_position * heard.unsqueeze(-1)).sum(1) / times
         goal, assigned = _assigned(known.target, place, heard.any(1), uav)
-        region = self.region_of(known)
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        # A sequence of landing points that leaves no gap: each lies far from those before it.
-        turn = (alone.time / self.dt / SEARCH_STEPS).floor() * known.time.shape[1] + uav
-        searched = (turn * GOLDEN % 1 * self.real[region].sum(-1, keepdim=True)).long()
-        searched = _places_at(self.points[region], searched).squeeze(1)
-        goal = torch.where(assigned.unsqueeze(-1), goal, searched)
+        goal = torch.where(assigned.unsqueeze(-1), goal, self.searched(known, uav))
+        region = self.region_of(known)
         close = (-distances(goal.unsqueeze(1), self.points[region]) / self.radius).exp()
         return self.choose_landing(alone, close, region, mask)
 
+    def searched(self, known: Messages, uav: int) -> Tensor:
+        """Where a UAV that searches flies next, [B, 2]."""
+        region = self.region_of(known)
+        # A sequence of landing points that leaves no gap: each lies far from those before it.
+        turn = (known.time[:, uav : uav + 1] / self.dt / SEARCH_STEPS).floor() * known.time.shape[1] + uav
+        point = (turn * GOLDEN % 1 * self.real[region].sum(-1, keepdim=True)).long()
+        return _places_at(self.points[region], point).squeeze(1)
 
-class Dispatcher(Coverer):
-    """UAVs are assigned to the open requests that are known, the nearest pair first; the others wait."""
+
+class Dispatcher(Rescuer):
+    """UAVs are assigned to the open requests that are known, the nearest pair first.
+
+    The others wait or, if requests are not known at once, search.
+    """
 
     def choose_new(
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
@@ -294,7 +301,8 @@ class Dispatcher(Coverer):
         requests, unserved = known_requests(known)
         goal, assigned = _assigned(known.target, requests[..., :2], unserved, uav)
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        goal = torch.where(assigned.unsqueeze(-1), goal, alone.target[:, 0])
+        other = alone.target[:, 0] if self.hears_all else self.searched(known, uav)
+        goal = torch.where(assigned.unsqueeze(-1), goal, other)
         region = self.region_of(known)
         inside = distances(goal.unsqueeze(1), self.points[region]) <= self.radius
         return self.choose_landing(alone, inside.float(), region, mask)

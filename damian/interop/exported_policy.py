@@ -64,7 +64,6 @@ class OwnLayers(nn.Module):
     def __init__(self, network: MultiAgentMLP) -> None:
         super().__init__()
         parts = dict(network._empty_net.named_children())
-        self.linear = [isinstance(part, nn.Linear) for part in parts.values()]
         self.parts = nn.ModuleList(
             nn.ParameterList([network.params[name, "weight"], network.params[name, "bias"].unsqueeze(-1)])
             if isinstance(part, nn.Linear)
@@ -74,8 +73,8 @@ class OwnLayers(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         features = features.unsqueeze(-1)
-        for part, is_linear in zip(self.parts, self.linear, strict=True):
-            features = part[0] @ features + part[1] if is_linear else part(features)
+        for part in self.parts:
+            features = part[0] @ features + part[1] if isinstance(part, nn.ParameterList) else part(features)
         return features.squeeze(-1)
 
 

@@ -268,6 +268,12 @@ class RequestConfig(Settings):
         0.0, "Mean number that appears in a minute, at most one in a step.", unit="1/min", low=0, high=6000
     )
     most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
+    range: float | None = setting(
+        None,
+        "A UAV on the ground hears of those within it; everybody at once if not given.",
+        unit="m",
+        above=0,
+    )
 
     @property
     def slots(self) -> int:

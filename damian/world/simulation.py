@@ -179,7 +179,7 @@ class Simulation:
             detected_position=torch.where(
                 detected.unsqueeze(-1), position.unsqueeze(-2), state.sent.detected_position
             ),
-            requests=state.requests.unsqueeze(-3).expand(-1, times.shape[-1], -1, -1),
+            requests=self._heard(state, on_ground),
             served=served,
             serves=serves,
             trail=trail,
@@ -244,6 +244,15 @@ class Simulation:
         radius = self.radius if drawn is None else drawn.unsqueeze(-1)
         served, serves = serve(requests, served, state.position[..., :2], lands, radius)
         return state._replace(requests=requests), served, serves.unsqueeze(-1).to(now.dtype)
+
+    def _heard(self, state: State, on_ground: Tensor) -> Tensor:
+        """The latest request of each slot that each UAV knows, [B, N, M, 3]."""
+        requests, reach = state.requests.unsqueeze(-3), self.config.requests.range
+        if reach is None:
+            return requests.expand(-1, on_ground.shape[-1], -1, -1)
+        ways = requests[..., :2] - state.position[..., None, :2]
+        hears = on_ground.unsqueeze(-1) & (ways.square().sum(-1) <= reach**2)
+        return torch.where(hears.unsqueeze(-1), requests, state.sent.requests)
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:
         """Whether each UAV's observed battery level is 0, or allows nothing but holding, [B, N]."""

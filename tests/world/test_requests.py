@@ -1,5 +1,6 @@
 """Requests against a plain loop over worlds, slots and UAVs."""
 
+import itertools
 import math
 
 import pytest
@@ -82,6 +83,24 @@ def test_requests_appear_and_are_served_as_in_a_plain_loop(kind):
     assert lost > 0
 
 
+def test_with_a_range_uavs_know_what_they_have_heard_on_the_ground():
+    flying, reach = MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0), 120.0
+    env = UavEnv(scenario(motion=flying, requests=RequestConfig(RATE, MOST, range=reach)), 6, seed=2)
+    td, heard = env.reset(), 0
+    known = torch.full((6, 3, MOST, 3), -1.0).tolist()
+    for _ in range(40):
+        state = env.state
+        ground = env.simulation.vehicles.on_ground(state)
+        for b, n, m in itertools.product(range(6), range(3), range(MOST)):
+            request = state.requests[b, m].tolist()
+            if ground[b, n] and math.dist(request[:2], state.position[b, n, :2].tolist()) <= reach:
+                heard += known[b][n][m] != request
+                known[b][n][m] = request
+        assert state.sent.requests.tolist() == known
+        td = env.step(env.rand_action(td))["next"]
+    assert heard > 20
+
+
 def test_requests_appear_at_their_rate_anywhere_in_the_region():
     env = UavEnv(scenario(requests=RequestConfig(rate=12.0, most=64)), 64, seed=0)
     env.reset()
@@ -106,8 +125,10 @@ def test_the_server_knows_of_service_only_what_has_arrived():
     assert (seen[..., 3] <= (held.requests[..., 2].amax(-2) >= 0).sum(-1)[..., None, None]).all()
 
 
-def test_the_dispatcher_serves_more_than_chance():
-    env = make_env(scenario(), 64, 0, "cpu", ["message", "state"])
+@pytest.mark.parametrize("reach", [None, 100.0])
+def test_the_dispatcher_serves_more_than_chance(reach):
+    asked = scenario(requests=RequestConfig(RATE, MOST, range=reach))
+    env = make_env(asked, 64, 0, "cpu", ["message", "state"])
     returns = []
     for policy in (greedy_policy(env), None):
         env.set_seed(0)
