@@ -20,12 +20,14 @@ class Values(NamedTuple):
     """All of them; a list of one for each UAV is a tensor [N] in double precision."""
     choices: dict[str, list[float]]
     """Settings that are drawn, and the range, or the values, from which."""
+    streams: dict[str, int]
+    """Numbers of the streams of what is drawn; computed within a step, they would not compile."""
 
     def draw(self, seed: Tensor, episode: Tensor) -> Tensor:
         """The drawn values of an episode, [B, D], by the seeds and numbers of episodes of the worlds [B]."""
         columns = []
         for key, values in self.choices.items():
-            share = counter_rng.uniform(seed, torch.full_like(episode, counter_rng.number_of(key)), episode)
+            share = counter_rng.uniform(seed, torch.full_like(episode, self.streams[key]), episode)
             if len(values) == 2:
                 columns.append(values[0] + (values[1] - values[0]) * share)
             else:
@@ -57,4 +59,4 @@ def values_of(config: WorldConfig) -> Values:
     choices = {key: [*map(float, values)] for key, values in config.randomise.items()}
     if config.is_windy and config.wind.direction is None:
         choices.setdefault("wind.direction", [0.0, 360.0])
-    return Values(settings, choices)
+    return Values(settings, choices, {key: counter_rng.number_of(key) for key in choices})
