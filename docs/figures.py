@@ -16,7 +16,7 @@ from PIL import Image
 from torchrl.envs import GymEnv, TransformedEnv
 
 from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.plotting import COLOURS, STYLE
 from damian.compare.comparison import ENDS, TRAINED, Comparison
 from damian.envs.pipeline import make_env
@@ -149,7 +149,7 @@ def plot_world(path: Path, words: list[str], step: int, worlds: int) -> None:
     """Draw an instant of an episode that the script flies, of several worlds beside each other."""
     env = make_env(compose_scenario(*words), worlds, seed=2, extras=EXTRAS)
     torch.manual_seed(0)
-    rollout = env.rollout(step + 1, greedy_policy(env), break_when_any_done=False)
+    rollout = env.rollout(step + 1, script_policy(env), break_when_any_done=False)
     with matplotlib.rc_context({**STYLE, "font.size": 8}):
         figure = Figure(figsize=(2.2 + 3.2 * worlds, 3.2), layout="constrained")
         axes = np.atleast_1d(figure.subplots(1, worlds))

@@ -10,7 +10,7 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
@@ -58,7 +58,7 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
         rows = read_file(path)
         n_uavs = len({report.id for _, report in rows})
         node = Node(for_uavs(config, n_uavs), config.seed)
-        policy = stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
+        policy = stored_actor(config, node.env) if config.learnt else script_policy(node.env)
         answers = next_landings(rows, node, policy, time.time(), config.flown == "sampled")
     save_config(config, folder)
     write_atomically(folder / "advice.json", answers.to_json(orient="records", indent=1, double_precision=15))

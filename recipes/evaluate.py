@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 from tensordict.nn import InteractionType
 from torchrl.modules import ProbabilisticActor
 
-from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -120,7 +120,7 @@ def report(
         if policy is not None:
             rows = {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)} | rows
     try:
-        rows[SCRIPT] = fly(greedy_policy(env))
+        rows[SCRIPT] = fly(script_policy(env))
     except InputError as error:  # the region is too large for the script, but not for the networks
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random

@@ -17,8 +17,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
+from damian.baselines.script import script_policy
 from damian.common import checks
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
@@ -44,7 +44,7 @@ def fly(config: FlyConfig) -> list[Episode]:
         policy: TensorDictModuleBase = stored_actor(config, env)
         add_recurrent_state(env, policy)
     else:
-        policy = greedy_policy(env) if config.flown == "script" else random_policy(env)
+        policy = script_policy(env) if config.flown == "script" else random_policy(env)
     with set_exploration_type(ExplorationType.DETERMINISTIC if likely else ExplorationType.RANDOM):
         rollout = env.rollout(config.horizon, policy, break_when_any_done=False)
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "seed": config.seed}

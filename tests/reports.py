@@ -102,7 +102,7 @@ def read_json(rows: Any) -> Rows:
 
 def write_journal(path: Path, *lines: dict[str, Any], uavs: list[str]) -> Path:
     """A journal of lines after the first one."""
-    about = {"policy": "greedy", "checkpoint": "runs/gone", "overrides": ["region=llanbedr", "port=0"]}
+    about = {"policy": "script", "checkpoint": "runs/gone", "overrides": ["region=llanbedr", "port=0"]}
     head = {"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": uavs, "about": about}
     path.write_text("".join(json.dumps(line) + "\n" for line in [head, *lines]), encoding="utf-8")
     return path

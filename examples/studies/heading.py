@@ -23,7 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from damian import keys
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.tables import markdown_table
 from damian.compare.comparison import means_over_seeds, shown
 from damian.envs.config import ScenarioConfig
@@ -121,7 +121,7 @@ def flown(scenario: ScenarioConfig, build: GridBuilder, worlds: int, seed: int) 
     limit = scenario.episode.max_steps
     assert limit
     assert env.server.grid
-    rollout = env.rollout(limit, greedy_policy(env), break_when_any_done=False)
+    rollout = env.rollout(limit, script_policy(env), break_when_any_done=False)
     cells = len(env.server.grid.centres.unique(dim=0))
     place = Truth.unpack(rollout[next_key(keys.STATE)]).source[..., 0, :].float()
     true = torch.cdist(place, env.server.grid.centres[:cells]).argmin(-1, keepdim=True)

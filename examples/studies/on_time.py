@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from damian import keys
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common import checks
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -47,7 +47,7 @@ def script_rows(config: TrainConfig) -> dict[str, Evaluation]:
     flights, rows = [(late, False), (own, False), (undelayed, False), (undelayed, True)], {}
     for known, (scenario, true_place) in zip(KNOWN_ON_TIME, flights, strict=True):
         env = make_env(scenario, config.eval_episodes, config.eval_seed, config.device, ["message", "state"])
-        script: TensorDictModuleBase = greedy_policy(env)
+        script: TensorDictModuleBase = script_policy(env)
         if true_place:
             script = TensorDictSequential([true_belief(env), script])  # type: ignore[list-item]
         rows[known] = evaluate(env, script, config.horizon)

@@ -5,7 +5,7 @@ import torch
 from helpers import SQUARE, square
 
 from damian import keys
-from damian.baselines.greedy import Searcher, greedy_policy
+from damian.baselines.script import Searcher, script_policy
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -44,7 +44,7 @@ def test_all_uavs_fly_to_where_they_detect_the_source(own):
     td[keys.BELIEF] = torch.nn.functional.one_hot(cell, len(centres)).float().view(1, 1, -1)
     if own:
         td[keys.OWN_BELIEF] = td[keys.BELIEF].unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()
-    after = env.step(greedy_policy(env)(td))["next"][keys.MESSAGE]
+    after = env.step(script_policy(env)(td))["next"][keys.MESSAGE]
     distance = (env.uav_env.server.messages(after).position[0] - centres[cell]).norm(dim=-1)
     assert (distance < env.uav_env.simulation.radius).all()
 
@@ -56,5 +56,5 @@ def test_without_a_belief_or_a_reward_for_the_source_the_script_keeps_its_own_ma
         "none": believing(observation=ObservationConfig()),
         "coverage": believing(reward=RewardConfig(spotted=0.0, coverage=1.0)),
     }
-    searches = {name: isinstance(greedy_policy(env).module, Searcher) for name, env in scripts.items()}
+    searches = {name: isinstance(script_policy(env).module, Searcher) for name, env in scripts.items()}
     assert searches == {"belief": True, "late": True, "none": False, "coverage": False}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from reports import LLANBEDR, Reporter, names_of, write_journal
 
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
@@ -53,7 +53,7 @@ def scenario(request) -> ScenarioConfig:
 def flown(tmp_path_factory, scenario) -> tuple:
     """A simulated flight, the episode that the simulation recorded, and the journal of its reports."""
     env = make_env(scenario, 1, 3, extras=EXTRAS)
-    rollout = env.rollout(N_STEPS, greedy_policy(env), break_when_any_done=False)
+    rollout = env.rollout(N_STEPS, script_policy(env), break_when_any_done=False)
     reporter, lines = Reporter(env, Node(scenario, 3).ground), []
     for step in range(N_STEPS + 1):
         reporter.send(rollout[:, step] if step < N_STEPS else rollout[:, -1]["next"], step, at_once=step == 0)

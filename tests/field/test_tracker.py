@@ -9,7 +9,7 @@ from reports import LLANBEDR, START, Reporter, names_of, read_json
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
@@ -78,7 +78,7 @@ def recurrent(env):
 def test_it_observes_what_the_simulation_does_bit_for_bit(task, fraction):
     scenario = scenario_of(**TASKS[task])
     env = make_env(scenario, 1, 3, extras=["message"])
-    node, policy, n_spotted, rows = Node(scenario, 3), greedy_policy(env), 0, []
+    node, policy, n_spotted, rows = Node(scenario, 3), script_policy(env), 0, []
     seen, reporter = [env.reset()], Reporter(env, node.ground, fraction)
     reporter.send(seen[0], 0, at_once=True)
     for step in range(90 if task == "flights" else 40):
@@ -100,7 +100,7 @@ def test_it_observes_what_the_simulation_does_bit_for_bit(task, fraction):
     assert n_spotted > 0
 
 
-@pytest.mark.parametrize("policy_of", [greedy_policy, recurrent])
+@pytest.mark.parametrize("policy_of", [script_policy, recurrent])
 def test_a_table_is_answered_as_the_policy_acts_in_the_simulation(policy_of):
     scenario = scenario_of(observation=BELIEF)
     env = make_env(scenario, 1, 3, extras=["message"])
@@ -126,7 +126,7 @@ def test_who_is_in_flight_is_not_advised():
     for row, point in zip(rows, (200, 300, 400), strict=True):
         row["lat"], row["lon"] = node.ground.place(point)
     rows[1]["FLA"] = 20
-    answers = next_landings(read_json(rows), node, greedy_policy(node.env), START)
+    answers = next_landings(read_json(rows), node, script_policy(node.env), START)
     assert [*(answers.state == "in flight")] == [*answers.lat.isna()] == [False, True, False]
     assert {*answers.age} == {1.0}
 

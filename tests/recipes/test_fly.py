@@ -121,7 +121,7 @@ def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(run):
     assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
     assert np.diff(episode.time) == pytest.approx(0.5)
     about = dict(episode.about)
-    assert (about["policy"], about["checkpoint"], about["fleet"]) == ("greedy", "runs/gone", "north")
+    assert (about["policy"], about["checkpoint"], about["fleet"]) == ("script", "runs/gone", "north")
     assert about["began"] == "2023-11-14T22:13:21.000Z", "when both had reported"
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == episode.n_steps + 1

@@ -40,7 +40,7 @@ class Parts(HTMLParser):
 
 def flown_with(*overrides):
     """Episodes that differ in their overrides."""
-    about = {"policy": "greedy", "checkpoint": None, "seed": 2, "world": 0}
+    about = {"policy": "script", "checkpoint": None, "seed": 2, "world": 0}
     return [flight(about={**about, "overrides": list(words)}) for words in overrides]
 
 

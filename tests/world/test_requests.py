@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common import counter_rng
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
@@ -130,7 +130,7 @@ def test_the_dispatcher_serves_more_than_chance(reach):
     asked = scenario(requests=RequestConfig(RATE, MOST, range=reach))
     env = make_env(asked, 64, 0, "cpu", ["message", "state"])
     returns = []
-    for policy in (greedy_policy(env), None):
+    for policy in (script_policy(env), None):
         env.set_seed(0)
         returns.append(
             env.rollout(40, policy, break_when_any_done=False)["next", "agents", "reward"].sum(1).mean()

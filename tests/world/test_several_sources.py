@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
@@ -101,7 +101,7 @@ def test_the_script_finds_more_than_chance():
     source = SourceConfig(count=3, level_db=140.0)
     told = scenario(source, episode=EpisodeConfig(60, all_sources=True), reward=RewardConfig(bonus=1.0))
     env, found = make_env(told, 64, 0, "cpu", ["message", "state"]), []
-    for policy in (greedy_policy(env), None):
+    for policy in (script_policy(env), None):
         env.set_seed(0)
         rollout = env.rollout(60, policy, break_when_any_done=False, auto_reset=True)
         found.append(rollout["next", "success"].any(1).float().mean().item())

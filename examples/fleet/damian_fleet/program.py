@@ -23,7 +23,7 @@ import yaml
 
 import damian
 from damian import keys
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common import checks
 from damian.common.errors import InputError, RunError
 from damian.common.fields import rules, setting
@@ -118,7 +118,7 @@ def make_parts(config: FleetConfig, words: Sequence[str]) -> Callable[[int], tup
     def parts(n_uavs: int) -> tuple[Node, torch.nn.Module]:
         node = Node(for_uavs(scenario, n_uavs), config.seed)
         if loaded is None:
-            return node, greedy_policy(node.env)
+            return node, script_policy(node.env)
         widths = [env.observation_spec[keys.OBSERVATION].shape[-1] for env in (node.env, loaded.env)]
         if widths[0] != widths[1]:
             raise InputError(

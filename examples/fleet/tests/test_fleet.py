@@ -7,7 +7,7 @@ import torch
 from reporting import FREE, START, advise, flights
 
 from damian import keys
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
@@ -74,7 +74,7 @@ TASKS = {
 def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task, fraction):
     scenario = scenario_of(**TASKS[task])
     spotted, moved, n_steps = 0, 0, 90 if task == "flights" else 40
-    for shown, fleet, action, ready, step in flights(scenario, greedy_policy, n_steps, fraction=fraction):
+    for shown, fleet, action, ready, step in flights(scenario, script_policy, n_steps, fraction=fraction):
         read = fleet.observe(ready)
         for key in (keys.OBSERVATION, keys.ACTION_MASK, keys.TIMELINE):
             if key in shown.keys(True):
@@ -96,7 +96,7 @@ SILENT = 40
 
 def fleet_of(**changed) -> Fleet:
     node = Node(scenario_of(**changed), 3)
-    return Fleet(node, ["a", "b", "c"], greedy_policy(node.env), rules=FREE)
+    return Fleet(node, ["a", "b", "c"], script_policy(node.env), rules=FREE)
 
 
 def report_of(
@@ -228,7 +228,7 @@ def test_fleets_that_share_a_node_do_not_see_each_other(task):
     """Beside another fleet, which began earlier elsewhere, a fleet observes what it does alone."""
 
     def flown(node: Node, beside: Fleet | None) -> list:
-        fleet, seen = Fleet(node, ["a", "b", "c"], greedy_policy(node.env), rules=FREE), []
+        fleet, seen = Fleet(node, ["a", "b", "c"], script_policy(node.env), rules=FREE), []
         for step in range(12):
             if beside:
                 told(beside, "b", START + step, 90 - step, battery=50.0, source_spotted=step % 2 == 0)
@@ -244,7 +244,7 @@ def test_fleets_that_share_a_node_do_not_see_each_other(task):
 
     scenario = scenario_of(**TASKS[task])
     shared = Node(scenario, 3)
-    beside = Fleet(shared, ["a", "b", "c"], greedy_policy(shared.env), rules=FREE)
+    beside = Fleet(shared, ["a", "b", "c"], script_policy(shared.env), rules=FREE)
     for i, uav in enumerate(beside.uavs):
         told(beside, uav, START - 20, 200 + i, source_spotted=True)
     advise(beside, START - 10)

@@ -11,7 +11,7 @@ from reporting import START, read_json
 from test_fleet import LLANBEDR, SEEN, scenario_of
 
 from damian import keys
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.field.node import Node, for_uavs
 from damian.field.playback import episodes_of
@@ -43,7 +43,7 @@ class Field:
         self.session.create("north", [*uavs])
 
     def open(self) -> AdviceSession:
-        return AdviceSession(self.make, self.folder, {"policy": "greedy"})
+        return AdviceSession(self.make, self.folder, {"policy": "script"})
 
     def parts(self, n: int):
         if n not in self.nodes:
@@ -367,7 +367,7 @@ def test_whatever_happens_nothing_is_unsafe_and_a_restart_remembers_it_all(tmp_p
     """Reports and answers get lost or come late, clocks stand still, people hold and send home."""
     draw = random.Random(seed)
     few_levels = {"highest_level": 20.0} if seed % 2 else {}
-    field = Field(tmp_path, uavs="ABC", policy_of=greedy_policy, **few_levels)
+    field = Field(tmp_path, uavs="ABC", policy_of=script_policy, **few_levels)
     given: list[tuple[str, str]] = []
     for uav, point in zip("ABC", (100, 200, 300), strict=True):
         field.report(uav, point)

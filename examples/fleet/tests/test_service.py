@@ -5,7 +5,7 @@ from reporting import FREE
 from starlette.testclient import TestClient
 from test_fleet import LLANBEDR, scenario_of
 
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.field.node import Node, for_uavs
 from damian_fleet.fleet import Fleet
 from damian_fleet.service import MAX_BODY, make_app
@@ -19,7 +19,7 @@ UAVS = ["A", "B", "C"]
 @pytest.fixture(scope="module")
 def parts():
     node = Node(for_uavs(scenario_of(region=LLANBEDR), 3))
-    return node, greedy_policy(node.env)
+    return node, script_policy(node.env)
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def session(parts, tmp_path):
     return AdviceSession(
         lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
         tmp_path / "journals",
-        {"policy": "greedy"},
+        {"policy": "script"},
     )
 
 

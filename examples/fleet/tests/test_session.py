@@ -8,7 +8,7 @@ from reporting import FREE, START, read_json
 from test_fleet import LLANBEDR, SEEN, TASKS, scenario_of
 from test_round_trip import recurrent
 
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError, RunError
 from damian.field.node import Node, for_uavs
 from damian_fleet import journal as module
@@ -18,8 +18,8 @@ from damian_fleet.session import AdviceSession
 
 UAVS = ["A", "B"]
 WORDS = ["region=llanbedr", "clock.simulation=1s", "delay.obs=0", "delay.obs={law: lag, steps: 2}"]
-ABOUT = {"policy": "greedy", "checkpoint": None, "overrides": WORDS}
-HEAD = Head(fleet="north", uavs=["A"], about=About(policy="greedy"))
+ABOUT = {"policy": "script", "checkpoint": None, "overrides": WORDS}
+HEAD = Head(fleet="north", uavs=["A"], about=About(policy="script"))
 LINE = Received(received=1.5, reports=[{"id": "A", "time": 1.0, "lat": 53.1, "lon": -4.5}])
 
 
@@ -34,7 +34,7 @@ def make_session(node, tmp_path):
     made: list[AdviceSession] = []
 
     def make(node: Node = node, policy=None, **about) -> AdviceSession:
-        policy = policy or greedy_policy(node.env)
+        policy = policy or script_policy(node.env)
         folder = tmp_path / "journals"
         made.append(
             AdviceSession(
@@ -153,7 +153,7 @@ def fail(*_):
     raise RunError("north.jsonl: it cannot be written: No space left on device")
 
 
-@pytest.mark.parametrize("policy_of", [greedy_policy, recurrent])
+@pytest.mark.parametrize("policy_of", [script_policy, recurrent])
 def test_nobody_is_told_what_the_journal_does_not_say(make_session, monkeypatch, tmp_path, policy_of):
     """On a full disk a question changes nothing: when there is room again, all goes on as after a restart."""
     scenario = scenario_of(region=LLANBEDR, observation=SEEN, delay=TASKS["late"]["delay"])

@@ -24,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import damian
 from damian import keys
-from damian.baselines.greedy import greedy_policy
+from damian.baselines.script import script_policy
 from damian.field.fitting import read_log
 from damian.field.known import UavLog, messages_of
 from damian.field.node import Node, for_uavs
@@ -42,7 +42,7 @@ SEED = 10_000
 
 def policy_of(name: str, trained: Any, env: Any) -> Any:
     """A policy for an environment; that of the run draws its actions, unless it is deterministic."""
-    return greedy_policy(env) if name == "script" else trained
+    return script_policy(env) if name == "script" else trained
 
 
 def simulated(name: str, trained: Any, env: Any, horizon: int) -> Tensor:

@@ -39,7 +39,7 @@ MAX_PAIRS = 400_000_000
 """Most pairs of landing points: the script weighs each of them against every other one of its region."""
 
 
-def greedy_policy(env: DelayedEnv) -> TensorDictModule:
+def script_policy(env: DelayedEnv) -> TensorDictModule:
     """Build the stateless scripted policy, for an environment with ``message`` among its extras."""
     n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
@@ -49,7 +49,7 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     believes = keys.BELIEF in available and scenario.seeks_source
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
     own_messages = keys.OWN_BELIEF in available if believes else scenario.observation.own
-    script = Searcher if believes else Greedy if scenario.seeks_source else Coverer
+    script = Searcher if believes else Seeker if scenario.seeks_source else Coverer
     if scenario.source.count > 1 and scenario.seeks_source:
         script = Rescuer
     if scenario.requests.slots:
@@ -57,7 +57,7 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     arguments: dict[str, NestedKey] = {"message": message, "mask": keys.ACTION_MASK}
     if script is Searcher:
         arguments |= {"belief": keys.BELIEF, "own_belief": keys.OWN_BELIEF}
-    if script is Greedy:
+    if script is Seeker:
         arguments |= {"age": keys.AGE}
     elif own_messages:
         arguments |= {"own_message": keys.MESSAGE}
@@ -65,7 +65,7 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     return TensorDictModule(script(env.uav_env), in_keys, [keys.ACTION])
 
 
-class Greedy:
+class Seeker:
     """Function from messages to actions, for the regions, the source and the UAVs of an environment."""
 
     def __init__(self, worlds: UavEnv) -> None:
@@ -174,7 +174,7 @@ def _places_at(ground: Tensor, index: Tensor) -> Tensor:
     return ground.gather(1, index.unsqueeze(-1).expand(*index.shape, 2))
 
 
-class Searcher(Greedy):
+class Searcher(Seeker):
     """Each UAV flies where it most probably detects the source, or else searches its own ground."""
 
     def __call__(  # type: ignore[override]
@@ -223,7 +223,7 @@ class Searcher(Greedy):
         return stands.sum(1, keepdim=True) > stands
 
 
-class Coverer(Greedy):
+class Coverer(Seeker):
     """Each UAV flies where its footprint holds most new ground; the UAVs choose one after the other.
 
     Ground is new if it lies outside the UAV's own latest footprints, as they are after the next landing, and

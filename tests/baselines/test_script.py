@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from damian import keys
-from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Coverer, Greedy, greedy_policy
 from damian.baselines.random import random_policy
+from damian.baselines.script import BLUR_M, RECENT, TRUST, Coverer, Seeker, script_policy
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
@@ -47,7 +47,7 @@ def field(**changed) -> DelayedEnv:
 
 def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
     """Landing points to which the policy sends the UAVs of the first world, if all are free, [N, 2]."""
-    action = greedy_policy(env)(td)["agents", "action"][0]
+    action = script_policy(env)(td)["agents", "action"][0]
     worlds = env.uav_env
     if worlds.scenario.actions.kind == "discrete":
         distance, heading = action_table(worlds.scenario.actions)[action].unbind(-1)
@@ -103,7 +103,7 @@ def test_without_a_reward_for_the_source_no_uav_flies_to_it(sections, seeks):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
     env = field(source=walking(emission="per_step", emission_probability=0.7))
-    policy, radius = Greedy(env.uav_env), env.uav_env.simulation.radius
+    policy, radius = Seeker(env.uav_env), env.uav_env.simulation.radius
     torch.manual_seed(seed)
     places, times = 400 * torch.rand(2, 2, 3, 2), 8.0 + torch.randint(2, (2, 3))
     detected = torch.minimum(torch.tensor([-1.0, 0.0, 5.0, 9.0])[torch.randint(4, (2, 3))], times)
@@ -146,7 +146,7 @@ def test_uavs_choose_one_after_the_other_where_their_footprints_hold_most_new_gr
     td = env.rollout(6, random_policy(env))["next"][:, -1]
     sent, legal = sent_messages(td), td["agents", "action_mask"]
     held = env.uav_env.server.messages(td[keys.RECEIVED]) if obs else sent
-    chosen = greedy_policy(env)(td)["agents", "action"]
+    chosen = script_policy(env)(td)["agents", "action"]
     for world in range(8):
         region = int(held.trail[world, 0, 0]) // policy.points.shape[1]
         points, claimed = policy.points[region], []
@@ -198,7 +198,7 @@ def distances(some: Tensor, others: Tensor) -> Tensor:
 @pytest.mark.parametrize("obs", [0, 2])
 def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_other_worlds(kind, motion, obs):
     env = make_env(everything(motion, kind, delay=DelayConfig(obs=obs)), 16, extras=["message"])
-    policy = greedy_policy(env)
+    policy = script_policy(env)
     rollout = env.rollout(8, policy, break_when_any_done=False)
     action = rollout["agents", "action"]
     if kind == "discrete":
@@ -213,7 +213,7 @@ def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_othe
 
 def test_the_policy_reads_received_messages_and_not_sent_ones():
     env = field(delay=DelayConfig(obs=3))
-    td, policy = detection(env, [200.0, 200.0]), greedy_policy(env)
+    td, policy = detection(env, [200.0, 200.0]), script_policy(env)
     without_detection = policy(env.reset())["agents", "action"]
     assert torch.equal(policy(td.clone())["agents", "action"], without_detection)
     td["agents", "received"] = td["agents", "message"]
