@@ -1,6 +1,6 @@
 """Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one (docs/runs.md).
 
-damian train scenario=paper/usecase2 delay=paper aware=both hydra.run.dir=runs/first
+damian train scenario=paper/usecase2 delay=paper aware=backupdate+history hydra.run.dir=runs/first
 damian train agents=3 seed=0 frames=300000 worlds=64 device=cuda compile=true learner.lr=3e-4
 damian train delay.obs=3  (steps; or 3s, 1..7 (uniform), 3s..7s, "{law: geometric, mean: 2s}"; delay.act)
 damian train resume=runs/first frames=600000     (the run goes on)

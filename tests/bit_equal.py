@@ -36,7 +36,7 @@ DELAYS = [["delay=none"], ["delay=paper"], ["delay.obs=4"], ["delay=burst", "awa
 OTHERS = [
     ["scenario=tracking", "delay=lag", "motion=polynomial"],
     ["scenario=energy", "delay=distance", "actions=continuous", "motion=polynomial"],
-    ["scenario=mixed", "delay=paper", "delay.act=2", "delay.rew=3", "delay.history=4", "aware=both"],
+    ["scenario=mixed", "delay=paper", "delay.act=2", "delay.rew=3", "delay.history=4", "aware=backupdate+history"],
     ["scenario=coverage", "region=random", "agents=5", "delay.obs=2", "observation.own=true"],
     ["scenario=tracking", "links=matrix", "delay=paper"],
     ["scenario=tracking", "links=updown", "delay=paper"],
@@ -48,14 +48,14 @@ OTHERS = [
 TRAININGS = [
     ["scenario=spotting", "aware=belief", "delay=paper"],
     ["scenario=delaybench/tracking", "delay.obs=4", "aware=backupdate", "observation.own=true"],
-    ["scenario=delaybench/tracking", "delay=paper", "aware=both", "settle=true"],
+    ["scenario=delaybench/tracking", "delay=paper", "aware=backupdate+history", "settle=true"],
     ["scenario=delaybench/flights", "delay=paper", "aware=belief"],
     ["scenario=delaybench/coverage", "region=random"],
     ["scenario=tracking", "model=gru", "delay=paper"],
     ["scenario=tracking", "learner=sac", "delay=paper", "aware=backupdate"],
     ["scenario=tracking", "learner=sac", "actions=continuous"],
-    ["scenario=tracking", "learner=bpql", "delay.obs=2", "aware=both"],
-    ["scenario=paper/usecase2", "delay=paper", "aware=both", "corrected=[reward,critic,actor]"],
+    ["scenario=tracking", "learner=bpql", "delay.obs=2", "aware=backupdate+history"],
+    ["scenario=paper/usecase2", "delay=paper", "aware=backupdate+history", "corrected=[reward,critic,actor]"],
     ["scenario=delaybench/crowded", "delay=burst", "aware=timeline"],
     [
         "scenario=delaybench/flights",

@@ -34,7 +34,7 @@ RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
 """Is one value computed for all agents, as with our ``model.shared_value``?"""
 WIDTHS = {"2 x 64": [64, 64], "2 x 256": [256, 256]}
 """Layer widths of all networks, by name."""
-UNDELAYED, AWARE = "scenario=paper/usecase2", "scenario=paper/usecase2 delay=paper aware=both"
+UNDELAYED, AWARE = "scenario=paper/usecase2", "scenario=paper/usecase2 delay=paper aware=backupdate+history"
 COMPILED, SHARED = "compile=true", "compile=true model.shared_value=true"
 METHODS = (UNDELAYED, f"{UNDELAYED} {COMPILED}", f"{UNDELAYED} {SHARED}", AWARE, f"{AWARE} {SHARED}")
 """Overrides of ``damian train``, separated by spaces."""

@@ -29,7 +29,7 @@ SENSOR = "sensors=[{sensor: sensor:wind, strength: 3}]"
 
 
 def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
-    first = run(*TINY, *REWARDS, *LAW, *FEATURES, *REGION, *MOTION, SENSOR, "aware=both")
+    first = run(*TINY, *REWARDS, *LAW, *FEATURES, *REGION, *MOTION, SENSOR, "aware=backupdate+history")
     second = run(f"checkpoint={first}", "seed=1", "trust=true", program="evaluate", name="evaluated")
     assert (second / "result.csv").is_file()
     with (first / "metrics.csv").open(newline="") as file:

@@ -219,7 +219,7 @@ tasks: {spotting: []}
 delays: {late: [delay.obs=2]}
 methods:
   undelayed: {delayed: false}
-  both: {overrides: [aware=both]}
+  both: {overrides: [aware=backupdate+history]}
   flown: {policy_of: both}
 """
 

@@ -15,7 +15,7 @@ from stopped_runs import SAC, TINY, check_equal, counted_updates, ended, files, 
 WHOLE = [
     "delay=paper",
     "delay.obs.high=9s",
-    "aware=both",
+    "aware=backupdate+history",
     "delay.act=1",
     "motion=polynomial",
     "model.rnn=gru",

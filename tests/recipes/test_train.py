@@ -61,8 +61,8 @@ def trained(tmp_path_factory) -> Path:
         ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
         ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
         ["learner=sac", "learner.warm_up=64", "actions=continuous", "motion=polynomial", "aware=backupdate"],
-        ["learner=sac", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=both"],
-        ["actions=continuous", "model=gru", "motion=polynomial", "delay=paper", "aware=both"],
+        ["learner=sac", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=backupdate+history"],
+        ["actions=continuous", "model=gru", "motion=polynomial", "delay=paper", "aware=backupdate+history"],
     ],
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):
