@@ -85,6 +85,8 @@ def trained(tmp_path_factory) -> Path:
     """A trained run and the files that the documents name."""
     folder = tmp_path_factory.mktemp("documents")
     call(["train", *TINY, "hydra.run.dir=runs/FOLDER"], folder)
+    for name in "AB":
+        shutil.copytree(folder / "runs" / "FOLDER", folder / "runs" / name)
     flight = ["fly", "policy=random", "formats=[]", "episode.max_steps=12", "region.lattice_step=60"]
     call([*flight, "hydra.run.dir=undelayed"], folder)
     call([*flight, "delay.obs=3", "hydra.run.dir=late"], folder)
