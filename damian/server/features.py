@@ -49,8 +49,6 @@ class ServerContext(NamedTuple):
     """For the feature ``coverage``; None if it is not needed."""
     points: Tensor
     """Landing points by flat id, [R*L, 2] metres."""
-    scaled_points: Tensor
-    """The same for each radius of footprints, in the unit of the first one (``tables_of_all``)."""
     observation: ObservationConfig
     """Gives scales, and the numbers of landing points and steps that features look at."""
     dt: float = 1.0
@@ -61,6 +59,8 @@ class ServerContext(NamedTuple):
     """Radius of a UAV's footprint [m]; [*] if it is drawn."""
     footprint: Tensor | None = None
     """Number of the drawn radius in tables, [*]."""
+    scaled_points: Tensor | None = None
+    """Landing points for each radius that may be drawn, in the unit of the first one (``tables_of_all``)."""
     kinds: Tensor | None = None
     """Speed limit and battery capacity of each UAV, over the largest ones, [N, 2]."""
     n_points: int = 0
@@ -352,7 +352,8 @@ def _agent_distances(v: FeatureCache) -> Tensor:
 def _coverage(v: FeatureCache) -> Tensor:
     """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
     assert v.context.footprints is not None
-    trail, points, known = v.tabled(v.trail), v.context.scaled_points, v.context.coverage
+    trail, points, known = v.tabled(v.trail), v.context.points, v.context.coverage
+    points = points if v.context.scaled_points is None else v.context.scaled_points
     if v.own_only:
         return own_covered_share(v.context.footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
     if known is not None and devices.data_dependent(trail.device):

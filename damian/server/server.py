@@ -87,7 +87,7 @@ class Server:
         self._widths = simulation.widths
         footprints, surrounded = None, "coverage_map" in self.names
         levels = simulation.vehicles.values.choices.get("source.level_db")
-        source, radii = simulation.config.source, [simulation.radius]
+        source, radii, scaled = simulation.config.source, [simulation.radius], None
         if levels is not None:
             ranged = len(levels) == 2 and (surrounded or "coverage" in self.names)
             problem = (
@@ -95,6 +95,7 @@ class Server:
             )
             checks.require(not ranged, "randomise.source.level_db", levels, problem)
             radii = [*map(footprint_radius, (replace(source, level_db=level) for level in levels))]
+            scaled = torch.cat([airspace.points.flatten(0, 1) * (radii[0] / each) for each in radii])
         self._radii = None if levels is None else torch.tensor(radii)
         if "coverage" in self.names:
             polygons, points = [region.polygon for region in airspace.regions], airspace.points.double().cpu()
@@ -110,7 +111,7 @@ class Server:
             battery=battery,
             footprints=footprints,
             points=airspace.points.flatten(0, 1),
-            scaled_points=torch.cat([airspace.points.flatten(0, 1) * (radii[0] / each) for each in radii]),
+            scaled_points=scaled,
             observation=observation,
             dt=simulation.dt,
             readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
