@@ -18,13 +18,16 @@ from torchrl.envs import GymEnv, TransformedEnv
 from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
 from damian.baselines.script import script_policy
 from damian.common.plotting import COLOURS, STYLE
+from damian.common.tables import read_csv
 from damian.compare.comparison import ENDS, TRAINED, Comparison
+from damian.compare.leaderboard import WORDS, leaderboard
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.recipes import cli
 from damian.recipes.compare import includes
 from damian.recipes.shared.comparison_runs import stored_results
 from damian.recipes.shared.environments import compose_scenario
+from damian.recipes.submit import delaybench
 from damian.runs.run_folder import RANDOM
 from damian.show.episode import record
 from damian.show.frame import frame_of
@@ -75,6 +78,12 @@ WORLDS = {
     "requests": (["scenario=requests"], 20),
 }
 """Pictures of docs/world.md: what is flown by the script, and the step that is shown."""
+LEADERBOARD = """# Leaderboard
+
+Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by damian's
+own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-learner); tasks and delays
+are those of [delaybench](delaybench.md).
+"""
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 
 
@@ -141,6 +150,7 @@ def main() -> None:
         panel.set_xlabel("step", fontsize=8)
     figure.savefig(IMAGES / "delay_laws.png", dpi=110)
     plot_matrix(DELAYBENCH / "matrix.png")
+    write_leaderboard()
     for name, (words, step) in WORLDS.items():
         plot_world(IMAGES / f"world_{name}.png", words, step, 1 + (name == "randomisation"))
 
@@ -164,6 +174,13 @@ def plot_world(path: Path, words: list[str], step: int, worlds: int) -> None:
         figure.legend(handles=legend_marks(episode), loc="outside right upper", frameon=False)
         figure.savefig(path, dpi=110)
     Image.open(path).convert("RGB").quantize(dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def write_leaderboard() -> None:
+    """Write docs/leaderboard.md from the submissions."""
+    files = sorted((DELAYBENCH.parent / "leaderboard").glob("*.csv"))
+    tables = leaderboard([read_csv(file, text=WORDS) for file in files], delaybench().delays)
+    (IMAGES.parent / "leaderboard.md").write_text(f"{LEADERBOARD}\n{tables}", encoding="utf-8")
 
 
 def plot_matrix(path: Path) -> None:

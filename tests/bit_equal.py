@@ -36,7 +36,14 @@ DELAYS = [["delay=none"], ["delay=paper"], ["delay.obs=4"], ["delay=burst", "awa
 OTHERS = [
     ["scenario=tracking", "delay=lag", "motion=polynomial"],
     ["scenario=energy", "delay=distance", "actions=continuous", "motion=polynomial"],
-    ["scenario=mixed", "delay=paper", "delay.act=2", "delay.rew=3", "delay.history=4", "aware=backupdate+history"],
+    [
+        "scenario=mixed",
+        "delay=paper",
+        "delay.act=2",
+        "delay.rew=3",
+        "delay.history=4",
+        "aware=backupdate+history",
+    ],
     ["scenario=coverage", "region=random", "agents=5", "delay.obs=2", "observation.own=true"],
     ["scenario=tracking", "links=matrix", "delay=paper"],
     ["scenario=tracking", "links=updown", "delay=paper"],

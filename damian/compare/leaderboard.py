@@ -68,10 +68,11 @@ def leaderboard(submissions: Sequence[pd.DataFrame], delays: Collection[str]) ->
 
 
 def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
-    """A line for each method, the best one first, with a column for each delay."""
+    """A line for each method, the best one under the first delay first, with a column for each delay."""
     present = [delay for delay in delays if (rows["delay"] == delay).any()]
+    means = rows.pivot_table(values="return", index="method", columns="delay")
     lines = []
-    for method in rows.groupby("method")["return"].mean().sort_values(ascending=False).index:
+    for method in means.sort_values(present, ascending=False).index:
         runs = rows[rows["method"] == method]
         cells = [_mean(runs[runs["delay"] == delay]) for delay in present]
         one, steps = runs.iloc[0], f"{runs['frames'].max() / 1e6:.2g}"

@@ -2,7 +2,7 @@
 
     cd examples/extending
     damian train "delay.obs={law: law:Satellite, hop: 2s, extra: 0.2}" aware=backupdate+history
-    damian train "delay.obs={law: law:Distance, antenna: [0, 0], speed: 40, reach: 300}" aware=backupdate+history
+    damian train "delay.obs={law: law:Distance, antenna: [0, 0], speed: 40, reach: 300}" aware=backupdate
     damian train "delay.obs={law: law:Route, longest: 6s, change: 0.3}" aware=backupdate+history
 
 A law is a frozen dataclass derived from ``damian.Law``. ``sampler`` returns the probability of each delay in
