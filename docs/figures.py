@@ -80,9 +80,9 @@ WORLDS = {
 """Pictures of docs/world.md: what is flown by the script, and the step that is shown."""
 LEADERBOARD = """# Leaderboard
 
-Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by damian's
-own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-learner); tasks and delays
-are those of [delaybench](delaybench.md).
+Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by
+damian's own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-learner);
+tasks and delays are those of [delaybench](delaybench.md).
 """
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 

@@ -241,10 +241,10 @@ class BpqlConfig(SacConfig):
     """BPQL (Kim et al. 2023): soft actor-critic with critics that are free of delay.
 
     The actor reads the newest observation that has arrived and its own actions since
-    (``aware=backupdate+history``). The critics read nothing but the state in which the action was chosen, which
-    the replay buffer knows by the time of learning: Q(s, a), with a from the policy at what the actor observed. Those of ``learner=sac``
-    also read what the actor observed. A step is learnt from when all of its messages must have arrived, as
-    with ``settle=true``.
+    (``aware=backupdate+history``). The critics read nothing but the state in which the action was chosen,
+    which the replay buffer knows by the time of learning: Q(s, a), with a from the policy at what the actor
+    observed. Those of ``learner=sac`` also read what the actor observed. A step is learnt from when all of
+    its messages must have arrived, as with ``settle=true``.
 
     The state is the entry ``LearningSetup.critic_key``. It has no actions that wait for their execution: with
     ``delay.act`` the critics do not know these."""
@@ -257,7 +257,7 @@ class BpqlConfig(SacConfig):
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
         true = setup.longest_delay == 0 or setup.backupdate or setup.critic_key != keys.GLOBAL_OBSERVATION
-        should = "needs back-updating, which gives its critics states that have arrived: aware=backupdate+history"
+        should = "needs back-updating, which gives its critics what has arrived: aware=backupdate+history"
         checks.require(true, "learner", self.name, should)
 
     def make(self, env: "EnvBase", setup: LearningSetup, buffer: "ReplayBuffer | None") -> Any:
