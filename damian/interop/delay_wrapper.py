@@ -1,40 +1,54 @@
-"""A wrapper that delays observations and actions of any Gymnasium environment, whatever their spaces."""
+"""Delays of what agents observe, do and earn, whatever their spaces are, and a wrapper for Gymnasium."""
 
 import copy
-from typing import Any, SupportsFloat
+import math
+from collections.abc import Collection, Mapping
+from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Space
+from gymnasium.spaces import Box, Dict, Space, flatten, flatten_space
 from gymnasium.vector.utils import batch_space, create_empty_array, iterate
+from numpy.typing import NDArray
 
-from damian.common import counter_rng
+from damian.common import checks, counter_rng
 from damian.common.errors import InputError
-from damian.delays.laws import sampler_of
+from damian.common.text_files import listed
+from damian.delays.laws import LOSES, sampler_of
 from damian.delays.line import DelayLine, Memory
+from damian.delays.samplers import LinkSampler, Sampler, streams_for
 from damian.transforms.context import ContextReader
+
+ByName = dict[str, Any]
+"""Something of each agent, or of each part of an observation; the only one is called ``""``."""
 
 
 class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
-    """Delays what the agent observes, what it does, or both, as ``ObservationDelay`` and ``ActionDelay`` do.
+    """Delays what the agent observes, does and earns, as the transforms do, whatever the spaces are.
 
     The agent holds the observation that was made last among those that have arrived, at first that of the
     reset; ``info["age"]`` is its age [steps]. The environment executes the action that was chosen last among
-    those that have arrived, until then ``default``. Rewards and the end of an episode are not late. With
-    delay 0 nothing changes. Many environments: ``gymnasium.make_vec(..., wrappers=[...])``.
+    those that have arrived, until then ``default``. Rewards that arrive in the same step are added up, in the
+    last step of an episode all that are in transit; ``info["received"]`` lists pairs of age [steps] and
+    reward. The end of an episode is not late. With delay 0 nothing changes.
 
     Args:
-        env: any Gymnasium environment; its spaces stay as they are.
-        observation, action: delay of each: steps (``3``), a time (``"3s"``), a distribution
-            (``Uniform(3, 7)``), or a function, as ``ObservationDelay`` takes.
-        loss: probability that an observation never arrives.
-        default: the action that is executed until the first one arrives; if not given, 0 (in all parts). It
-            is not needed if no action is late.
+        env: any Gymnasium environment, with its time limit; many: ``make_vec(..., wrappers=[...])``.
+        observation, action, reward: delay of each: steps (``3``), a time (``"3s"``), a distribution
+            (``Uniform(3, 7)``), or a function, as ``ObservationDelay`` takes. The parts of a ``Dict`` may be
+            messages of their own, with laws by name; those not named are not late.
+        loss: probability that an observation never arrives; also by part.
+        history, timeline: numbers of steps K. With either, the observation is a ``Dict`` with ``observation``
+            (or its own entries), ``age`` [1], ``action_history`` [K * A] as ``ActionHistory`` writes it, with
+            discrete actions one-hot, and ``timeline`` [K, D + 1] as ``ObservationTimeline`` does (float32).
+            Parts have ages of their own, and lie in the timeline side by side, each with its mark.
+        default: the action that is executed until the first one arrives, and fills the history at first; if
+            not given, 0 (in all parts). It is not needed if no action is late and there is no history.
         dt: length of a step [s], for delays given as times.
 
     Examples:
-        >>> env = DelayWrapper(gymnasium.make("Pendulum-v1"), observation=Uniform(1, 4), action=2)
+        >>> env = DelayWrapper(gymnasium.make("Pendulum-v1"), observation=Uniform(1, 4), action=2, history=6)
     """
 
     def __init__(
@@ -42,68 +56,207 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         env: gymnasium.Env[Any, Any],
         observation: Any = 0,
         action: Any = 0,
+        reward: Any = 0,
         *,
-        loss: float = 0.0,
+        loss: Any = 0.0,
+        history: int = 0,
+        timeline: int = 0,
         default: Any = None,
         dt: float = 1.0,
     ) -> None:
-        told = {"observation": observation, "action": action, "loss": loss, "default": default, "dt": dt}
+        told: dict[str, Any] = {"observation": observation, "action": action, "reward": reward, "loss": loss}
+        told |= {"history": history, "timeline": timeline, "default": default, "dt": dt}
         gymnasium.utils.RecordConstructorArgs.__init__(self, **told)
         super().__init__(env)
-        self._observations = _Link("observation", observation, loss, dt)
-        self._actions = _Link("action", action, 0.0, dt, before_step=True)
-        if default is None and self._actions.late:
-            default = _zero(env.action_space)
-        self._default = default
+        space: Any = env.observation_space
+        self._in_parts = isinstance(space, Dict) and (_by_name(observation) or _by_name(loss))
+        observed = space.spaces if self._in_parts else {"": space}
+        told["default"] = {} if default is None else {"": default}
+        self._delays = Delays(observed, {"": env.action_space}, told)
+        self.observation_space = self._delays.space("", space)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
-        self._actions.reset(self._default, seed)
-        self._observations.reset(observation, seed)
-        return copy.deepcopy(observation), info | {"age": 0}
+        told, more = self._delays.reset(observation if self._in_parts else {"": observation}, seed)
+        return told[""], info | more[""]
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        executed, _ = self._actions.send(action)
+        executed = self._delays.actions.send({"": action})[""]
         observation, reward, terminated, truncated, info = self.env.step(executed)
-        held, age = self._observations.send(observation)
-        return copy.deepcopy(held), reward, terminated, truncated, info | {"age": age}
+        ended = [""] if terminated or truncated else []
+        observed = observation if self._in_parts else {"": observation}
+        told, rewards, more = self._delays.step(observed, {"": reward}, ended)
+        return told[""], rewards[""], terminated, truncated, info | more[""]
+
+
+class Delays:
+    """What some agents observe, do and earn, late: the wrappers pass it through here in each step.
+
+    ``acting`` has the spaces of the actions by agent; ``observed`` those of the observations by agent, or by
+    part if these are messages of their own; ``told`` the arguments of a wrapper, ``default`` by agent.
+    """
+
+    def __init__(self, observed: ByName, acting: ByName, told: ByName) -> None:
+        for name in ("history", "timeline"):
+            checks.whole(name, told[name], 0, unit="steps")
+        self._history, self._timeline = told["history"], told["timeline"]
+        self._parts = {agent: [agent] if agent in observed else [*observed] for agent in acting}
+        self._observations = _Link("observation", observed, told)
+        self.actions, self._rewards = (_Link(name, acting, told) for name in ("action", "reward"))
+        checks.require(not self._rewards.sampler.loses, "reward", told["reward"], LOSES)
+        needed, given = self.actions.sampler.late or self._history, told["default"]
+        self._default = {a: given[a] if a in given else _zero(acting[a]) if needed else None for a in acting}
+        self._messages = {n: _flat("timeline", each) for n, each in observed.items() if self._timeline}
+        self._chosen = {a: _flat("history", each) for a, each in acting.items() if self._history}
+
+    def space(self, agent: str, space: Space[Any]) -> Space[Any]:
+        """The space of what an agent is told, whose observations are in ``space``."""
+        added = {name: Box(-np.inf, np.inf, each.shape) for name, each in self._added(agent).items()}
+        own = dict(space.spaces) if isinstance(space, Dict) else {"observation": space}
+        taken = sorted(added.keys() & own.keys())
+        checks.require(not taken, "observation", listed(taken), "is an entry of it already: rename that")
+        return Dict({**own, **added}) if added else space
+
+    def reset(self, observations: ByName, seed: int | None) -> tuple[ByName, ByName]:
+        """What agents are told first, and their infos; a seed decides all later delays."""
+        self._observations.reset(observations, seed)
+        self.actions.reset(self._default, seed)
+        self._rewards.reset(dict.fromkeys(self._default, 0.0), seed)
+        return self._told(observations)
+
+    def step(self, observations: ByName, rewards: ByName, ended: list[str]) -> tuple[ByName, ByName, ByName]:
+        """What agents are told, receive, and their infos; the episodes of some have ``ended``."""
+        (told, infos), rewards = self._told(self._observations.send(observations)), dict(rewards)
+        if self._rewards.sampler.late:
+            self._rewards.send(rewards)
+            for agent in rewards:
+                sent = self._rewards.recent(agent).items()
+                due = [(age, r) for age, (r, wait) in sent if wait == 0 or (wait > 0 and agent in ended)]
+                infos[agent]["received"], rewards[agent] = due, float(sum(reward for _, reward in due))
+        return told, rewards, infos
+
+    def _told(self, held: ByName) -> tuple[ByName, ByName]:
+        """What the agents are told of whom something is ``held``, and their infos."""
+        told, infos = {}, {}
+        for agent in [agent for agent, parts in self._parts.items() if held.keys() >= {*parts}]:
+            found: Any = {part: copy.deepcopy(held[part]) for part in self._parts[agent]}
+            age: Any = {part: self._observations.age[part] for part in found}
+            if agent in found:
+                found, age = found[agent], age[agent]
+            if added := self._added(agent):
+                found = {**(found if isinstance(found, Mapping) else {"observation": found}), **added}
+            told[agent], infos[agent] = found, {"age": age}
+        return told, infos
+
+    def _added(self, agent: str) -> dict[str, NDArray[np.float32]]:
+        """The entries that are added to the observation of an agent."""
+        added, parts, link = {}, self._parts[agent], self._observations
+        if self._timeline:
+            added["timeline"] = np.concatenate([self._slots(part) for part in parts], -1)
+        if self._history:
+            sent, first = self.actions.recent(agent), (self._default[agent], 0)
+            space, low, width = self._chosen[agent]
+            chosen = [sent.get(age, first)[0] for age in reversed(range(self._history))]
+            numbers = [np.asarray(flatten(space, action), np.float32) for action in chosen]
+            added["action_history"] = np.concatenate([(each - low) / width for each in numbers])
+        return added | {"age": np.array([link.age[part] for part in parts], np.float32)} if added else {}
+
+    def _slots(self, part: str) -> NDArray[np.float32]:
+        """The timeline of what is sent under a name, [K, D + 1]."""
+        space, low, _ = self._messages[part]
+        slots: Any = np.zeros((self._timeline, len(low) + 1), np.float32)
+        for age, (thing, wait) in self._observations.recent(part).items():
+            if age < self._timeline and wait <= 0:
+                slots[age, :-1], slots[age, -1] = flatten(space, thing), 1
+        return slots
 
 
 class _Link:
-    """One link: a ``DelayLine`` delays the times at which things were sent, so that they may be anything."""
+    """The messages of some senders; a ``DelayLine`` delays their times, so that they may be anything."""
 
-    def __init__(self, name: str, delay: Any, loss: float, dt: float, before_step: bool = False) -> None:
-        sampler = sampler_of(delay, dt, loss, name)
-        self.late = sampler.late
-        self._line, self._name = DelayLine(sampler, "generation"), name
-        self._contexts = ContextReader(sampler, None, dt, name, before_step)
+    def __init__(self, name: str, senders: Collection[str], told: ByName) -> None:
+        laws: list[Any] = [told[name], told["loss"] if name == "observation" else 0.0]
+        for key, given in zip((name, "loss"), laws, strict=True):
+            unknown = [each for each in given if each not in senders] if _by_name(given) else []
+            should = f"is named, but the names are: {listed(filter(None, senders))}"
+            checks.require(not unknown, key, listed(unknown), should)
+        each = [[law.get(sender, 0) if _by_name(law) else law for law in laws] for sender in senders]
+        distinct = [law for i, law in enumerate(each) if law not in each[:i]]
+        samplers = [sampler_of(law, told["dt"], loss, name) for law, loss in distinct]
+        self.sampler: Sampler = samplers[0]
+        if len(samplers) > 1:
+            index = torch.tensor([distinct.index(law) for law in each])
+            self.sampler = LinkSampler(samplers, index, torch.zeros(len(index)))
+        self._line = DelayLine(self.sampler, "generation")
+        self._contexts = ContextReader(self.sampler, None, told["dt"], name, before_step=name == "action")
+        self._numbers = torch.tensor([counter_rng.number_of(f"{name} {each}".strip()) for each in senders])
         self._memory: Memory | None = None
-        self._sent: dict[int, Any] = {}
+        self._now, self._kept = 0, max(self.sampler.longest, told["timeline"], told["history"])
+        self.age = dict.fromkeys(senders, 0)
+        """Age of what is held of each sender [steps]."""
+        self._sent: dict[str, dict[int, tuple[Any, float]]] = {sender: {} for sender in senders}
+        """What was sent, and when it arrives, by sender and time."""
 
-    def reset(self, first: Any, seed: int | None) -> None:
-        """Begin an episode in which ``first`` is held; a seed decides all later delays."""
+    def reset(self, firsts: ByName, seed: int | None) -> None:
+        """Forget all messages, and begin episodes; a seed decides all later delays."""
+        self._sent = {sender: {} for sender in self.age}
         if self._memory is None or seed is not None:
-            entropy = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
-            name = torch.tensor([counter_rng.number_of(self._name)])
-            streams = counter_rng.bits64(torch.from_numpy(entropy[None].view(np.int64)), name)
-            memory = self._line.init_memory([torch.zeros(1, dtype=torch.long)], streams)
-            self._memory = memory | {"agents": torch.zeros(1, dtype=torch.long)}
-        now = self._memory["clock"]
-        self._memory, _ = self._line.reset(self._memory, [now], torch.tensor([True]))
-        self._sent = {int(now): first}
+            entropy = np.random.SeedSequence(seed).generate_state(1, np.uint64).view(np.int64)
+            streams = counter_rng.bits64(torch.from_numpy(entropy), self._numbers)
+            streams = streams_for(self.sampler, streams, len(streams))
+            memory = self._line.init_memory([], streams)
+            self._memory, self._now = memory | {"agents": torch.arange(len(streams))}, 0
+        self._begin(firsts)
 
-    def send(self, thing: Any) -> tuple[Any, int]:
-        """Send a thing; returns the one that is held now, and its age [steps]."""
+    def _begin(self, firsts: ByName) -> None:
+        """Begin the episodes of some senders, whose ``firsts`` are known at once."""
+        mask = torch.tensor([sender in firsts for sender in self.age])
+        self._memory, _ = self._line.reset(cast(Memory, self._memory), [], mask)
+        self._sent |= {sender: {self._now: (first, self._now)} for sender, first in firsts.items()}
+        self.age |= dict.fromkeys(firsts, 0)
+
+    def send(self, things: ByName) -> ByName:
+        """Send the things of some senders; returns what is held of them then. New ones begin an episode."""
         if self._memory is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        now = self._memory["clock"] + 1
-        self._sent[int(now)] = thing
-        context = self._contexts.read(self._memory, {}, None, torch.Size([1]))
-        self._memory, delivery = self._line.step(self._memory, [now], None, context)
-        held, oldest = int(delivery.held[0]), int(now) - self._line.sampler.longest
-        # What was sent before the held one is never held again, and what has not arrived by now never does.
-        self._sent = {t: each for t, each in self._sent.items() if t == held or t > max(held, oldest)}
-        return self._sent[held], int(delivery.age)
+        self._now, delays = self._now + 1, [0] * len(self.age)
+        if self.sampler.late:
+            sends = torch.tensor([sender in things for sender in self.age])
+            sent = None if sends.all() else sends
+            context = self._contexts.read(self._memory, {}, sent, sends.shape)
+            self._memory, delivery = self._line.step(self._memory, [], sent, context)
+            self.age = dict(zip(self.age, delivery.age.tolist(), strict=True))
+            delays = delivery.delay.tolist()
+        for sender, delay in zip(self.age, delays, strict=True):
+            sent, now = self._sent[sender], self._now
+            if sender in things:
+                sent[now] = things[sender], now + delay if delay < self.sampler.lost else math.inf
+            # What is neither recent nor held is never asked for again.
+            recent, held = now - self._kept, now - self.age[sender]
+            self._sent[sender] = {t: each for t, each in sent.items() if t >= recent or t == held}
+        if new := {s: each for s, each in things.items() if self._now - self.age[s] not in self._sent[s]}:
+            self._begin(new)
+        return {sender: self._sent[sender][self._now - self.age[sender]][0] for sender in things}
+
+    def recent(self, sender: str) -> dict[int, tuple[Any, float]]:
+        """What a sender sent lately, and the time until it arrives, by age [steps]."""
+        return {self._now - t: (thing, due - self._now) for t, (thing, due) in self._sent[sender].items()}
+
+
+def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], NDArray[np.float32], NDArray[np.float32]]:
+    """A space, and the bound and width of each of its D numbers, 0 and 1 if they have no bounds, [D]."""
+    flat = flatten_space(space)
+    if not isinstance(flat, Box):
+        raise InputError(f"{key}: {space} has no vectors of a fixed length")
+    with np.errstate(over="ignore"):  # a bound may be the largest number
+        low, width = np.float32(flat.low), np.float32(flat.high) - np.float32(flat.low)
+    bounded = np.isfinite(width)
+    return space, np.where(bounded, low, np.float32(0)), np.where(bounded & (width > 0), width, np.float32(1))
+
+
+def _by_name(given: Any) -> bool:
+    """Whether something is given by name, and is not one law for all."""
+    return isinstance(given, Mapping) and "law" not in given
 
 
 def _zero(space: Space[Any]) -> Any:

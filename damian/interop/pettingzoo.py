@@ -1,4 +1,4 @@
-"""A PettingZoo environment of several UAVs."""
+"""PettingZoo: an environment of several UAVs, and a wrapper that delays any environment."""
 
 from typing import Any
 
@@ -7,14 +7,14 @@ from gymnasium.spaces import Space
 
 from damian.common.errors import InputError
 from damian.envs.config import ScenarioConfig
+from damian.interop.delay_wrapper import ByName, Delays
 from damian.interop.flight import METADATA, Array, Flight, actions_in, row
 
 try:
     from pettingzoo import ParallelEnv
+    from pettingzoo.utils import BaseParallelWrapper
 except ImportError as error:
     raise InputError("pettingzoo: it is not installed; pip install pettingzoo") from error
-
-ByAgent = dict[str, Any]
 
 
 class UavParallelEnv(ParallelEnv[str, Array, Any]):
@@ -43,14 +43,12 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
     def action_space(self, agent: str) -> Space[Any]:
         return self.action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[ByAgent, ByAgent]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ByName, ByName]:
         instant = self.flight.reset(seed)
         self.agents = [*self.possible_agents]
         return self._by_agent(instant.observation[0]), self._infos(instant.infos)
 
-    def step(self, actions: ByAgent) -> tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]:
+    def step(self, actions: ByName) -> tuple[ByName, ByName, ByName, ByName, ByName]:
         if not self.agents:
             return {}, {}, {}, {}, {}
         chosen = [
@@ -75,9 +73,58 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
     def state(self) -> Array:
         return self.flight.state()
 
-    def _by_agent(self, values: Any) -> ByAgent:
+    def _by_agent(self, values: Any) -> ByName:
         """Values [N] by agent."""
         return dict(zip(self.possible_agents, values, strict=True))
 
-    def _infos(self, infos: dict[str, Array]) -> ByAgent:
+    def _infos(self, infos: dict[str, Array]) -> ByName:
         return {name: row(infos, 0, number) for number, name in enumerate(self.possible_agents)}
+
+
+class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
+    """Delays what the agents of any ``ParallelEnv`` observe, do and earn, each as ``DelayWrapper`` does.
+
+    An agent may leave the episode, with all its rewards, or join it, with an observation that is not late.
+    ``state()`` is not late.
+
+    Args:
+        env, history, timeline, dt: as in ``DelayWrapper``.
+        observation, action, reward, loss: a law for all agents, or by agent; those not named are not late. A
+            function knows the agent as ``message.sender``, its place among ``possible_agents``.
+        default: the action that is executed until the first one arrives, by agent; if not given, 0.
+    """
+
+    def __init__(
+        self,
+        env: ParallelEnv[str, Any, Any],
+        observation: Any = 0,
+        action: Any = 0,
+        reward: Any = 0,
+        *,
+        loss: Any = 0.0,
+        history: int = 0,
+        timeline: int = 0,
+        default: ByName | None = None,
+        dt: float = 1.0,
+    ) -> None:
+        super().__init__(env)
+        told: ByName = {"observation": observation, "action": action, "reward": reward, "loss": loss}
+        told |= {"history": history, "timeline": timeline, "default": default or {}, "dt": dt}
+        observed = {agent: env.observation_space(agent) for agent in env.possible_agents}
+        self._delays = Delays(observed, {agent: env.action_space(agent) for agent in observed}, told)
+        self._spaces = {agent: self._delays.space(agent, space) for agent, space in observed.items()}
+
+    def observation_space(self, agent: str) -> Space[Any]:
+        return self._spaces[agent]
+
+    def reset(self, seed: int | None = None, options: ByName | None = None) -> tuple[ByName, ByName]:
+        observations, infos = self.env.reset(seed=seed, options=options)
+        told, more = self._delays.reset(observations, seed)
+        return told, {agent: infos.get(agent, {}) | info for agent, info in more.items()}
+
+    def step(self, actions: ByName) -> tuple[ByName, ByName, ByName, ByName, ByName]:
+        executed = self._delays.actions.send(actions)
+        observations, rewards, terminated, truncated, infos = self.env.step(executed)
+        ended = [agent for agent in rewards if terminated[agent] or truncated[agent]]
+        told, rewards, more = self._delays.step(observations, rewards, ended)
+        return told, rewards, terminated, truncated, {a: infos.get(a, {}) | info for a, info in more.items()}

@@ -1,22 +1,44 @@
-"""Delays of a Gymnasium environment: as the transforms delay TorchRL's, whatever the spaces are."""
+"""Delays of environments of Gymnasium and PettingZoo: as the transforms delay those of TorchRL."""
+
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sequence, Text, Tuple
 from gymnasium.utils.env_checker import check_env, data_equivalence
+from pettingzoo import ParallelEnv
+from pettingzoo.test import parallel_api_test
 from torchrl.envs import Compose, GymEnv, TransformedEnv
+from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
-from damian import ActionDelay, ObservationDelay, Uniform
+from damian import (
+    ActionDelay,
+    ActionHistory,
+    ContextSampler,
+    ObservationDelay,
+    ObservationTimeline,
+    RewardDelay,
+    Uniform,
+)
 from damian.common.errors import InputError
 from damian.delays.samplers import MessageContext
 from damian.interop import DelayWrapper
+from damian.interop.pettingzoo import DelayParallelWrapper
 
 
 def by_time(message: MessageContext) -> torch.Tensor:
     """Delays that follow from the time alone, so that messages overtake each other without chance."""
     return (3 * message.time) % 5
+
+
+def lost_at_times(message: MessageContext) -> torch.Tensor:
+    """The same; every fourth message is lost."""
+    return torch.where(message.time % 4 == 2, -1.0, by_time(message))
+
+
+LOSSY = ContextSampler(lost_at_times, 5)
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
@@ -125,3 +147,299 @@ def test_a_space_without_zero_asks_for_a_default_only_where_an_action_is_late():
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
 def test_gymnasiums_checker_finds_nothing(name):
     check_env(DelayWrapper(gymnasium.make(name).unwrapped, Uniform(0, 3), 2), skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
+@pytest.mark.parametrize(
+    ("observation", "action", "reward"), [(0, 0, 0), (LOSSY, 0, 3), (1, by_time, by_time), (by_time, 2, 40)]
+)
+def test_history_timeline_and_rewards_are_those_of_the_transforms(name, observation, action, reward):
+    delays = Compose(
+        ActionDelay(action),
+        ObservationDelay(observation, "observation", "held", delay_key="delay"),
+        RewardDelay(reward),
+        ActionHistory(3),
+        ObservationTimeline(7, "observation", delay_key="delay"),
+    )
+    reference = TransformedEnv(GymEnv(name, max_episode_steps=25), delays)
+    reference.set_seed(5)
+    inner = gymnasium.make(name, max_episode_steps=25)
+    inner.reset(seed=5)
+    env = DelayWrapper(inner, observation, action, reward, history=3, timeline=7)
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(2):
+        now, done = reference.reset(), False
+        told, info = env.reset()
+        while not done:
+            assert env.observation_space.contains(told)
+            for key in ("age", "timeline", "action_history"):
+                assert np.array_equal(told[key], now[key].numpy()), key
+            assert np.array_equal(told["observation"], now["held"].numpy())
+            assert info["age"] == told["age"].item()
+            chosen = rng.uniform(-2, 2, 1).astype(np.float32) if name == "Pendulum-v1" else rng.integers(2)
+            now["action"] = torch.as_tensor(chosen if name == "Pendulum-v1" else np.eye(2, dtype=int)[chosen])
+            now = reference.step(now)["next"]
+            told, received, terminated, truncated, info = env.step(chosen)
+            assert received == pytest.approx(now["reward"].item(), rel=1e-5)
+            done = terminated or truncated
+            assert done == now["done"].item()
+        ends += 1
+    assert ends == 2
+
+
+def test_every_reward_is_received_once_and_the_info_tells_when_it_was_earned():
+    plain, steps = gymnasium.make("Pendulum-v1", max_episode_steps=40), 40
+    env = DelayWrapper(gymnasium.make("Pendulum-v1", max_episode_steps=40), reward=Uniform(0, 30))
+    plain.reset(seed=3)
+    env.reset(seed=3)
+    earned, found, together = [], {}, 0
+    for step in range(steps):
+        action = plain.action_space.sample()
+        earned.append(plain.step(action)[1])
+        _, reward, _, _, info = env.step(action)
+        assert reward == pytest.approx(sum(each for _, each in info["received"]))
+        together += len(info["received"]) > 1 and step < steps - 1
+        for age, each in info["received"]:
+            assert step - age not in found
+            found[step - age] = each
+    assert found == dict(enumerate(earned))
+    assert together
+
+
+@pytest.mark.parametrize("late", [0, torch.zeros_like], ids=["0", "a function that returns 0"])
+def test_without_delay_all_is_as_without_the_wrapper(late):
+    law = late if late == 0 else lambda message: torch.zeros_like(message.time)
+    plain, env = gymnasium.make("Pendulum-v1"), DelayWrapper(gymnasium.make("Pendulum-v1"), law, law, law)
+    assert env.observation_space == plain.observation_space
+    assert np.array_equal(plain.reset(seed=1)[0], env.reset(seed=1)[0])
+    for _ in range(20):
+        action = plain.action_space.sample()
+        (expected, *others, _), (found, *same, _) = plain.step(action), env.step(action)
+        assert np.array_equal(expected, found)
+        assert others == same
+
+
+def test_the_parts_of_an_observation_have_laws_of_their_own():
+    env = DelayWrapper(Anything(Discrete(3)), {"place": 2, "word": by_time}, timeline=6)
+    told, info = env.reset()
+    assert info["age"] == {"place": 0, "word": 0}
+    arrives = {0: 0} | {t: t + 3 * t % 5 for t in range(1, 10)}
+    for now in range(1, 10):
+        assert env.observation_space.contains(told)
+        told, _, _, _, info = env.step(0)
+        word = max(t for t, at in arrives.items() if at <= now)
+        assert told["word"] == f"t{word}"
+        assert told["place"].tolist() == [max(0, now - 2)] * 2
+        assert info["age"] == {"place": min(now, 2), "word": now - word}
+        assert told["age"].tolist() == [*info["age"].values()]
+        for k in range(6):
+            place, word = told["timeline"][k, :3].tolist(), told["timeline"][k, 3:]
+            assert place == ([now - k, now - k, 1] if 2 <= k <= now or k == now else [0, 0, 0])
+            known = k <= now and arrives[now - k] <= now
+            assert word[-1] == known
+            assert word[:-1].any() == known
+
+
+def test_the_losses_of_parts_are_their_own():
+    env = DelayWrapper(Anything(Discrete(3)), loss={"word": 1.0})
+    env.reset(seed=0)
+    for t in range(1, 4):
+        told, *_, info = env.step(0)
+        assert (told["word"], told["place"].tolist()) == ("t0", [t, t])
+        assert info["age"] == {"place": 0, "word": t}
+
+
+def test_environments_in_a_vector_are_those_alone():
+    late = partial(
+        DelayWrapper,
+        observation=Uniform(1, 4),
+        action=1,
+        reward=Uniform(0, 3),
+        loss=0.2,
+        history=2,
+        timeline=3,
+    )
+    options = {"max_episode_steps": 8}
+    vector = gymnasium.make_vec("CartPole-v1", 3, vectorization_mode="sync", wrappers=[late], **options)
+    singles = [late(gymnasium.make("CartPole-v1", **options)) for _ in range(3)]
+    observations, _ = vector.reset(seed=4)
+    assert vector.observation_space.contains(observations)
+    firsts = [env.reset(seed=4 + i)[0] for i, env in enumerate(singles)]
+    vector.action_space.seed(0)
+    done = [False] * 3
+    for _ in range(30):
+        for i, first in enumerate(firsts):
+            assert data_equivalence({key: each[i] for key, each in observations.items()}, first)
+        actions = vector.action_space.sample()
+        observations, rewards, _, _, infos = vector.step(actions)
+        for i, env in enumerate(singles):
+            if done[i]:  # a vector begins a new episode in the step after the last one
+                (firsts[i], info), reward, done[i] = env.reset(), 0.0, False
+            else:
+                firsts[i], reward, terminated, truncated, info = env.step(actions[i])
+                done[i] = terminated or truncated
+            assert rewards[i] == reward
+            assert infos["age"][i] == info["age"]
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")
+def test_gymnasiums_checker_finds_nothing_in_wide_observations():
+    env = DelayWrapper(gymnasium.make("Pendulum-v1").unwrapped, Uniform(0, 3), 2, 1, history=3, timeline=4)
+    check_env(env, skip_render_check=True)
+
+
+def test_what_a_user_can_get_wrong_is_said_in_one_line():
+    inner = Anything(Discrete(3))
+    for options, message in (
+        ({"reward": LOSSY}, "reward: .* loses messages"),
+        ({"observation": {"sound": 1}}, "observation: sound is named, but the names are: place, word"),
+        ({"action": {"left": 1}}, "action: left is named, but the names are: none"),
+        ({"timeline": -1}, "timeline: -1 steps is not at least 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            DelayWrapper(inner, **options)
+    with pytest.raises(InputError, match="observation: camera is named, but the names are: none"):
+        DelayWrapper(gymnasium.make("CartPole-v1"), {"camera": 2})
+    with pytest.raises(InputError, match=r"history: Sequence.* has no vectors of a fixed length"):
+        DelayWrapper(Anything(Sequence(Discrete(2))), default=(), history=1)
+    inner.observation_space = Dict(age=Discrete(3))
+    with pytest.raises(InputError, match="observation: age is an entry of it already"):
+        DelayWrapper(inner, timeline=2)
+
+
+# Several agents.
+
+
+def made_spread():
+    spread = pytest.importorskip("mpe2.simple_spread_v3")
+    return spread.parallel_env(N=3, max_cycles=12, continuous_actions=True)
+
+
+def of_sender(message: MessageContext) -> torch.Tensor:
+    """A delay for each agent: 0, 2 and 5 steps."""
+    return torch.tensor([0, 2, 5])[message.sender]
+
+
+def of_congestion(message: MessageContext) -> torch.Tensor:
+    return message.n_sending + message.sender + by_time(message)
+
+
+BY_AGENT = {"agent_1": 2, "agent_2": 5}
+
+
+@pytest.mark.parametrize(
+    ("law", "given"),
+    [(3, 3), (LOSSY, LOSSY), (of_congestion, of_congestion), (of_sender, BY_AGENT), (of_sender, of_sender)],
+    ids=["constant", "lossy", "congestion", "by agent", "by sender"],
+)
+def test_the_delays_of_agents_are_those_of_the_transforms(law, given):
+    observation, action, reward = (("agent", each) for each in ("observation", "action", "reward"))
+    of_reward = 3 if law is LOSSY else law
+    delays = Compose(
+        ActionDelay(law, action),
+        ObservationDelay(law, observation, ("agent", "held"), delay_key="delay"),
+        RewardDelay(of_reward, reward),
+        ActionHistory(3, action),
+        ObservationTimeline(7, observation, delay_key="delay"),
+    )
+    reference = TransformedEnv(PettingZooWrapper(made_spread()), delays)
+    reference.set_seed(5)
+    inner = made_spread()
+    inner.reset(seed=5)
+    rewards = {"reward": 3 if given is LOSSY else given}
+    env = DelayParallelWrapper(inner, given, given, **rewards, history=3, timeline=7)
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        now, (told, infos) = reference.reset(), env.reset()
+        while env.agents:
+            for i, agent in enumerate(env.possible_agents):
+                assert env.observation_space(agent).contains(told[agent])
+                for key, own in (("held", "observation"), ("age", "age"), ("timeline", "timeline")):
+                    assert np.array_equal(told[agent][own], now["agent", key][i].numpy()), key
+                assert np.array_equal(
+                    told[agent]["action_history"], now["agent", "action_history"][i].numpy()
+                )
+                assert infos[agent]["age"] == now["agent", "age"][i].item()
+            chosen = rng.uniform(0, 1, (3, 5)).astype(np.float32)
+            now["agent", "action"] = torch.as_tensor(chosen)
+            now = reference.step(now)["next"]
+            told, received, _, truncated, infos = env.step(dict(zip(env.agents, chosen, strict=True)))
+            expected = now["agent", "reward"].flatten().tolist()
+            assert [*received.values()] == pytest.approx(expected, rel=1e-5)
+        assert all(truncated.values())
+        assert now["done"].item()
+
+
+class Relay(ParallelEnv):
+    """Agents observe the step and what they have executed; b dies in step 5, c comes in step 3."""
+
+    def __init__(self):
+        self.metadata, self.possible_agents = {"name": "relay"}, ["a", "b", "c"]
+        self.observation_spaces = dict.fromkeys(self.possible_agents, Box(-99.0, 99.0, (2,), np.float32))
+        self.action_spaces = dict.fromkeys(self.possible_agents, Discrete(50))
+
+    def observation_space(self, agent):
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent):
+        return self.action_spaces[agent]
+
+    def reset(self, seed=None, options=None):
+        self.t, self.agents = 0, ["a", "b"]
+        return {agent: np.zeros(2, np.float32) for agent in self.agents}, {"a": {}, "b": {}}
+
+    def step(self, actions):
+        assert [*actions] == self.agents
+        self.t += 1
+        present = [*self.agents, *["c"] * (self.t == 3)]
+        ends = {agent: self.t == 9 or (self.t == 5 and agent == "b") for agent in present}
+        told = {agent: np.array([self.t, actions.get(agent, -1)], np.float32) for agent in present}
+        rewards = {agent: float(10**self.t) for agent in present}
+        self.agents = [agent for agent in present if not ends[agent]]
+        return told, rewards, ends, dict.fromkeys(present, False), {agent: {"t": self.t} for agent in present}
+
+
+def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
+    env = DelayParallelWrapper(Relay(), {"a": 1, "b": 4, "c": 2}, {"a": 2}, {"b": 3, "a": 1}, timeline=4)
+    for _ in range(2):  # nothing of an episode reaches the next one
+        told, infos = env.reset()
+        assert {agent: each["observation"].tolist() for agent, each in told.items()} == {
+            "a": [0, 0],
+            "b": [0, 0],
+        }
+        rows = []
+        while env.agents:
+            actions = dict.fromkeys(env.agents, env.unwrapped.t + 1)
+            told, rewards, *_, infos = env.step(actions)
+            assert told.keys() == rewards.keys() == infos.keys()
+            rows.append((told, rewards))
+            assert infos["a"]["t"] == env.unwrapped.t
+        seen = {
+            name: [row[0][name]["observation"].tolist() for row in rows if name in row[0]] for name in "abc"
+        }
+        assert seen["a"] == [[0, 0], [1, 0], [2, 0], [3, 1], [4, 2], [5, 3], [6, 4], [7, 5], [8, 6]]
+        assert seen["b"] == [[0, 0], [0, 0], [0, 0], [0, 0], [1, 1]]
+        assert seen["c"] == [[3, -1], [3, -1], [3, -1], [4, 4], [5, 5], [6, 6], [7, 7]][: len(seen["c"])]
+        assert [row[1].get("b") for row in rows] == [0, 0, 0, 10, 111100 + 0, None, None, None, None]
+        assert [row[1]["a"] for row in rows] == [0, *(10**t for t in range(1, 8)), 10**8 + 10**9]
+        assert rows[4][0]["c"]["timeline"][:, -1].tolist() == [0, 0, 1, 0]
+        assert rows[4][0]["a"]["timeline"][:, 0].tolist() == [0, 4, 3, 2]
+
+
+def test_agents_draw_different_delays_which_follow_from_the_seed():
+    env, found = DelayParallelWrapper(Relay(), Uniform(0, 4), loss={"b": 1.0}), []
+    for seed in (0, 1, 0):
+        env.reset(seed=seed)
+        ages = []
+        while env.agents:
+            infos = env.step(dict.fromkeys(env.agents, 0))[-1]
+            ages.append({agent: info["age"] for agent, info in infos.items()})
+        found.append(ages)
+        assert [each["b"] for each in ages[:5]] == [1, 2, 3, 4, 5]
+        assert [each["a"] for each in ages[3:]] != [each["c"] for each in ages[3:]]
+    assert found[0] == found[2] != found[1]
+
+
+def test_pettingzoos_checker_finds_nothing(capsys):
+    parallel_api_test(DelayParallelWrapper(made_spread(), Uniform(0, 3), 1, 2, history=2, timeline=3), 30)
+    assert "Passed Parallel API test" in capsys.readouterr().out
