@@ -1,6 +1,7 @@
 """The examples of docs/interop.md run as they stand."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,21 @@ def test_an_example_runs(code, capsys):
     exec(code.replace("num_envs=256", "num_envs=4"), found)
     if "picture" in found:
         assert found["picture"].ndim == 3
-    if "cart" in found:
-        ages = [float(age) for age in re.findall(r"tensor\((\d+)", capsys.readouterr().out)]
-        assert 1 <= ages[0] <= 8
-        assert 3 <= ages[1] <= 9
+    if "late" in found and "env" in found:
+        assert found["observation"]["timeline"].shape == (8, 4 + 1)
+        assert found["observation"]["action_history"].shape == (6 * 2,)
+    if "spread" in found:
+        by_agent, by_sender = capsys.readouterr().out.split("\n", 1)
+        assert by_agent == "{'agent_0': 1, 'agent_1': 1, 'agent_2': 0}"
+        assert [float(age) for age in re.findall(r"\d+(?=\.)", by_sender)] == [4, 3, 0]
+
+
+def test_the_callback_for_stable_baselines3_moves_each_reward_to_the_step_that_earned_it():
+    pytest.importorskip("stable_baselines3")
+    example = runpy.run_path(str(Path(damian.__file__).parents[1] / "examples" / "sb3_late_rewards.py"))
+    buffers = [example["train"](frames=1024, back_update=moved).rollout_buffer for moved in (True, False)]
+    settled = [buffer.rewards[: 256 - 30] for buffer in buffers]  # each step of CartPole earns 1
+    assert (settled[0] == 1).all()
+    assert not (settled[1] == 1).all()
+    assert buffers[0].rewards.sum() == buffers[1].rewards.sum()
+    assert not (buffers[0].returns == buffers[1].returns).all()
