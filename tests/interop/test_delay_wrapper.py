@@ -420,10 +420,19 @@ def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
         assert seen["a"] == [[0, 0], [1, 0], [2, 0], [3, 1], [4, 2], [5, 3], [6, 4], [7, 5], [8, 6]]
         assert seen["b"] == [[0, 0], [0, 0], [0, 0], [0, 0], [1, 1]]
         assert seen["c"] == [[3, -1], [3, -1], [3, -1], [4, 4], [5, 5], [6, 6], [7, 7]][: len(seen["c"])]
-        assert [row[1].get("b") for row in rows] == [0, 0, 0, 10, 111100 + 0, None, None, None, None]
+        assert [row[1].get("b") for row in rows] == [0, 0, 0, 10, 111100, None, None, None, None]
         assert [row[1]["a"] for row in rows] == [0, *(10**t for t in range(1, 8)), 10**8 + 10**9]
         assert rows[4][0]["c"]["timeline"][:, -1].tolist() == [0, 0, 1, 0]
         assert rows[4][0]["a"]["timeline"][:, 0].tolist() == [0, 4, 3, 2]
+
+
+def test_only_those_who_are_there_send():
+    env, ages = DelayParallelWrapper(Relay(), lambda message: message.n_sending), []
+    env.reset()
+    while env.agents:
+        ages.append(env.step(dict.fromkeys(env.agents, 0))[-1]["a"]["age"])
+    # Two agents send in steps 1 and 2, three from step 3 to 5, and two from then on.
+    assert ages == [1, 2, 2, 2, 3, 3, 3, 2, 2]
 
 
 def test_agents_draw_different_delays_which_follow_from_the_seed():
