@@ -145,6 +145,10 @@ class FlyConfig(FlownPolicyConfig):
         choices=FORMATS,
     )
     views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
+    shown: list[str] = setting(
+        [],
+        "UAVs that films tell apart, by number, or by ID in a journal; if none, all of up to 6, 3 of more.",
+    )
     journal: str | None = setting(
         None, "Journal of a fleet whose flight to show, instead of flying, with the settings given here."
     )
@@ -153,6 +157,8 @@ class FlyConfig(FlownPolicyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
+        numbered = not self.journal and not {*self.shown} <= {*map(str, range(self.agents))}
+        self.refuse(numbered, "shown", f"is not a list of UAVs from 0 to {self.agents - 1}")
 
 
 @dataclass

@@ -3,6 +3,7 @@
 damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
 damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"   (in one page, side by side)
 damian fly journal=north.jsonl "formats=[html]"    (the flight of real UAVs)
+damian fly scenario=coverage agents=100 "shown=[4,17]"    (films tell these UAVs from the others)
 """
 
 from functools import cache
@@ -89,13 +90,13 @@ def show(config: FlyConfig, folder: Path) -> None:
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
         episode.save(folder / f"{name}.json")
         if "png" in config.formats:
-            save_picture(episode, folder / f"{name}.png")
+            save_picture(episode, folder / f"{name}.png", config.shown)
         if "html" in config.formats:
             save_page([episode], folder / f"{name}.html")
         if "geojson" in config.formats:
             save_geojson(episode, folder / f"{name}.geojson")
         for kind, view in product(kinds, config.views):
-            save_film(episode, folder / f"{name}{'_3d' * (view == '3d')}.{kind}", view)
+            save_film(episode, folder / f"{name}{'_3d' * (view == '3d')}.{kind}", view, config.shown)
     for name, episode in episodes.items():
         print(summary(name, episode))
 

@@ -233,12 +233,16 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
     belief, grid = instants.get(keys.BELIEF, None), env.server.grid
     airspace, region = env.simulation.airspace, int(env.server.region_of(own)[0])
     about, over = {**about, **_drawn(env, truth.drawn[:1])}, airspace.regions[region]
+    points = np.asarray(airspace.points[region, : airspace.n_points[region]].cpu())
+    if env.scenario.battery.charging_points:  # else UAVs charge wherever they land
+        charges = env.simulation.vehicles.chargers.view(airspace.points.shape[:2])[region].cpu()
+        about["charging_points"] = _listed(points[charges[: len(points)].numpy()])
     level, source = about.get("drawn", {}).get("source.level_db"), env.scenario.source
     return Episode(
         about={**about, "region": over.name, "damian": damian.__version__},
         region=over.polygon,
         origin=over.origin,
-        landing_points=np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),
+        landing_points=points,
         radius=footprint_radius(replace(source, level_db=level) if level else source),
         instant=env.simulation.vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),

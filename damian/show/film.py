@@ -1,5 +1,6 @@
 """Films of an episode: what is true, what the server believes, and the messages between them."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,12 +18,12 @@ from tensordict import TensorDictBase
 from damian.common.plotting import STYLE
 from damian.envs.uav_env import UavEnv
 from damian.show.episode import Episode, at_instant, episode_of
-from damian.show.frame import INK, frame_of
-from damian.show.views import MapView, SpaceView, draw_messages, draw_scale, height_of_rows, legend_marks
+from damian.show.frame import INK, chosen_of, frame_of
+from damian.show.views import MapView, SpaceView, draw_messages, height_of_rows, legend_marks
 
 DPI = 100
-WIDTH, HEIGHTS = 7.2, {"2d": 4.6, "3d": 3.6}
-"""Width of a film, and height of the map and of the space [inches]."""
+WIDTH, HEIGHT = 7.2, 4.6
+"""Width of a film, and height of the map or of the space [inches]."""
 STEPS_PER_SECOND = 4
 """Steps that a film shows in a second."""
 LAST_STEPS = 6
@@ -30,9 +31,9 @@ LAST_STEPS = 6
 _STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5}
 
 
-def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
+def save_film(episode: Episode, path: Path, view: str = "2d", shown: Collection[str] = ()) -> None:
     """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path."""
-    film, steps = Film(episode, view), range(episode.n_steps + 1)
+    film, steps = Film(episode, view, shown), range(episode.n_steps + 1)
     if path.suffix != ".gif":
         writer = FFMpegWriter(STEPS_PER_SECOND)
         with writer.saving(film.figure, str(path), DPI):
@@ -46,22 +47,26 @@ def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
     first.save(path, save_all=True, append_images=others, duration=times, loop=0)
 
 
-def save_picture(episode: Episode, path: Path) -> None:
+def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
     """Write the picture of the instant at which the server was most mistaken about where the UAVs were."""
     error = np.linalg.norm(episode.true - episode.believed, axis=-1).sum(-1)
-    film = Film(episode)
+    film = Film(episode, shown=shown)
     film.draw(int(np.flatnonzero(error == error.max())[-1]))
     film.figure.savefig(path, dpi=2 * DPI)
 
 
 class Film:
-    """Draws the instants of an episode into one figure; ``2d``: from above, ``3d``: in space."""
+    """Draws the instants of an episode into one figure; ``2d``: from above, ``3d``: in space.
 
-    def __init__(self, episode: Episode, view: str = "2d") -> None:
-        self.episode = episode
-        self.colours = [uav.colour for uav in frame_of(episode, 0).uavs]
+    ``shown`` are the IDs of the UAVs to tell apart; if there are none, all of up to six, or three of more.
+    """
+
+    def __init__(self, episode: Episode, view: str = "2d", shown: Collection[str] = ()) -> None:
+        self.episode, self.chosen = episode, chosen_of(episode, shown)
+        uavs = frame_of(episode, 0, self.chosen).uavs
+        self.colours = {uav: uavs[uav].colour for uav in self.chosen}
         with matplotlib.rc_context(_STYLE):
-            rows, height = height_of_rows(episode.n_agents), HEIGHTS[view]
+            rows, height = height_of_rows(len(self.chosen)), HEIGHT
             low, size = rows + 1.0, (WIDTH, round(rows + height + 1.4, 1))
             self.figure = Figure(figsize=size, dpi=DPI)
             FigureCanvasAgg(self.figure)
@@ -69,16 +74,20 @@ class Film:
             def axes(*place: float, projection: str | None = None) -> Any:
                 return self.figure.add_axes(tuple(np.divide(place, size * 2)), projection=projection)
 
-            place = (-0.05, low - 1.15, 5.5, 5.5) if view == "3d" else (0.65, low, 4.5, height)
-            self.map = axes(*place, projection="3d" if view == "3d" else None)
+            if view == "3d":
+                room = np.array([5.1, height])
+                corner = (0.15, low) + room / 2 - WIDTH  # of axes that are so large that they cut nothing
+                self.map = axes(*corner, 2 * WIDTH, 2 * WIDTH, projection="3d")
+                self.view: MapView | SpaceView = SpaceView(self.map, episode, DPI * room)
+                self.figure.text(0.65 / size[0], (low - 0.2) / size[1], self.view.scale, color="0.4")
+            else:
+                self.map = axes(0.65, low, 4.5, height)
+                self.view = MapView(self.map, episode)
             self.charts = [axes(5.55, low + up * height, 1.45, 0.19 * height) for up in (0.33, 0)]
             self.lanes = axes(0.65, 0.5, 6.35, rows)
-            self.view = (SpaceView if view == "3d" else MapView)(self.map, episode)
             top = (5.35 / size[0], (low + height + 0.1) / size[1])
             style = {"loc": "upper left", "bbox_to_anchor": top, "frameon": False, "labelspacing": 0.3}
-            self.figure.legend(handles=legend_marks(episode), **style)
-            if episode.belief is not None:
-                draw_scale(axes(5.55, low + height - 1.25, 1.45, 0.09))
+            self.figure.legend(handles=legend_marks(episode, len(self.chosen)), **style)
             self._draw_charts()
             draw_messages(self.lanes, episode, self.colours)
         self._moving: list[Any] = []
@@ -87,7 +96,7 @@ class Film:
         """Draw the instant after so many steps; returns the artists that were drawn."""
         for artist in self._moving:
             artist.remove()
-        frame = frame_of(self.episode, step)
+        frame = frame_of(self.episode, step, self.chosen)
         with matplotlib.rc_context(_STYLE):
             self._moving = [*self.view.draw(frame), *self._now(frame.time)]
         won = f"return {self.episode.reward[: step + 1].mean(-1).sum():.2f}"
@@ -109,18 +118,20 @@ class Film:
         """Draw over time the return so far, and the ages of messages, or the batteries if they are used."""
         episode = self.episode
         used = not np.allclose(episode.battery, episode.battery[:1])
-        titles = ("return so far", "battery [%]" if used else "age of information [s]")
+        values, title, unit = episode.age, "age of information", "s"
+        if used:
+            values, title, unit = episode.battery, "battery", "%"
         self.charts[0].plot(episode.time, episode.reward.mean(-1).cumsum(), color=INK, linewidth=1.3)
-        colours, style = self.colours, "default" if used else "steps-post"
-        values = episode.battery if used else episode.age
-        if episode.is_crowded:  # lines of many UAVs would hide each other
-            titles = (titles[0], f"{'battery [%]' if used else 'age [s]'}, mean and range")
-            colours = ["0.8", "0.8", INK]
-            values = np.stack([values.min(-1), values.max(-1), values.mean(-1)], -1)
-        for line, colour in zip(values.T, colours, strict=True):
-            self.charts[1].plot(episode.time, line, color=colour, linewidth=1.2, drawstyle=style)
-        for axis, title in zip(self.charts, titles, strict=True):
-            axis.set_title(title, loc="left", fontsize=8.5)
+        title = f"{title} [{unit}]"
+        if len(self.chosen) < episode.n_agents:  # lines of many UAVs would hide each other
+            title = f"{title.split()[0]} [{unit}], grey: all UAVs"
+            step, ends = None if used else "post", (values.min(-1), values.max(-1))
+            self.charts[1].fill_between(episode.time, *ends, color="0.85", step=step, linewidth=0)
+        for uav, colour in self.colours.items():
+            style = {"drawstyle": "default" if used else "steps-post", "linewidth": 1.2}
+            self.charts[1].plot(episode.time, values[:, uav], color=colour, **style)
+        for axis, above in zip(self.charts, ("return so far", title), strict=True):
+            axis.set_title(above, loc="left", fontsize=8.5)
             axis.margins(x=0)
             axis.yaxis.set_major_locator(MaxNLocator(3))
             axis.xaxis.set_major_locator(MaxNLocator(3))

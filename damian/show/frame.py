@@ -1,5 +1,6 @@
 """One instant of an episode, as every picture of it shows it: on the map, in space, and as GeoJSON."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,9 +9,12 @@ import numpy as np
 from damian.common.plotting import COLOURS, UAV_COLOURS
 from damian.show.episode import LIKELY, Episode, Floats
 
-TRAIL, CROWDED_TRAIL = 8, 3
-"""Number of steps whose path is drawn behind a UAV, and behind one of many."""
-INK = "#222222"
+TRAIL = 8
+"""Number of steps whose path is drawn behind a UAV."""
+SOME = 3
+"""Number of UAVs that a picture of many tells apart, unless others are chosen."""
+INK, OTHER = "#222222", "#95928b"
+"""Colours of texts, and of the UAVs that are not told apart."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +22,8 @@ class Uav:
     """A UAV at an instant."""
 
     id: str
+    chosen: bool
+    """Whether the picture tells it apart: by its name, its colour, its path and what is believed of it."""
     colour: str
     ink: str
     """The colour of its texts, which is dark."""
@@ -50,17 +56,25 @@ class Frame:
     """Where a source may well be: polygons or several of them, with the probability that any is there."""
 
 
-def frame_of(episode: Episode, step: int) -> Frame:
-    """An episode after ``step`` steps."""
-    begin = max(step - (CROWDED_TRAIL if episode.is_crowded else TRAIL), 0)
+def chosen_of(episode: Episode, shown: Collection[str] = ()) -> list[int]:
+    """Numbers of the UAVs that a picture tells apart: those with these IDs, else all of few, some of many."""
+    found = [uav for uav, name in enumerate(episode.ids) if name in shown]
+    return found or [*range(SOME if episode.is_crowded else episode.n_agents)]
+
+
+def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None) -> Frame:
+    """An episode after ``step`` steps, with the numbers of the UAVs to tell apart, or all."""
+    begin = max(step - TRAIL, 0)
+    rank = {uav: place for place, uav in enumerate(range(episode.n_agents) if chosen is None else chosen)}
     known, emits, asked = episode.source, episode.emits, episode.requests
     belief = [] if episode.belief is None else 1 - (1 - episode.belief[step]).prod(0)
     uavs = [
         Uav(
             id=episode.ids[uav],
-            colour=UAV_COLOURS[uav % len(UAV_COLOURS)],
-            ink=UAV_COLOURS[len(COLOURS) + uav % len(COLOURS)],
-            edge=("white", INK)[uav // len(UAV_COLOURS) % 2],
+            chosen=uav in rank,
+            colour=UAV_COLOURS[rank[uav] % len(UAV_COLOURS)] if uav in rank else OTHER,
+            ink=UAV_COLOURS[len(COLOURS) + rank.get(uav, 0) % len(COLOURS)],
+            edge=("white", INK)[rank.get(uav, 0) // len(UAV_COLOURS) % 2],
             path=episode.position[begin : step + 1, uav],
             heading=float(episode.track[step, uav]),
             spots=bool(episode.spotted[step, uav]),

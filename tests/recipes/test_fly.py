@@ -82,6 +82,7 @@ def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(fly, c
     ("overrides", "message"),
     [
         (["policy=deterministic"], "policy: deterministic needs checkpoint"),
+        (["agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
         (["formats=[geojson]", "region=usecase"], "geojson: its region has no latitude and longitude"),
     ],
 )

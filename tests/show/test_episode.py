@@ -16,6 +16,8 @@ from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
 from damian.show.episode import COLUMNS, Episode, record
+from damian.world.config import BatteryConfig
+from damian.world.regions.region import local_places
 from damian.world.signal_source import SourceConfig
 
 
@@ -84,3 +86,18 @@ def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path):
     path.write_text(json.dumps({**flight().document(), "version": 2}))
     with pytest.raises(InputError, match=r"episode\.json: it is not an episode of version 3: it is .* 2$"):
         Episode.load(path)
+
+
+def test_an_episode_knows_the_landing_points_that_charge_if_not_all_do():
+    places = [[120.0, 80.0], [30.0, 200.0]]
+    for chosen in (None, places):
+        scenario = ScenarioConfig(battery=BatteryConfig(enabled=True, charging_points=chosen))
+        env = make_env(scenario, 1, seed=0, extras=["message", "state"])
+        episode = record(env.rollout(1, random_policy(env)), env.uav_env, {})[0]
+        if chosen is None:
+            assert "charging_points" not in episode.about
+    points = episode.landing_points.astype(float)
+    local = local_places("places", places, env.simulation.airspace.regions[0])
+    distances = np.linalg.norm(points - np.asarray(local)[:, None], axis=-1)
+    nearest = {tuple(points[point].round(1)) for point in distances.argmin(1)}
+    assert {tuple(np.round(place, 1)) for place in episode.about["charging_points"]} == nearest
