@@ -22,7 +22,6 @@ import damian
 from damian import keys
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
-from damian.common.plotting import COLOURS
 from damian.common.text_files import named, one_line, read_text
 from damian.envs.uav_env import UavEnv
 from damian.world.signal_source import footprint_radius
@@ -101,11 +100,6 @@ class Episode:
     def names(self) -> list[str]:
         """The UAVs in a text: their IDs if they are real ones, else as in ``UAV 0``."""
         return self.ids if self.about.get("uavs") else [f"UAV {uav}" for uav in self.ids]
-
-    @property
-    def is_crowded(self) -> bool:
-        """Whether there are so many UAVs that less must be drawn of each."""
-        return self.n_agents > len(COLOURS)
 
     @property
     def true(self) -> Floats:

@@ -118,13 +118,10 @@ class Film:
         """Draw over time the return so far, and the ages of messages, or the batteries if they are used."""
         episode = self.episode
         used = not np.allclose(episode.battery, episode.battery[:1])
-        values, title, unit = episode.age, "age of information", "s"
-        if used:
-            values, title, unit = episode.battery, "battery", "%"
+        title, values = ("battery [%]", episode.battery) if used else ("age of information [s]", episode.age)
         self.charts[0].plot(episode.time, episode.reward.mean(-1).cumsum(), color=INK, linewidth=1.3)
-        title = f"{title} [{unit}]"
         if len(self.chosen) < episode.n_agents:  # lines of many UAVs would hide each other
-            title = f"{title.split()[0]} [{unit}], grey: all UAVs"
+            title = f"{title.replace(' of information', '')}, grey: all UAVs"
             step, ends = None if used else "post", (values.min(-1), values.max(-1))
             self.charts[1].fill_between(episode.time, *ends, color="0.85", step=step, linewidth=0)
         for uav, colour in self.colours.items():

@@ -9,10 +9,8 @@ import numpy as np
 from damian.common.plotting import COLOURS, UAV_COLOURS
 from damian.show.episode import LIKELY, Episode, Floats
 
-TRAIL = 8
-"""Number of steps whose path is drawn behind a UAV."""
-SOME = 3
-"""Number of UAVs that a picture of many tells apart, unless others are chosen."""
+TRAIL, SOME = 8, 3
+"""Number of steps whose path is drawn behind a UAV, and of UAVs of many to tell apart if none is chosen."""
 INK, OTHER = "#222222", "#95928b"
 """Colours of texts, and of the UAVs that are not told apart."""
 
@@ -59,7 +57,7 @@ class Frame:
 def chosen_of(episode: Episode, shown: Collection[str] = ()) -> list[int]:
     """Numbers of the UAVs that a picture tells apart: those with these IDs, else all of few, some of many."""
     found = [uav for uav, name in enumerate(episode.ids) if name in shown]
-    return found or [*range(SOME if episode.is_crowded else episode.n_agents)]
+    return found or [*range(episode.n_agents if episode.n_agents <= len(COLOURS) else SOME)]
 
 
 def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None) -> Frame:

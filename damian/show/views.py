@@ -31,16 +31,14 @@ _BLOWS = Path([[0.0, 1.0], [0.0, -1.0], [-0.4, -0.4], [0.0, -1.0], [0.4, -0.4]],
 DART = Path([[0.0, 1.0], [0.62, -0.8], [0.0, -0.42], [-0.62, -0.8], [0.0, 1.0]])
 """Outline of a UAV that flies to the north."""
 _BOLT = Path([[0.2, 1.0], [-0.6, -0.15], [-0.05, -0.15], [-0.2, -1.0], [0.6, 0.15], [0.05, 0.15], [0.2, 1.0]])
-_CHARGES = {"marker": _BOLT, "linestyle": "", "color": "#b8860b", "markersize": 9, "zorder": 1.2}
+_CHARGES: dict[str, Any] = {"marker": _BOLT, "color": "#b8860b", "markersize": 9, "zorder": 1.2}
 """Mark of a place where UAVs charge."""
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
 _ZONE = {"facecolor": "white", "edgecolor": _EDGE, "linewidth": 0.6, "hatch": "////"}
 _CORNERS = 48
 """Corners of a footprint in space."""
-_SMALL = 8.0
-"""Size of the mark of a UAV that is not told apart [points]."""
-HIGHEST = 0.35
-"""Share of the region's size up to which heights are enlarged, so that they are seen."""
+_SMALL, _HIGHEST = 8.0, 0.35
+"""Size of the mark of one of many [points], and share of the region's size to which heights are enlarged."""
 _HALO = [withStroke(linewidth=1.8, foreground="white")]
 _NAME = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points", "path_effects": _HALO}
 _AROUND = np.array([(1, 0.5), (1, -0.5), (-1, 0.5), (-1, -0.5), (0, 1), (0, -1), (1, 1), (-1, -1)])
@@ -57,7 +55,7 @@ class MapView:
         for zone in _zones(episode):
             axis.add_patch(PathPatch(zone, zorder=0.1, **_ZONE))
         axis.plot(*episode.landing_points.T, ".", color=_POINT, markersize=2, zorder=1)
-        axis.plot(*_chargers(episode), **_CHARGES)
+        axis.plot(*_chargers(episode), linestyle="", **_CHARGES)
         (west, south), (east, north) = limits(episode)
         axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
         axis.set(xlabel="east [m]", ylabel="north [m]")
@@ -112,6 +110,7 @@ class SpaceView:
     def __init__(self, axis: Any, episode: Episode, room: Floats) -> None:
         self.axis, self.radius = axis, episode.radius
         self.dt = float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
+        self._turn = lambda steps: axis.view_init(elev=34, azim=-65 + TURN * steps)
         axis.computed_zorder = False  # the middle of the large ground says nothing about what it hides
         for part in shapely.get_parts(episode.region):
             shell, *holes = [shapely.get_coordinates(ring) for ring in shapely.get_rings(part)]
@@ -119,11 +118,11 @@ class SpaceView:
             for ring, style in [(shell, land), *((hole, _ZONE) for hole in holes)]:
                 axis.add_collection3d(Poly3DCollection([_on_ground(ring)], zorder=0, **style))
         axis.plot(*episode.landing_points.T, 0, ".", color=_POINT, markersize=1.5, zorder=1)
-        axis.plot(*_chargers(episode), 0, **_CHARGES)
+        axis.plot(*_chargers(episode), 0, linestyle="", **_CHARGES)
         (west, south), (east, north) = limits(episode)
         size, highest = np.array([east - west, north - south]), float(episode.position[..., 2].max())
         height = 1.1 * max(highest, 0.001 * size.max())
-        times = _round_factor(HIGHEST * size.max() / height) if highest else 1
+        times = max(1, round(float(f"{_HIGHEST * size.max() / height:.1g}"))) if highest else 1
         axis.set(xlim=(west, east), ylim=(south, north), zlim=(0, height), proj_type="ortho")
         axis.set_axis_off()
         ground = shapely.get_coordinates(episode.region.buffer(self.radius)).T
@@ -131,7 +130,6 @@ class SpaceView:
         self._fit(corners, np.array([*size, times * height]) / size.max(), room, episode.n_steps)
         heights = f", heights {f'{times} times as large' if times > 1 else 'to scale'}" if highest else ""
         self.scale = f"{size[0]:.0f} m x {size[1]:.0f} m{heights}"
-        """What a caption says about sizes."""
 
     def draw(self, frame: Frame) -> list[Any]:
         """Draw a frame; returns the artists that were drawn."""
@@ -154,10 +152,6 @@ class SpaceView:
             self.axis, frame, lambda at: proj_transform(at[0], at[1], at[2:].sum(), seen)
         )
 
-    def _turn(self, steps: float) -> None:
-        """Turn as after so many steps."""
-        self.axis.view_init(elev=34, azim=-65 + TURN * steps)
-
     def _fit(self, corners: Floats, shape: Floats, room: Floats, n_steps: int) -> None:
         """Draw a box of this shape so large that these corners in it, [3, C], are always in the room."""
         axis, far = self.axis, []
@@ -165,9 +159,8 @@ class SpaceView:
         axis.apply_aspect()
         for steps in np.linspace(0, n_steps, 90):
             self._turn(steps)
-            x, y, _ = proj_transform(*corners, axis.get_proj())
-            seen = axis.transData.transform(np.stack([x, y], -1))
-            far.append(np.abs(seen - np.mean(axis.bbox, 0)).max(0))
+            seen = np.transpose(proj_transform(corners[0], corners[1], corners[2], axis.get_proj())[:2])
+            far.append(np.abs(axis.transData.transform(seen) - np.mean(axis.bbox, 0)).max(0))
         axis.set_box_aspect(shape, zoom=float((room / 2 / np.max(far, 0)).min()))
 
     def _others(self, uavs: list[Uav]) -> list[Any]:
@@ -217,7 +210,7 @@ def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> N
         lines = [[(a, row), (b, row)] for a, b in ends]
         axis.add_collection(LineCollection(lines, colors=colour, linewidths=2.2, alpha=0.55))
         axis.plot(at_once, np.full(len(at_once), row), ".", color=colour, markersize=3, clip_on=False)
-        axis.plot(ends[:, 1], np.full(len(ends), row), ">", color=colour, markersize=3.5, clip_on=False)
+        axis.plot(ends[:, 1], np.full(len(ends), row), ">", color=colour, markersize=3.5)
         axis.plot(begin[lost], np.full(lost.sum(), row), "x", color=INK, markersize=4.5, clip_on=False)
     size = min(8.0, 50 * height_of_rows(len(colours)) / len(colours))
     axis.set_yticks(range(len(colours)), [_short(episode.names[uav]) for uav in colours], fontsize=size)
@@ -310,11 +303,6 @@ def _shades(uavs: list[Uav]) -> list[Any]:
     return [to_rgba(OTHER, 0.3 if uav.spots else 0.09) for uav in uavs]
 
 
-def _round_factor(most: float) -> int:
-    """The largest of 1, 2, 5, 10, 20, ... that is at most a number, or 1."""
-    return next((n for n in (f * 10**p for p in range(9, -1, -1) for f in (5, 2, 1)) if n <= most), 1)
-
-
 def _on_ground(corners: Floats) -> Floats:
     """Places [C, 2] as points on the ground, [C, 3]."""
     return np.column_stack([corners, np.zeros(len(corners))])
@@ -347,6 +335,6 @@ def _short(name: str) -> str:
     return name if len(name) <= 8 else f"{name[:7]}\N{HORIZONTAL ELLIPSIS}"
 
 
-def _mark(label: str, **style: Any) -> Line2D:
+def _mark(label: str, color: str = "0.3", **style: Any) -> Line2D:
     """An entry of a legend."""
-    return Line2D([], [], label=label, **{"color": "0.3", "linestyle": ""} | style)
+    return Line2D([], [], label=label, color=color, linestyle="", **style)

@@ -9,8 +9,9 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+import shapely
 from chromium import chromium, problems, resize
-from episodes import crowd, flight
+from episodes import SQUARE, crowd, flight
 
 from damian import compose_scenario
 from damian.baselines.random import random_policy
@@ -22,6 +23,8 @@ from damian.show.replay_page import save_page
 pytestmark = pytest.mark.browser
 WEBGL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LAST, LATE = 20, 4
+ROUND = 0.056
+"""Largest error of a number of one decimal made of one with five significant digits, below 1,000."""
 
 
 @cache
@@ -115,9 +118,9 @@ def check_numbers(page, episode, step):
     """The page shows the numbers of an instant of an episode."""
     table = page.table()
     for axis, name in enumerate(("east", "north", "up")):
-        np.testing.assert_allclose(table[name], episode.position[step, :, axis], atol=0.001)
-    np.testing.assert_allclose(table["age"], episode.age[step], atol=0.001)
-    np.testing.assert_allclose(table["battery"], episode.battery[step], atol=0.001)
+        np.testing.assert_allclose(table[name], episode.position[step, :, axis], atol=ROUND)
+    np.testing.assert_allclose(table["age"], episode.age[step], atol=ROUND)
+    np.testing.assert_allclose(table["battery"], episode.battery[step], atol=ROUND)
     won = float(page.shown("return").split()[1])
     assert won == pytest.approx(episode.reward[: step + 1].mean(-1).sum(), abs=0.0051)
     assert page.shown("time") == f"{episode.time[step]:g} s"
@@ -131,7 +134,7 @@ def test_it_shows_the_numbers_of_every_instant_and_loads_nothing(opened):
             check_numbers(page, episode, step)
             page.press("ARROW_RIGHT")
         legend = [each.text for each in page.all("[data-chart=reward] .u-value")][1:]
-        assert legend == [f"{term[LAST].mean():.3f}" for term in episode.reward_terms.values()]
+        assert legend == [f"{term[LAST].mean():.3f}" for term in episode.reward_terms.values() if term.any()]
         assert page.run("return performance.getEntriesByType('resource').length") == 0
 
 
@@ -186,6 +189,35 @@ def test_a_click_on_a_uav_or_on_its_number_dims_the_others(opened):
             assert (button.get_attribute("aria-pressed"), page.run(dim) == before) == ("true", False)
             page.press("ESCAPE")
             assert page.run(dim) == before
+
+
+def test_of_many_uavs_the_list_chooses_the_one_that_is_told_apart(opened):
+    with opened(crowd()) as page:
+        before, (button, other) = page.map(), (page.all(".numbers tbody button")[uav] for uav in (17, 3))
+        choose = "const s = document.querySelector('#tools select'); s.value = arguments[0];"
+        choose += "s.dispatchEvent(new Event('change'))"
+        colour = "return arguments[0].parentElement.style.getPropertyValue('--uav')"
+        assert page.run(colour, button) == page.run(colour, other)
+        page.run(choose, "17")
+        page.settle()
+        assert page.shown("chosen").startswith("UAV 17: east 100.0 m, north 100.0 m, age 0.0 s")
+        assert button.get_attribute("aria-pressed") == "true"
+        assert page.run(colour, button) != page.run(colour, other)
+        assert page.map() != before
+        page.press("ESCAPE")
+        assert page.run("return document.querySelector('#tools select').value") == ""
+        assert (page.map(), page.all("[data-shown=chosen]")) == (before, [])
+
+
+def test_zones_are_hatched_and_charging_places_marked(opened):
+    colours = "const c = document.querySelector('canvas.map'); "
+    colours += "const [w, h] = [c.width, c.height]; const n = Math.round(0.05 * Math.min(w, h));"
+    colours += "const d = c.getContext('2d').getImageData((w - n) / 2, (h - n) / 2, n, n).data;"
+    colours += "return new Set(new Uint32Array(d.buffer)).size"
+    zone = SQUARE.difference(shapely.box(-60, -60, 60, 60))
+    for changes in ({}, {"region": zone}, {"about": {"charging_points": [[0, 0]]}}):
+        with opened(flight(source=None, emits=None, **changes)) as page:
+            assert (page.run(colours) > 1) == bool(changes)
 
 
 def test_a_drag_shows_a_part_of_the_time_which_follows_the_present(opened):

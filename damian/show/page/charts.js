@@ -113,10 +113,6 @@ export class ChartView {
       const [min, max] = this.shown;
       this.plot.batch(() => this.plot.setScale("x", { min, max }));
     }
-    if (this.isCrowded)
-      this.caption.querySelectorAll(".u-series").forEach((row, i) => {
-        row.style.display = this.chart.isByUav && i - 1 === this.theme.chosen ? "" : "none";
-      });
     const width = this.plot.over.clientWidth;
     const at = Math.min(Math.max(this.plot.valToPos(now.time, "x"), 0), width);
     this.future.style.transform = `translateX(${at}px)`;
@@ -126,6 +122,13 @@ export class ChartView {
 
   /** Draw again in the present width and colours. */
   resize() {
+    if (this.isCrowded)
+      this.caption.querySelectorAll(".u-series").forEach((row, i) => {
+        const isChosen = this.chart.isByUav && i - 1 === this.theme.chosen;
+        row.style.display = isChosen ? "" : "none";
+        if (isChosen) row.querySelector(".u-marker").style.background = this.chart.lines[i - 1].colour();
+        if (i) this.plot.series[i].width = isChosen ? 2.5 : 1;
+      });
     const width = this.figure.clientWidth;
     const height = this.#height();
     if (width && (width !== this.plot.width || height !== this.plot.height))

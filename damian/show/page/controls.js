@@ -72,6 +72,16 @@ export function addTools(parent, settings, hasBelief, changed) {
   return Object.fromEntries(Object.entries(keys).map(([key, press]) => [key, () => (press(), show())]));
 }
 
+/** The list of the UAVs, of which one may be chosen. */
+export function addList(parent, names, theme) {
+  const list = document.createElement("select");
+  list.setAttribute("aria-label", "chosen UAV");
+  list.append(new Option("all UAVs", ""), ...names.map((name, uav) => new Option(name, uav)));
+  list.addEventListener("change", () => theme.choose(list.value === "" ? null : Number(list.value)));
+  theme.onChange(() => (list.value = theme.chosen ?? ""));
+  parent.append(list);
+}
+
 /** The buttons and the slider of the time. */
 export function addTransport(parent, player) {
   const first = sign(parent, ICONS.first, () => player.seek(0), "first instant (Home)");

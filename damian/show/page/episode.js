@@ -5,8 +5,8 @@
  * metres east and north of the region's origin.
  */
 
-/** Number of steps whose path is drawn behind a UAV, and behind one of many. */
-const [TRAIL, CROWDED_TRAIL] = [8, 3];
+/** Number of steps whose path is drawn behind a UAV. */
+const TRAIL = 8;
 /** Share of a step in which a UAV turns to where it flies next. */
 const TURN = 0.2;
 /** Number of steps for which a lost message is shown. */
@@ -87,9 +87,9 @@ export class Episode {
   }
 
   /** The latest places of a UAV, the oldest first, up to where it is: [[east, north, up], ...]. */
-  trail(uav, now, isCrowded) {
+  trail(uav, now) {
     const path = this.position
-      .slice(Math.max(now.step - (isCrowded ? CROWDED_TRAIL : TRAIL), 0), now.step + 1)
+      .slice(Math.max(now.step - TRAIL, 0), now.step + 1)
       .map((places) => places[uav]);
     return [...path, this.place(uav, now)];
   }

@@ -4,6 +4,8 @@ import { faint } from "page/theme";
 
 /** Colour of a cell in which the source surely is; others are fainter, on a logarithmic scale. */
 export const OPACITY = 0.75;
+/** Mark of a charging place, as in films, in a square of 2. */
+const BOLT = new Path2D("M.2-1-.6 .15H-.05L-.2 1 .6-.15H.05Z");
 
 /** Paints the ground into a canvas of its own, again only when it changes. */
 export class Ground {
@@ -41,10 +43,11 @@ export class Ground {
     context.fill("evenodd");
     context.save();
     context.clip("evenodd");
-    this.#points(context, frame, theme);
     if (covered) this.#coverage(context, frame, step, theme, place);
     if (belief) this.#belief(context, frame, step, theme);
+    this.#points(context, frame, theme);
     context.restore();
+    this.#hatch(context, frame, theme);
     this.#outline(context, frame);
     context.strokeStyle = theme.edge;
     context.lineWidth = Math.max(1.4, frame.width / 600);
@@ -52,9 +55,9 @@ export class Ground {
     return true;
   }
 
-  #outline(context, frame) {
+  #outline(context, frame, rings = this.episode.polygons.flat()) {
     context.beginPath();
-    for (const ring of this.episode.polygons.flat()) {
+    for (const ring of rings) {
       ring.forEach((corner, i) => context[i ? "lineTo" : "moveTo"](...frame.pixel(corner)));
       context.closePath();
     }
@@ -70,6 +73,28 @@ export class Ground {
       context.arc(x, y, size, 0, 2 * Math.PI);
     }
     context.fill();
+    context.fillStyle = theme.charge;
+    for (const point of this.episode.about.charging_points ?? []) {
+      const [mark, scale] = [new Path2D(), frame.width / 70];
+      mark.addPath(BOLT, new DOMMatrix([scale, 0, 0, scale, ...frame.pixel(point)]));
+      context.fill(mark);
+    }
+  }
+
+  /** Lines across the holes of the region, which are no-fly zones. */
+  #hatch(context, frame, theme) {
+    const holes = this.episode.polygons.flatMap((rings) => rings.slice(1));
+    context.save();
+    this.#outline(context, frame, holes);
+    context.clip();
+    for (let x = -frame.height; x < frame.width; x += frame.width / 70) {
+      context.moveTo(x, frame.height);
+      context.lineTo(x + frame.height, 0);
+    }
+    context.strokeStyle = theme.edge;
+    context.lineWidth = frame.width / 900;
+    context.stroke();
+    context.restore();
   }
 
   /** Footprints at all instants so far; those that were painted before stay in the mask. */

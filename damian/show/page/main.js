@@ -2,7 +2,7 @@
 
 import { Card } from "page/card";
 import { chartsOf, rangeOf } from "page/charts";
-import { addTools, addTransport, listen } from "page/controls";
+import { addList, addTools, addTransport, listen } from "page/controls";
 import { Episode } from "page/episode";
 import { Player } from "page/player";
 import { Theme } from "page/theme";
@@ -10,7 +10,8 @@ import { Zoom } from "page/zoom";
 
 const replay = JSON.parse(document.getElementById("replay").textContent);
 const episodes = replay.episodes.map((file) => new Episode(file));
-const theme = new Theme(replay.colours);
+const largest = episodes.reduce((one, other) => (other.nAgents > one.nAgents ? other : one));
+const theme = new Theme(replay.colours, largest.nAgents);
 const player = new Player(episodes);
 const zoom = new Zoom();
 const hasBelief = episodes.some((episode) => episode.belief !== null);
@@ -27,6 +28,7 @@ const cards = episodes.map(
 addCharts();
 addTransport(document.getElementById("transport"), player);
 const keys = addTools(document.getElementById("tools"), settings, hasBelief, () => player.changed());
+addList(document.getElementById("tools"), largest.names, theme);
 listen(player, { ...keys, ...zoomKeys(), Escape: () => theme.choose(null) });
 player.onChange(() => cards.forEach((card) => card.draw(settings)));
 new ResizeObserver(redraw).observe(parent);

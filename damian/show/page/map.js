@@ -45,21 +45,21 @@ export class MapView {
 
   #footprintsAndTrails(context, now, theme) {
     const { episode, frame } = this;
-    const isCrowded = episode.nAgents > theme.few;
     for (let uav = 0; uav < episode.nAgents; uav++) {
       const [colour, spotted] = [theme.uav(uav), episode.spotted[now.step][uav]];
       context.beginPath();
       context.arc(...frame.pixel(episode.place(uav, now)), episode.radius * frame.scale, 0, 2 * Math.PI);
-      context.fillStyle = faint(colour, spotted ? 0.26 : isCrowded ? 0 : 0.07);
-      context.strokeStyle = faint(colour, spotted ? 1 : 0.6);
+      context.fillStyle = faint(colour, spotted ? 0.26 : 0.07);
+      context.strokeStyle = faint(colour, spotted ? 1 : theme.tells(uav) ? 0.6 : 0);
       context.lineWidth = spotted ? 2 : 0.8;
       context.fill();
       context.stroke();
     }
     context.lineWidth = 2;
     context.lineCap = "round";
-    for (let uav = 0; uav < episode.nAgents; uav++) {
-      const path = episode.trail(uav, now, isCrowded).map((place) => frame.pixel(place));
+    for (const uav of episode.ids.keys()) {
+      if (!theme.tells(uav)) continue;
+      const path = episode.trail(uav, now).map((place) => frame.pixel(place));
       path.slice(1).forEach((to, i) => {
         context.strokeStyle = faint(theme.uav(uav), 0.1 + (0.6 * (i + 1)) / path.length);
         context.beginPath();

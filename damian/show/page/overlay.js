@@ -37,15 +37,17 @@ export function drawMarks(scene) {
   const rings = layers.has("believed") ? uavs.map((uav) => drawBelieved(scene, uav)) : [];
   const darts = layers.has("truth") ? uavs.map((uav) => drawUav(scene, uav)) : [];
   const shown = [...darts, ...rings.filter(Boolean)].reverse(); // the chosen one is named first
-  marks.names(context, shown, stars, scene.places, theme);
+  const named = shown.filter(({ uav }) => theme.tells(uav));
+  marks.names(context, named, stars, scene.places, theme);
   return shown;
 }
 
 /** A UAV, and its battery if it is used. */
 function drawUav({ context, episode, now, theme, pixel, darts }, uav) {
   const [at, colour] = [pixel(episode.place(uav, now)), theme.uav(uav)];
-  if (darts) marks.dart(context, at, episode.heading(uav, now), colour, theme.rim(uav));
-  if (episode.usesBattery) marks.battery(context, at, episode.battery[now.step][uav], colour, theme);
+  const tells = theme.tells(uav);
+  if (darts) marks.dart(context, at, episode.heading(uav, now), colour, theme.rim(uav), tells ? 10 : 7);
+  if (episode.usesBattery && tells) marks.battery(context, at, episode.battery[now.step][uav], colour, theme);
   return { uav, at, key: `dart ${uav}`, text: episode.ids[uav], colour: theme.text(uav) };
 }
 
@@ -53,8 +55,10 @@ function drawUav({ context, episode, now, theme, pixel, darts }, uav) {
 function drawBelieved({ context, episode, now, layers, theme, pixel }, uav) {
   const [age, colour] = [episode.age[now.step][uav], theme.uav(uav)];
   const at = pixel([...episode.believed[now.step][uav], 0]);
-  if (age > 0 && layers.has("truth")) marks.error(context, pixel(episode.place(uav, now)), at, colour);
-  if (age === 0 && layers.has("truth")) return undefined;
+  if (layers.has("truth")) {
+    if (age === 0 || !theme.tells(uav)) return undefined;
+    marks.error(context, pixel(episode.place(uav, now)), at, colour);
+  }
   marks.ghost(context, at, colour);
   const text = age > 0 ? `${episode.ids[uav]}, ${marks.plain(age)} s` : episode.ids[uav];
   return { uav, at, key: `ring ${uav}`, text, colour: theme.text(uav) };
@@ -101,6 +105,6 @@ function drawMessages({ context, episode, now, theme, pixel, rise }) {
     context.moveTo(...from);
     context.lineTo(...at);
     context.stroke();
-    marks.parcel(context, at, share, theme.uav(uav), theme, episode.nAgents > theme.few ? 4 : 6);
+    marks.parcel(context, at, share, theme.uav(uav), theme, theme.tells(uav) ? 6 : 3);
   }
 }

@@ -33,16 +33,31 @@ export class Readout {
     const key = [step, ended, theme.dark, theme.chosen].join();
     if (key === this.shown) return;
     this.shown = key;
+    this.rows.forEach((cells, uav) => {
+      const [east, north, up] = episode.position[step][uav];
+      const numbers = { east, north, up, age: episode.age[step][uav], battery: episode.battery[step][uav] };
+      for (const [name, cell] of cells) if (name in numbers) cell.textContent = written(numbers[name]);
+      const spots = episode.spotted[step][uav];
+      cells.get("spots").textContent = spots ? FILLED : HOLLOW;
+      cells.get("spots").setAttribute("aria-label", spots ? "yes" : "no");
+      cells.get("UAV").style.setProperty("--uav", theme.uav(uav));
+      cells.get("UAV").firstChild.setAttribute("aria-pressed", String(theme.chosen === uav));
+      cells.get("age").classList.toggle("old", numbers.age > 0);
+    });
     const spots = episode.spotters(step).length;
     const { wind } = episode.about;
     const which = episode.source?.[0].length > 1 ? "a" : "the";
+    const arrow = wind && "↓↙←↖↑↗→↘"[Math.round(wind[1] / 45) % 8];
+    const cells = [...(this.rows[theme.chosen] ?? [])].filter(([name]) => UNITS[name]);
+    const told = cells.map(([name, cell]) => `${name} ${cell.textContent} ${UNITS[name]}`);
     const parts = [
       ["time", `${plain(episode.time[step])} s`],
       ["return", `return ${episode.returns[step].toFixed(2)}`],
       ["spots", `${spots} of ${episode.nAgents} spot ${which} source`],
       ["age", `mean age ${episode.meanAge[step].toFixed(1)} s`],
-      ["wind", wind ? `wind ${wind[0].toFixed(1)} m/s from ${Math.round(wind[1])}°` : ""],
+      ["wind", wind ? `wind ${arrow} ${wind[0].toFixed(1)} m/s from ${Math.round(wind[1])}°` : ""],
       ["belief", episode.belief ? `belief ${episode.entropy(step).toFixed(1)} bit` : ""],
+      ["chosen", told.length ? `${episode.names[theme.chosen]}: ${told.join(", ")}` : ""],
       ["ended", ended ? (episode.success ? "ended with success" : "ended") : ""],
     ];
     this.line.replaceChildren(
@@ -55,17 +70,6 @@ export class Readout {
           return part;
         }),
     );
-    this.rows.forEach((cells, uav) => {
-      const [east, north, up] = episode.position[step][uav];
-      const numbers = { east, north, up, age: episode.age[step][uav], battery: episode.battery[step][uav] };
-      for (const [name, cell] of cells) if (name in numbers) cell.textContent = written(numbers[name]);
-      const spots = episode.spotted[step][uav];
-      cells.get("spots").textContent = spots ? FILLED : HOLLOW;
-      cells.get("spots").setAttribute("aria-label", spots ? "yes" : "no");
-      cells.get("UAV").style.setProperty("--uav", theme.uav(uav));
-      cells.get("UAV").firstChild.setAttribute("aria-pressed", String(theme.chosen === uav));
-      cells.get("age").classList.toggle("old", numbers.age > 0);
-    });
   }
 }
 

@@ -4,7 +4,7 @@ import * as three from "libraries";
 import { fitted } from "page/canvas";
 import { Frame, length, roundLength } from "page/geography";
 import { Ground } from "page/ground";
-import { label, plain } from "page/marks";
+import { label } from "page/marks";
 import { drawMarks } from "page/overlay";
 import { SpaceUav } from "page/space_uav";
 
@@ -37,7 +37,7 @@ export class SpaceView {
     const [west, south, east, north] = episode.borders;
     this.middle = [(west + east) / 2, (south + north) / 2];
     this.size = Math.max(east - west, north - south);
-    this.enlarged = episode.highest ? Math.max(1, (SHARE * this.size) / episode.highest) : 1;
+    this.enlarged = episode.highest ? Math.max(1, roundLength((SHARE * this.size) / episode.highest)) : 1;
     this.scene = new three.Scene();
     const sun = new three.DirectionalLight("#ffffff", 2.2);
     sun.position.set(-1, 2, 1);
@@ -161,7 +161,7 @@ export class SpaceView {
     label(context, [x, y + 11], length(metres), theme.muted, theme);
     label(context, this.pixel([middle, north + 0.03 * this.size, 0]), "N", theme.muted, theme);
     context.textAlign = "left";
-    const times = this.enlarged > 1 ? `heights ${plain(this.enlarged, 10)} times as large` : "";
-    label(context, [12, 14], times, theme.muted, theme);
+    const times = this.enlarged > 1 ? `${this.enlarged} times as large` : "to scale";
+    if (this.episode.highest) label(context, [12, 14], `heights ${times}`, theme.muted, theme);
   }
 }

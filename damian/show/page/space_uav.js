@@ -36,17 +36,20 @@ export class SpaceUav {
     const place = episode.place(this.uav, now);
     const [above, below] = [this.space.point(place), this.space.point([place[0], place[1], 0])];
     const spotted = episode.spotted[now.step][this.uav];
-    const isCrowded = episode.nAgents > theme.few;
+    const tells = theme.tells(this.uav);
+    this.edge.visible = tells || Boolean(spotted);
+    this.body.scale.setScalar(tells ? 1 : 0.7);
     const [colour, land] = [new three.Color(theme.uav(this.uav)), new three.Color(theme.land)];
     this.body.material.color = colour;
     this.body.position.set(...above);
     this.body.rotation.y = -episode.heading(this.uav, now);
     this.footprint.material.color = colour;
-    this.footprint.material.opacity = spotted ? 0.3 : isCrowded ? 0.03 : 0.09;
+    this.footprint.material.opacity = spotted ? 0.3 : 0.09;
     this.footprint.position.set(...below);
     this.edge.material.color = colour.clone().lerp(land, spotted ? 0 : 0.5);
     this.edge.position.set(...below);
-    const path = pairs(episode.trail(this.uav, now, isCrowded).map((each) => this.space.point(each)));
+    const trail = tells ? episode.trail(this.uav, now) : [];
+    const path = pairs(trail.map((each) => this.space.point(each)));
     const faded = (part) => (part < path.length ? 0.7 * (1 - part / path.length) : 0.35);
     draw(this.path, [...path, [above, below]], (part) => colour.clone().lerp(land, faded(part)));
   }

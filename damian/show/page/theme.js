@@ -12,10 +12,11 @@ export class Theme {
   #listeners = [];
 
   /** @param {string[]} colours of the UAVs, as #rrggbb: the usual ones, and the same darkened */
-  constructor(colours) {
+  constructor(colours, nAgents) {
     this.colours = colours;
-    /** Largest number of UAVs of which everything can be drawn. */
     this.few = colours.length / 2;
+    /** Whether there are so many UAVs that only the chosen one is told apart. */
+    this.many = nAgents > this.few;
     this.#read();
     DARK.addEventListener("change", () => {
       this.#read();
@@ -32,6 +33,11 @@ export class Theme {
   choose(uav) {
     this.chosen = uav === this.chosen ? null : uav;
     this.#changed();
+  }
+
+  /** Whether a UAV has a name, a colour and a path of its own. */
+  tells(number) {
+    return !this.many || this.chosen === number;
   }
 
   /** Colour of a UAV. */
@@ -51,6 +57,7 @@ export class Theme {
 
   /** Colour of its mark's edge, which tells it from an earlier one of the same colour. */
   rim(number) {
+    if (!this.tells(number)) return this.other;
     return Math.floor(number / this.uavs.length) % 2 ? this.#dimmed(number, this.ink) : this.paper;
   }
 
@@ -59,6 +66,7 @@ export class Theme {
   }
 
   #dimmed(number, colour) {
+    if (!this.tells(number)) return this.other;
     return this.chosen === null || this.chosen === number ? colour : mixed(colour, this.paper, DIM);
   }
 
@@ -80,6 +88,8 @@ export class Theme {
       "belief",
       "covered",
       "alarm",
+      "other",
+      "charge",
     ]) {
       this[name] = value(name);
     }
