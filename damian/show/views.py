@@ -127,7 +127,7 @@ class SpaceView:
         axis.set_axis_off()
         ground = shapely.get_coordinates(episode.region.buffer(self.radius)).T
         corners = np.hstack([[*ground, np.full(ground.shape[1], up)] for up in (0, height)])
-        self._fit(corners, np.array([*size, times * height]) / size.max(), room, episode.n_steps)
+        self._fit(corners, np.array([*size, times * height]) / size.max(), room)
         heights = f", heights {f'{times} times as large' if times > 1 else 'to scale'}" if highest else ""
         self.scale = f"{size[0]:.0f} m x {size[1]:.0f} m{heights}"
 
@@ -152,13 +152,13 @@ class SpaceView:
             self.axis, frame, lambda at: proj_transform(at[0], at[1], at[2:].sum(), seen)
         )
 
-    def _fit(self, corners: Floats, shape: Floats, room: Floats, n_steps: int) -> None:
+    def _fit(self, corners: Floats, shape: Floats, room: Floats) -> None:
         """Draw a box of this shape so large that these corners in it, [3, C], are always in the room."""
         axis, far = self.axis, []
         axis.set_box_aspect(shape)
         axis.apply_aspect()
-        for steps in np.linspace(0, n_steps, 90):
-            self._turn(steps)
+        for angle in range(0, 360, 4):
+            self._turn(angle / TURN)
             seen = np.transpose(proj_transform(corners[0], corners[1], corners[2], axis.get_proj())[:2])
             far.append(np.abs(axis.transData.transform(seen) - np.mean(axis.bbox, 0)).max(0))
         axis.set_box_aspect(shape, zoom=float((room / 2 / np.max(far, 0)).min()))
@@ -181,9 +181,8 @@ class SpaceView:
     def _uav(self, uav: Uav) -> list[Any]:
         """Draw a UAV with its path, what it stands above, and where the server believes it to be."""
         colour, axis, (x, y, z) = uav.colour, self.axis, uav.path[-1]
-        strength = 0.35 if uav.spots else 0.12
         ground = [_on_ground(self._print(uav))]
-        footprint = Poly3DCollection(ground, facecolor=colour, alpha=strength, zorder=2)
+        footprint = Poly3DCollection(ground, facecolor=colour, alpha=0.35 if uav.spots else 0.12, zorder=2)
         drawn: list[Any] = [axis.add_collection3d(footprint)]
         drawn += axis.plot([x, x], [y, y], [0, z], color=colour, lw=0.8, zorder=6)
         parts, fading = _trail(uav.path)
