@@ -211,10 +211,7 @@ class World:
     def _preferences(self, uav: Uav, move: tuple[float, float]) -> list[int]:
         """Landing points, nearest the target first; only the UAV's own point if the target is outside."""
         distance, heading = move
-        target = (
-            uav.place[0] + distance * math.sin(heading),
-            uav.place[1] + distance * math.cos(heading),
-        )
+        target = (uav.place[0] + distance * math.sin(heading), uav.place[1] + distance * math.cos(heading))
         if not shapely.contains_xy(self.polygon, *target):
             return [uav.point]
         return sorted(range(len(self.points)), key=lambda p: math.dist(self.points[p], target))

@@ -4,15 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from damian.compare.comparison import (
-    MEASURED,
-    RANDOM,
-    TRAINED,
-    UNTRAINED,
-    Comparison,
-    Method,
-    shown,
-)
+from damian.compare.comparison import MEASURED, RANDOM, TRAINED, UNTRAINED, Comparison, Method, shown
 from damian.compare.report import markdown
 
 LIKELIEST = f"{TRAINED}, deterministic"

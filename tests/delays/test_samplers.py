@@ -9,13 +9,7 @@ from torch import Tensor
 
 from damian.common import counter_rng
 from damian.delays.laws import Distance, Lag, Uniform
-from damian.delays.samplers import (
-    ContextSampler,
-    LinkSampler,
-    MessageContext,
-    Recorded,
-    Sampler,
-)
+from damian.delays.samplers import ContextSampler, LinkSampler, MessageContext, Recorded, Sampler
 
 SENDERS = 20_000
 

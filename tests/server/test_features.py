@@ -17,12 +17,7 @@ shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
 
 
 @settings(max_examples=settings.default.max_examples // 2)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    n_agents=st.integers(1, 6),
-    heard=shares,
-    spots=shares,
-)
+@given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(1, 6), heard=shares, spots=shares)
 def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(seed, n_agents, heard, spots):
     worlds = random_worlds(seed, n_agents, heard, spots)
     messages, server = messages_of(worlds)

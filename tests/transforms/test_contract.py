@@ -10,18 +10,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from environments import (
-    ACTION,
-    KINDS,
-    LATE,
-    OBSERVATION,
-    REWARD,
-    Drift,
-    Kind,
-    cartpole,
-    uavs,
-    unserved,
-)
+from environments import ACTION, KINDS, LATE, OBSERVATION, REWARD, Drift, Kind, cartpole, uavs, unserved
 from helpers import all_same, same, saved_and_loaded, square, walking
 from streams import check_independent
 from tensordict import TensorDictBase

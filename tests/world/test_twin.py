@@ -34,9 +34,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
         region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, initial_conditions=24),
         source=SourceConfig(level_db=138.0),
         actions=ActionConfig(
-            kind=kind,
-            distances=[0.0, 33.3, 71.9, 118.4],
-            headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4],
+            kind=kind, distances=[0.0, 33.3, 71.9, 118.4], headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4]
         ),
         observation=ObservationConfig(local_features=LOCAL, global_features=TWIN_FEATURES, time_scale=9.0),
         reward=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
