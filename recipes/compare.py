@@ -23,7 +23,7 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import write_csv
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, RUN, Comparison
-from damian.compare.config import SEEDS, CompareConfig
+from damian.compare.config import EPISODES, SEEDS, CompareConfig
 from damian.compare.figures import plot_curves, plot_profiles, plot_scores
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
@@ -51,8 +51,6 @@ from .shared.runs import check_stored
 from .train import train
 
 TABLE, CURVES = "table.csv", "curves.png"
-EPISODES = 100
-"""A report with a method of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
 
 
 def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":

@@ -26,6 +26,9 @@ from . import cli
 from .config import SubmitConfig
 from .shared.comparison_runs import stored_results
 
+RECORDED = ("damian", "commit", "command")
+"""Words of a submission that the records of its runs tell."""
+
 
 def delaybench() -> Experiment:
     """The experiment delaybench."""
@@ -37,23 +40,23 @@ def submission(folder: Path, method: str, authors: str) -> pd.DataFrame:
     rows = stored_results(folder).rows
     checks.one_of("method", method, [*rows["method"].unique()])
     rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
-    facts = []
+    facts, trained = list[dict[str, object]](), dict[tuple[str, str], Path]()
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
         run = folder / task / delay / method / f"seed_{seed}"
-        should = "is no folder of a finished run: a submission needs those of all its runs"
-        checks.require((run / RESULTS).exists() and bool(read_record(run)), "folder", run, should)
+        record, should = read_record(run), "is not the folder of a finished run: keep those of all runs"
+        checks.require((run / RESULTS).exists() and bool(record), "folder", run, should)
         found = read_results(run / RESULTS).set_index("policy")["return"]  # of damian's own evaluation
-        record = {name: read_record(run).get(name) for name in ("damian", "commit", "command")}
-        facts.append({"return": found[TRAINED], "parameters": parameters(run), **record})
-    known = rows.drop(columns=["return"]).join(pd.DataFrame(facts)).assign(authors=authors)
-    known["parameters"] = known["parameters"].max()  # of flights elsewhere there are none
-    return known[COLUMNS]
+        facts.append({"return": found[TRAINED], **{name: record.get(name) for name in RECORDED}})
+        if (run / CHECKPOINT).exists():  # flights elsewhere have no networks
+            trained[task, delay] = run  # those of all seeds have the same sizes
+    known = rows.drop(columns=["return"]).join(pd.DataFrame(facts))
+    return known.assign(authors=authors, parameters=max(map(parameters, trained.values()), default=0))[
+        COLUMNS
+    ]
 
 
 def parameters(run: Path) -> int:
-    """Number of parameters of the networks that a run has trained; 0 if it has trained none."""
-    if not (run / CHECKPOINT).exists():
-        return 0
+    """Number of parameters of the networks that a run has trained."""
     networks = read_checkpoint(run / CHECKPOINT, "folder").get("components", {})
     return sum(_count(part) for name, part in networks.items() if "optimizer" not in name)
 
@@ -78,7 +81,3 @@ def submit(config: SubmitConfig) -> None:
 @cli.one_line_errors("submit")
 def main(given: DictConfig) -> None:
     submit(cli.checked(given, [], "submit"))
-
-
-if __name__ == "__main__":
-    main()

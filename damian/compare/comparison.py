@@ -40,9 +40,8 @@ MEASURED += ("age", "late", "lost", "backupdated")
 SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
 """Measures whose intervals end at 0 and at 1."""
 COMPARED = ("J_norm", "recovery", "improvement")
-"""What is found of a method beside others under the same delay (``normalised``, ``recovery``,
-``probability_of_improvement``), the naive method being the strongest of the same track: methods that learn
-from late data only, or those that had a simulator."""
+"""Statistics of a method under a delay (``normalised``, ``recovery``, ``probability_of_improvement``). The
+naive method in them is the strongest of the same track: late data only, or simulator allowed."""
 LATE_DATA, SIMULATOR, NO_DELAY = "late data", "simulator", "no delay"
 """Regimes: the information that a method may use (docs/protocol.md)."""
 RUN = ["task", "delay", "method", "seed"]
@@ -55,7 +54,7 @@ COLUMNS += [name + end for name in (*MEASURED, *COMPARED) for end in ENDS]
 
 
 def regime(methods: Mapping[str, Method], name: str) -> str:
-    """What a method may know: ``NO_DELAY``, ``LATE_DATA``, or else what only a ``SIMULATOR`` has."""
+    """The regime of a method: ``LATE_DATA``, ``SIMULATOR`` or ``NO_DELAY``."""
     method = methods[name]
     if not method.delayed:
         return NO_DELAY
@@ -116,6 +115,11 @@ class Comparison:
     score: str = "return"
     """Measure that is the J of J_norm and recovery."""
 
+    @property
+    def undelayed(self) -> str:
+        """Name of the undelayed method, with which others are compared."""
+        return next((name for name, method in self.methods.items() if not method.delayed), "")
+
     def tasks(self) -> list[str]:
         """Tasks with a finished run."""
         return [*self.rows["task"].unique()]
@@ -153,17 +157,9 @@ class Comparison:
                     runs = self._runs.get((task, delay, method, policy))
                     if runs is None:
                         continue  # a method may have no untrained network, and a task no script
-                    line = {
-                        "task": task,
-                        "delay": delay,
-                        "method": name,
-                        "policy": policy,
-                        "seeds": len(runs),
-                    }
-                    line |= {
-                        "regime": regime(self.methods, method) if name == method else "",
-                        "compared_seeds": 0,
-                    }
+                    line = {"task": task, "delay": delay, "method": name, "policy": policy}
+                    known = regime(self.methods, method) if name == method else ""
+                    line |= {"seeds": len(runs), "regime": known, "compared_seeds": 0}
                     if name == method and policy == self.policy_of(method) and delay != NOT_LATE:
                         line |= self._compared(scores, method)
                     yield line | means_over_seeds(runs[[*MEASURED]])
@@ -179,8 +175,7 @@ class Comparison:
 
         The first columns are the undelayed method and the random policy, without delay.
         """
-        undelayed = next((name for name, method in self.methods.items() if not method.delayed), "")
-        of = {undelayed: (NOT_LATE, undelayed, TRAINED), RANDOM: (NOT_LATE, undelayed, RANDOM)}
+        of = {self.undelayed: (NOT_LATE, self.undelayed, TRAINED), RANDOM: (NOT_LATE, self.undelayed, RANDOM)}
         of |= {method: (delay, method, self.policy_of(method)) for method in self._present(task, delay)}
         none = pd.DataFrame({self.score: []}, dtype=float)
         found = {name: self._runs.get((task, *key), none)[self.score] for name, key in of.items()}

@@ -63,7 +63,6 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
     """
     table: Any = comparison.table.set_index(["task", "delay", "method", "policy"])
     score = comparison.score
-    undelayed = next((name for name, method in comparison.methods.items() if not method.delayed), "")
 
     def panel(axis: Axes, place: tuple[str, str]) -> None:
         task, delay = place
@@ -78,13 +77,13 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
             axis.errorbar([value], [row], xerr=error, markersize=4, **style)
             if name != SCRIPT and comparison.methods[name].naive:
                 naive.append(value)
-        for name, policy, line in ((undelayed, TRAINED, "--"), (RANDOM, RANDOM, ":")):
+        for name, policy, line in ((comparison.undelayed, TRAINED, "--"), (RANDOM, RANDOM, ":")):
             if (task, NOT_LATE, name, policy) not in table.index:
                 continue
             level = table.loc[(task, NOT_LATE, name, policy), score]
             style = _LEVEL | {"linestyle": line}
             axis.axvline(level, **style)
-            if name == undelayed and naive:
+            if name == comparison.undelayed and naive:
                 best = min(naive) if score in LESS_IS_BETTER else max(naive)
                 axis.axvspan(best, level, color="0.92", zorder=0)
         axis.set_yticks(range(len(shown)), [name for name, _ in shown])

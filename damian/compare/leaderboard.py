@@ -1,4 +1,4 @@
-"""The leaderboard of delaybench: what a submission must hold, and the tables that follow from all of them."""
+"""The leaderboard of delaybench: checks of a submission, and the tables of all submissions."""
 
 from collections.abc import Collection, Sequence
 
@@ -8,13 +8,13 @@ import pandas as pd
 from damian.common import checks
 from damian.common.tables import markdown_table
 from damian.compare.comparison import HELD_OUT_MARK, LATE_DATA, RUN, SIMULATOR, means_over_seeds, shown
-from damian.compare.config import Experiment
+from damian.compare.config import EPISODES, Experiment
 
-MEASURED = ["frames", "episodes", "return"]
+NUMBERS = ["frames", "episodes", "return"]
 WORDS = ["task", "delay", "method", "authors", "regime", "damian", "commit", "command"]
-COLUMNS = [*RUN, *MEASURED, "parameters", *WORDS[3:]]
+COLUMNS = [*RUN, *NUMBERS, "parameters", *WORDS[3:]]
 """Columns of a submission, which has a row for each run; those that are words."""
-FEWEST_SEEDS, FEWEST_EPISODES = 5, 100
+FEWEST_SEEDS = 5
 
 
 def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> None:
@@ -39,7 +39,7 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         checks.require(not empty.any(), f"{path}: {name}", "it", "is empty")
     changed = rows["commit"].astype(str).str.contains("+", regex=False)
     checks.require(not changed.any(), f"{path}: commit", rows["commit"].iloc[0], "has changes: commit them")
-    finite = np.isfinite(rows[[*MEASURED, "parameters"]].to_numpy(float)).all()
+    finite = np.isfinite(rows[[*NUMBERS, "parameters"]].to_numpy(float)).all()
     checks.require(bool(finite), path, "a number", "is not finite")
     for place, runs in rows.groupby(RUN[:-1], sort=False):
         where, seeds = f"{path}: {'/'.join(map(str, place))}", runs["seed"]
@@ -47,7 +47,7 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         enough = len(seeds) >= FEWEST_SEEDS and seeds.min() >= experiment.first_seed
         should = f"are not {FEWEST_SEEDS} or more from {experiment.first_seed} on"
         checks.require(bool(enough), f"{where}: seed", [*seeds], should)
-        checks.in_range(f"{where}: episodes", int(runs["episodes"].min()), FEWEST_EPISODES)
+        checks.in_range(f"{where}: episodes", int(runs["episodes"].min()), EPISODES)
 
 
 def leaderboard(submissions: Sequence[pd.DataFrame], delays: Collection[str]) -> str:

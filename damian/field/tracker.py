@@ -30,7 +30,7 @@ _ROUNDING = 1e-3
 
 
 class Tracker:
-    """The server node of a fleet, of which every UAV has reported; ``rows`` are their reports in any order.
+    """The server node of a fleet, once every UAV has sent a report; ``rows`` are their reports in any order.
 
     It begins with the newest report of each UAV, once each has one.
     """

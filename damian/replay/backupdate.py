@@ -186,7 +186,7 @@ class BackupdateStorage(TimeStorage):
     def _recomputed(
         self, steps: TensorDictBase, messages: Tensor | None, n_right: int
     ) -> dict[NestedKey, Tensor]:
-        """The corrected entries of steps [T, B], of which the first ``n_right`` stored ones are right."""
+        """The corrected entries of steps [T, B]; the first ``n_right`` are stored as they should be."""
         begins = steps[self._count].squeeze(-1) == 0
         entries = self.recompute(steps, messages) if self.recompute and messages is not None else {}
         after = self._correct(entries, steps)

@@ -56,7 +56,7 @@ def test_a_submission_without_the_folders_of_its_runs_is_refused(folder, capsys)
     (folder / "crowded/1-7/mine/seed_9/run.json").unlink()
     with pytest.raises(SystemExit):
         main(SUBMIT)
-    assert "seed_9 is no folder of a finished run" in capsys.readouterr().err
+    assert "seed_9 is not the folder of a finished run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
