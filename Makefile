@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | fleet | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-gpu | fleet | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -8,7 +8,7 @@ PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick fleet benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-gpu fleet benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
@@ -70,6 +70,10 @@ package: $(VENV)/package
 
 bench: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py $(ARGS)
+
+# On a machine with a GPU; ARGS="--device cpu --worlds 64" tries it without.
+bench-gpu: $(VENV)/bench
+	$(PY) examples/benchmarks/bench_gpu.py $(ARGS)
 
 # The same beside JaxMARL, in an environment of its own: it asks for other versions than we do.
 JAXMARL := build/jaxmarl-venv

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
@@ -27,6 +28,9 @@ def main(words: Sequence[str] | None = None) -> None:
     # Threads that wait for each other soon sleep: where other programs run, a training whose threads keep
     # spinning takes several times as long. OpenMP reads this when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    # Compiled kernels: torch's own choice is a temporary folder, which the next boot, or job of a cluster, lacks.
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(Path(caches, "torchinductor")))
     name, *words = (sys.argv[1:] if words is None else words) or ["--help"]
     if name in ("-h", "--help"):
         print(usage())

@@ -21,6 +21,7 @@ from damian.learners.recurrent import AgentGRU
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
     "fallback_random": True,  # the draws of torch's generator, as without compiling
+    "cpp.vec_isa_ok": True,  # by the processor's flags, without a trial
 }
 """Options of ``torch.compile`` for networks."""
 FIRST_WEIGHT, LEAST = 8.0, 1e-3

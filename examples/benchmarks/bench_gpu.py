@@ -1,0 +1,159 @@
+"""Check that a GPU computes what the CPU computes, then measure worlds of one device (``make bench-gpu``).
+
+    python examples/benchmarks/bench_gpu.py                               (on a GPU: eight minutes at most)
+    python examples/benchmarks/bench_gpu.py --device cpu --worlds 64 256  (the same at small sizes)
+
+The tables are printed as they come and written to runs/bench_gpu.md. No row begins after ``--minutes``.
+"""
+
+import time
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from bench import BARE, WHOLE, delays, policy_for, scenarios, steps_of, table
+from bench_timing import staggered
+from bench_training import damian
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from torchrl.envs.libs.vmas import VmasEnv
+
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
+from damian.recipes.cli import settings as composed_config
+
+KINDS = {
+    "plain world": ("use case 2", BARE),
+    "whole chain": ("use case 2", WHOLE),
+    "everything": ("everything", WHOLE),
+}
+MODES = {"compiled": {}, "CUDA graphs": {"mode": "reduce-overhead"}}
+STEPS, REPEATS = 20, 3
+
+
+def make(kind: str, worlds: int, device: str) -> DelayedEnv:
+    """One of ``KINDS`` on a device."""
+    scenario, changes = KINDS[kind]
+    return make_env(replace(scenarios()[scenario], **delays()[changes]), worlds, device=torch.device(device))
+
+
+def differences(kind: str, device: str, worlds: int = 64, steps: int = 50) -> tuple[str, ...]:
+    """Share of the numbers that differ from the CPU's, and the largest difference, after the same actions."""
+    ours, theirs = make(kind, worlds, "cpu"), make(kind, worlds, device)
+    ours.set_seed(0), theirs.set_seed(0)
+    rollout = ours.rollout(steps, break_when_any_done=False)
+    actions = iter(rollout["agents", "action"].unbind(1))
+    again = theirs.rollout(
+        steps, lambda td: td.set(("agents", "action"), next(actions).to(device)), break_when_any_done=False
+    )
+    n, n_different, largest = 0, 0, 0.0
+    for key, value in rollout["next"].items(True, True):
+        a, b = value.double(), again["next", key].cpu().double()
+        apart = (a - b).abs().nan_to_num() / (1 + a.abs().nan_to_num(posinf=0))
+        n, n_different, largest = (
+            n + apart.numel(),
+            n_different + int((apart > 1e-4).sum()),
+            max(largest, float(apart.max())),
+        )
+    return kind, f"{n_different / n:.2e}", f"{largest:.1e}"
+
+
+def waits(kind: str, worlds: int) -> str:
+    """Whether a step on the GPU waits for the host, as torch's debug mode tells."""
+    env = make(kind, worlds, "cuda")
+    following = env.rand_action(env.reset())
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        env.step_and_maybe_reset(following)
+    except RuntimeError as error:
+        return str(error).splitlines()[0]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return "never"
+
+
+def per_second(chunk: Callable[[], object], frames: int, device: str) -> str:
+    """World steps a second [millions], the median of ``REPEATS`` calls after two that do not count."""
+    ends = []
+    for _ in range(2 + REPEATS + 1):
+        chunk()
+        if device != "cpu":
+            torch.cuda.synchronize()
+        ends.append(time.perf_counter())
+    spent = sorted(b - a for a, b in pairwise(ends[2:]))
+    return f"{frames / spent[len(spent) // 2] / 1e6:.3f}"
+
+
+def environments(worlds: int, device: str) -> Iterator[tuple[str, Callable[[], EnvBase]]]:
+    """What is measured with so many worlds."""
+    for kind in KINDS:
+        for mode, options in MODES.items():
+            if device != "cpu" or mode == "compiled":
+                yield f"{kind}, {mode}", lambda k=kind, o=options: make(k, worlds, device).compile(**o)
+    for task in ("discovery", "navigation", "simple_spread"):
+        options = {"num_envs": worlds, "n_agents": 3, "device": device, "continuous_actions": True}
+        yield f"VMAS {task}", lambda t=task, o=options: VmasEnv(t, **o)
+
+
+def measured(name: str, make_env: Callable[[], EnvBase], worlds: int, device: str) -> tuple[str, ...]:
+    """A row: steps with random actions, and with a policy in TorchRL's ``Collector``."""
+    env = make_env()
+    following = staggered(env, groups=10)
+    stepped = per_second(lambda: steps_of(env, following, STEPS), worlds * STEPS, device)
+    policy = policy_for(env).to(device)
+    collector = Collector(env, policy, frames_per_batch=worlds * STEPS, total_frames=-1)
+    return name, f"{worlds:,}", stepped, per_second(iter(collector).__next__, worlds * STEPS, device)
+
+
+def trained(worlds: int, device: str) -> tuple[str, ...]:
+    """A row: iterations of ``damian train`` with the words of the README, compiled."""
+    words = ["scenario=delaybench/crowded", "delay.obs=1..7", "aware=timeline", "compile=true"]
+    config = composed_config(*words, f"worlds={worlds}", f"device={device}")
+    frames = worlds * config.update_steps
+    return "a training", f"{worlds:,}", "-", per_second(damian(config).__next__, frames, device)
+
+
+def measure(options: Namespace) -> Iterator[str]:
+    """The tables, one after the other."""
+    device, until = options.device, time.monotonic() + 60 * options.minutes
+    name = torch.cuda.get_device_name() if device != "cpu" else f"CPU, {torch.get_num_threads()} threads"
+    yield f"# {name}, torch {torch.__version__}\n"
+    header = ("environment", "share of numbers apart by 1e-4", "largest difference")
+    yield table("The same as on the CPU?", header, [differences(kind, device) for kind in KINDS])
+    if device != "cpu":
+        rows = [(kind, waits(kind, options.worlds[0])) for kind in KINDS]
+        yield table("Does a step wait for the host?", ("environment", "waits"), rows)
+    rows = []
+    for worlds in options.worlds:
+        jobs = {
+            name: partial(measured, name, make_one, worlds, device)
+            for name, make_one in environments(worlds, device)
+        }
+        jobs["a training"] = partial(trained, worlds, device)
+        for name, job in jobs.items():
+            if time.monotonic() > until:
+                rows.append((name, f"{worlds:,}", "no time left", ""))
+                continue
+            try:
+                rows.append(job())
+            except RuntimeError as error:  # of memory, or what CUDA graphs cannot do
+                rows.append((name, f"{worlds:,}", str(error).splitlines()[0][:80], ""))
+            print(*rows[-1], sep="  ", flush=True)
+    header = ("environment", "worlds", "random actions [million world steps/s]", "a policy in a collector")
+    yield table("World steps a second", header, rows)
+
+
+if __name__ == "__main__":
+    parser = ArgumentParser(description="Compare a GPU with the CPU, and measure it.")
+    parser.add_argument("--device", default="cuda", help="cuda, or cpu for a trial")
+    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384, 65536, 262144])
+    parser.add_argument("--minutes", type=float, default=8.0, help="no row begins later")
+    Path("runs").mkdir(exist_ok=True)
+    with Path("runs/bench_gpu.md").open("w", encoding="utf-8") as report:
+        for part in measure(parser.parse_args()):
+            print(part, flush=True)
+            report.write(part + "\n")
