@@ -1,5 +1,8 @@
 """What depends on the device."""
 
+import math
+from pathlib import Path
+
 import torch
 
 
@@ -9,3 +12,12 @@ def data_dependent(device: torch.device) -> bool:
     Any device but a CPU would first have to finish all work to tell how many: there a mask chooses.
     """
     return device.type == "cpu"
+
+
+def free_memory(device: torch.device) -> float:
+    """Free memory of a device [GiB]; infinite where the system does not tell."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0] / 2**30
+    table = Path("/proc/meminfo")  # of Linux: the memory that is free, or would be if it were asked for [KiB]
+    lines = table.read_text(encoding="ascii").splitlines() if table.exists() else []
+    return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith("MemAvailable:")), math.inf)

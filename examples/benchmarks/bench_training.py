@@ -38,6 +38,8 @@ UNDELAYED, AWARE = "scenario=paper/usecase2", "scenario=paper/usecase2 delay=pap
 COMPILED, SHARED = "compile=true", "compile=true model.shared_value=true"
 METHODS = (UNDELAYED, f"{UNDELAYED} {COMPILED}", f"{UNDELAYED} {SHARED}", AWARE, f"{AWARE} {SHARED}")
 """Overrides of ``damian train``, separated by spaces."""
+PRODUCTS = "the matrix products of the first one's update alone"
+"""What no update can be faster than, on this processor and with these networks."""
 HEADER = ("training", "frames/s", "collecting [ms]", "back-updating [ms]", "optimising [ms]")
 HEADER += ("back-updating's share", "times TorchRL and VMAS")
 WARM_UP = 2  # iterations that do not count: the first compiles; back-updating has a full buffer after two
@@ -56,6 +58,7 @@ def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
     found = []
     for width, hidden in WIDTHS.items():
         methods = {words: damian(method_config(words, hidden, worlds, steps)) for words in METHODS}
+        methods[PRODUCTS] = products(method_config(UNDELAYED, hidden, worlds, steps))
         if importlib.util.find_spec("vmas"):
             config = method_config(UNDELAYED, hidden, worlds, steps)
             methods |= {name: rival(config, together) for name, together in RIVALS.items()}
@@ -105,6 +108,27 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
         add_advantages(batch, learner.critic, learner.config)
         learner.optimize(batch)
         yield Seconds(collected - begin, backupdated - collected, time.perf_counter() - backupdated)
+
+
+def products(config: TrainConfig) -> Iterator[Seconds]:
+    """Multiply what the layers of an update multiply, forwards and backwards, and nothing else."""
+    env, learner = learning_env(config), cast(MappoConfig, config.learner)
+    networks = cast(Mappo, make_learner(config, env, replay_buffer(config, env)))
+    n = config.worlds * config.update_steps * config.agents // learner.minibatches
+    layers = [
+        m.weight.data
+        for net in (networks.actor, networks.critic)
+        for m in net.modules()
+        if isinstance(m, nn.Linear)
+    ]
+    inputs = [torch.rand(n, layer.shape[1]) for layer in layers]
+    gradients = [torch.rand(n, layer.shape[0]) for layer in layers]
+    while True:
+        begin = time.perf_counter()
+        for _ in range(learner.epochs * learner.minibatches):
+            for layer, entered, gradient in zip(layers, inputs, gradients, strict=True):
+                entered @ layer.T, gradient @ layer, gradient.T @ entered
+        yield Seconds(0.0, 0.0, time.perf_counter() - begin)
 
 
 def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:

@@ -12,6 +12,7 @@ from torchrl.envs import TransformedEnv
 
 from damian import keys
 from damian.common import checks
+from damian.common.devices import free_memory
 from damian.common.errors import naming_errors
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
@@ -28,6 +29,9 @@ from damian.server.server import Server
 
 from ..config import TrainConfig
 from .settings import backupdates, learning_setup, measures_hindsight
+
+BASE_MEMORY, COPIES = 0.6, 2.6
+"""Memory of the program [GiB], and how often a training holds a step of its batch and of its buffer at once."""
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
@@ -94,6 +98,17 @@ def corrected_storage(
         hindsight_key=keys.HINDSIGHT if hindsight else None,
         device=config.device,
     )
+
+
+def require_memory(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> float:
+    """Memory of the training [GiB], which its device must have free (docs/scaling.md)."""
+    step = sum(entry.nbytes for entry in env.fake_tensordict().values(True, True))
+    stored = 0 if buffer is None else buffer.storage.max_size / config.worlds
+    needed = BASE_MEMORY + COPIES * step * (config.update_steps + stored) / 2**30
+    free = free_memory(torch.device(config.device))
+    problem = f"these worlds need about {needed:.1f} GiB of memory, {free:.1f} are free: take fewer"
+    checks.require(needed < free, "worlds", config.worlds, problem)
+    return needed
 
 
 def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:
