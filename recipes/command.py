@@ -28,7 +28,7 @@ def main(words: Sequence[str] | None = None) -> None:
     # Threads that wait for each other soon sleep: where other programs run, a training whose threads keep
     # spinning takes several times as long. OpenMP reads this when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    # Compiled kernels: torch's own choice is a temporary folder, which the next boot, or job of a cluster, lacks.
+    # Compiled kernels: torch's own choice is a temporary folder, which the next boot, or job, lacks.
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(Path(caches, "torchinductor")))
     name, *words = (sys.argv[1:] if words is None else words) or ["--help"]

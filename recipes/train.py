@@ -50,6 +50,7 @@ from .shared.learning import (
     own_code,
     read_by,
     replay_buffer,
+    require_memory,
     ticks,
 )
 from .shared.runs import run_folder, save_config, start, stored_values
@@ -61,6 +62,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     check_learning(config)
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
+    require_memory(config, env, buffer)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compiles)
     hindsight = hindsight_returns(config, env)

@@ -44,6 +44,6 @@ _INDUCTOR: dict[str, Any] = {
     "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
     # The innermost loops run over a few UAVs: vectors of 16 lanes would be mostly idle, and slower.
     "cpp.simdlen": 1,
-    # Whether the processor has vectors is read from its flags; a trial would compile, load and import for each.
+    # Whether the processor has vectors is read from its flags; a trial would take seconds for each.
     "cpp.vec_isa_ok": True,
 }

@@ -31,7 +31,7 @@ from ..config import TrainConfig
 from .settings import backupdates, learning_setup, measures_hindsight
 
 BASE_MEMORY, COPIES = 0.6, 2.6
-"""Memory of the program [GiB], and how often a training holds a step of its batch and of its buffer at once."""
+"""Memory of the program [GiB], and how often it holds each step of the batch and of the buffer at once."""
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
@@ -100,15 +100,14 @@ def corrected_storage(
     )
 
 
-def require_memory(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> float:
-    """Memory of the training [GiB], which its device must have free (docs/scaling.md)."""
+def require_memory(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> None:
+    """Refuse a training that needs more memory than its device has free (docs/scaling.md)."""
     step = sum(entry.nbytes for entry in env.fake_tensordict().values(True, True))
     stored = 0 if buffer is None else buffer.storage.max_size / config.worlds
     needed = BASE_MEMORY + COPIES * step * (config.update_steps + stored) / 2**30
     free = free_memory(torch.device(config.device))
     problem = f"these worlds need about {needed:.1f} GiB of memory, {free:.1f} are free: take fewer"
     checks.require(needed < free, "worlds", config.worlds, problem)
-    return needed
 
 
 def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:

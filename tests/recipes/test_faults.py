@@ -14,6 +14,7 @@ from stopped_runs import TINY, at_each_update, ended, files, forked, killed_afte
 
 from damian.learners.mappo import Mappo
 from damian.recipes import train
+from damian.recipes.shared import learning
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import locked
@@ -64,6 +65,13 @@ def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
     after = contents(copied)
     changed = {name for name in after if after[name] != before.get(name)}
     assert changed <= {"metrics.csv", "run.json", "config.yaml"}
+
+
+def test_worlds_that_do_not_fit_into_the_memory_are_refused(run, capsys, monkeypatch):
+    monkeypatch.setattr(learning, "free_memory", lambda device: 0.5)
+    should = "these worlds need about 0.6 GiB of memory, 0.5 are free: take fewer"
+    check_refused(lambda: run(*TINY, "worlds=4"), f"worlds: 4 {should}", capsys)
+    assert not Path("run").exists() or not files(Path("run"))
 
 
 def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatch):
