@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
+from pandas.api.types import is_numeric_dtype
 
 from damian.common.plotting import STYLE
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method
@@ -121,6 +122,43 @@ def plot_profiles(comparison: Comparison, path: Path) -> None:
     save(path, ["all"] if len(scores) > 1 else [], panel, (4.0, 3.0))
 
 
+def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
+    """Draw the returns of a sweep (lines of ``means``) over one setting, in a panel for each value of others.
+
+    The setting along the axis has most values, and numbers if any has. The trained policy stands with its
+    95 % intervals before those of the other panels, in grey. There are 40 panels at most.
+    """
+    along = max(
+        groups, key=lambda key: (is_numeric_dtype(lines[key]), lines[key].nunique()), default="policy"
+    )
+    names = [] if is_numeric_dtype(lines[along]) else [*lines[along].unique()]
+    places = lines[along].map(names.index) if names else lines[along]
+    titles = ["\n".join(f"{k}={line[k]}" for k in groups if k != along) for line in lines.to_dict("records")]
+    found = lines.assign(x=places, title=titles).sort_values("x").groupby(["title", "policy"], sort=False)
+    curves = {key: each[["x", *("return" + end for end in ENDS)]].to_numpy().T for key, each in found}
+
+    def panel(axis: Axes, title: str) -> None:
+        for (place, policy), (x, value, low, high) in curves.items():
+            style: dict[str, Any] = {"color": METHOD_COLOURS[0], "marker": "o", "markersize": 4}
+            if policy == TRAINED and place == title:
+                axis.errorbar(x, value, np.nan_to_num([value - low, high - value]), label=policy, **style)
+            elif policy == TRAINED:
+                axis.plot(x, value, color="0.85", zorder=0, label="other panels")
+            elif place == title and policy in (SCRIPT, RANDOM):
+                style = _LEVEL | {"label": policy, "linestyle": "-." if policy == SCRIPT else ":"}
+                axis.plot(x, value, **style)
+        first: Any = axis.get_subplotspec()
+        axis.set(title=title, xlabel=along, ylabel="return" if first.is_first_col() else "")
+        if names:
+            axis.set_xticks(range(len(names)), [str(name)[:20] for name in names])
+            axis.margins(x=0.2)
+        elif 0 < 100 * places.min() <= places.max():
+            axis.set_xscale("log")
+
+    shown = list(dict.fromkeys(titles))[:40] if groups else []
+    save(path, shown, panel, (2.4, 2.2), width=4, sharey=True)
+
+
 def look(methods: Mapping[str, Method], method: str) -> dict[str, Any]:
     """Style of a method by its place among all; dotted lines are of methods that train nothing."""
     again, colour = divmod([*methods].index(method), len(METHOD_COLOURS))
@@ -139,6 +177,7 @@ def save(
     draw: Callable[[Axes, Panel], None],
     size: tuple[float, float],
     width: int = 1,
+    sharey: bool = False,
 ) -> None:
     """Draw panels of this size [inches] in rows of ``width``, with one legend to the right of them."""
     if not panels:
@@ -148,7 +187,7 @@ def save(
     height = math.ceil(len(panels) / width)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(size[0] * width + 1.2, size[1] * height), layout="constrained")
-        axes = figure.subplots(height, width, squeeze=False).flat
+        axes = figure.subplots(height, width, squeeze=False, sharey=sharey).flat
         drawn: dict[str, Any] = {}
         for axis, panel in zip(axes, panels, strict=False):
             draw(axis, panel)

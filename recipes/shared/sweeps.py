@@ -15,13 +15,14 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import markdown_table, write_csv
 from damian.common.text_files import read_text
+from damian.compare.figures import plot_sweep
 from damian.compare.paired import as_table, means
 from damian.runs.run_folder import FAILED, RESULTS, check_no_links, read_results
 from damian.runs.run_record import read_record
 
 from ..cli import short
 from ..known import key_of
-from .comparison_runs import MARKDOWN, ROWS
+from .comparison_runs import FIGURE, MARKDOWN, ROWS
 from .runs import JOB, OVERRIDES, SEED
 
 
@@ -62,7 +63,7 @@ def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
 
 
 def report(folder: Path) -> str:
-    """Write rows and table of a sweep into its folder; returns the table."""
+    """Write rows, table and figure of a sweep into its folder; returns the table."""
     failed = [file.parent for file in sorted(folder.rglob(FAILED))]
     for each in (folder, *failed):
         check_no_links(each, "folders")
@@ -72,6 +73,7 @@ def report(folder: Path) -> str:
         groups, finished = sweep_rows(folder)
         lines = means(finished, groups)
         parts.append(as_table(lines, groups))
+        plot_sweep(lines, groups, folder / FIGURE)
         rows = pd.concat([finished, rows], ignore_index=True) if failed else finished
     if failed:
         parts.append(markdown_table(["failed", "why"], errors, left=2))

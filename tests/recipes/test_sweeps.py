@@ -84,6 +84,7 @@ def test_the_same_command_goes_on_with_what_is_missing_after_a_kill(sweep, capsy
 def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, capsys):
     assert sweep("aware=none,backupdate", "delay.obs=1..3", "seed=0,1,2", "hydra.sweep.dir=sweep") == 0
     table = capsys.readouterr().out.rpartition("results of the sweep")[2]
+    assert Path("sweep/figure.png").stat().st_size
     rows = damian.results("sweep")
     trained = rows[rows["policy"] == "trained"].pivot(index="seed", columns="aware", values="return")
     mean = (trained["backupdate"] - trained["none"]).mean()
