@@ -22,6 +22,7 @@ from damian.field.fitting import (
     check_clocks,
     fit,
     law_summary,
+    plot_fit,
     read_log,
     steps_of,
     summary,
@@ -78,7 +79,7 @@ def check_motion(config: AdviseConfig) -> None:
 
 
 def fit_delays(config: AdviseConfig, folder: Path) -> None:
-    """Write the delays of a log of reports as a trace, and print which law fits them best."""
+    """Write the delays of a log of reports as a trace, and tell and draw which law fits them best."""
     log = Path(str(config.fit))
     check_clocks(fitted := fit(read_log(log)), log)
     save_config(config, folder)
@@ -88,6 +89,7 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
     laws = fit_laws(steps_of(fitted, config.clock.dt))
     print(law_summary(*laws, config.clock.dt))
+    plot_fit(fitted, laws[0], config.clock.dt, folder / "fit.png")
 
 
 @cli.one_line_errors("advise")

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from damian.common.errors import InputError
+from damian.common.plotting import COLOURS
 from damian.common.text_files import named
 from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers, LawFit
 from damian.delays.laws import LOST, in_steps
@@ -112,3 +114,33 @@ def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
     if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
         text += "\na bad fit: take the trace"
     return text
+
+
+def plot_fit(messages: pd.DataFrame, law: LawFit, dt: float, path: Path) -> None:
+    """Draw the share of the messages that are later than a delay, or lost: survival curves.
+
+    The law has a point at whole steps of ``dt`` seconds, to which a simulation rounds delays up.
+    """
+    from damian.compare.figures import save  # noqa: PLC0415 (slow to import, needed once)
+
+    delays = np.sort(messages.delay.dropna())
+    recorded = 1 - np.arange(len(delays) + 1) / len(messages)
+    later, lost = 1 - law.chances[:-1].cumsum(), law.chances[-1]
+    shown = later > max(lost, 0.1 / len(messages))  # rounding leaves a rest where nothing is later
+
+    def panel(axis: Any, _: str) -> None:
+        axis.step([0, *delays], recorded, where="post", color=COLOURS[0], label="recorded")
+        name = law.written["law"] if isinstance(law.written, dict) else "constant"
+        axis.plot(
+            np.arange(len(later))[shown] * dt,
+            later[shown],
+            "o",
+            ms=4,
+            color=COLOURS[1],
+            label=f"best law: {name}",
+        )
+        axis.set(xlabel="delay [s]", ylabel="share of messages later, or lost", yscale="log")
+        if lost:
+            axis.axhline(lost, color="0.5", linestyle=":", label="lost")
+
+    save(path, ["fit"], panel, (4.2, 3.0))
