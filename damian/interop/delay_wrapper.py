@@ -9,7 +9,8 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Space, flatten, flatten_space
-from gymnasium.vector.utils import batch_space, create_empty_array, iterate
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from damian.common import checks, counter_rng
@@ -89,6 +90,82 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         return told[""], rewards[""], terminated, truncated, info | more[""]
 
 
+class DelayVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+    """Delays the B worlds of a Gymnasium vector environment as one batch, each as ``DelayWrapper`` does.
+
+    Its arguments are those of ``DelayWrapper``; the parts of an observation have one law. Each world draws
+    its own delays. New episodes begin as those of ``env`` do, in the same step or in the next one.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.vector.VectorEnv[Any, Any, Any],
+        observation: Any = 0,
+        action: Any = 0,
+        reward: Any = 0,
+        *,
+        loss: Any = 0.0,
+        history: int = 0,
+        timeline: int = 0,
+        default: Any = None,
+        dt: float = 1.0,
+    ) -> None:
+        super().__init__(env)
+        mode, self._worlds = env.metadata.get("autoreset_mode"), [str(i) for i in range(env.num_envs)]
+        self._at_once = mode == AutoresetMode.SAME_STEP
+        known = self._at_once or mode == AutoresetMode.NEXT_STEP
+        checks.require(known, "env", mode, "is no autoreset_mode in which episodes begin by themselves")
+        told: ByName = {"observation": observation, "action": action, "reward": reward, "loss": loss}
+        told |= {"history": history, "timeline": timeline, "dt": dt}
+        told["default"] = {} if default is None else dict.fromkeys(self._worlds, default)
+        space, acting = env.single_observation_space, env.single_action_space
+        self._delays = Delays(dict.fromkeys(self._worlds, space), dict.fromkeys(self._worlds, acting), told)
+        self.single_observation_space = self._delays.space("0", space)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._over: list[str] = []
+        told, more = self._delays.reset(self._by_world(self.env.observation_space, observations), seed)
+        return self._batch(self.single_observation_space, told), self._with(infos, more)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        chosen, begin = self._by_world(self.action_space, actions), self._over
+        going = {world: action for world, action in chosen.items() if world not in begin}
+        executed = self._batch(self.env.single_action_space, chosen | self._delays.actions.send(going))
+        observations, rewards, terminated, truncated, infos = self.env.step(executed)
+        now = self._by_world(self.env.observation_space, observations)
+        over = [self._worlds[i] for i in np.flatnonzero(terminated | truncated)]
+        final = {world: infos["final_obs"][int(world)] for world in over if self._at_once}
+        paid = dict(zip(chosen, rewards.tolist(), strict=True))
+        seen, earned = {w: (now | final)[w] for w in going}, {w: paid[w] for w in going}
+        told, received, more = self._delays.step(seen, earned, over)
+        if self._at_once:
+            last = {w: {"final_obs": told[w], "final_info": more[w]} for w in over}
+            begin, infos = over, self._with(infos, last)
+        else:
+            self._over = over
+        first, at_first = self._delays.begin({w: now[w] for w in begin}, begin) if begin else ({}, {})
+        rewards = np.array([*(paid | received).values()], rewards.dtype)
+        observations = self._batch(self.single_observation_space, told | first)
+        return observations, rewards, terminated, truncated, self._with(infos, more | at_first)
+
+    def _by_world(self, space: Space[Any], things: Any) -> ByName:
+        """A batch as a dict by world; environments may write over what they return."""
+        return dict(zip(self._worlds, iterate(space, copy.deepcopy(things)), strict=True))
+
+    def _batch(self, space: Space[Any], things: ByName) -> Any:
+        """Things of all worlds in one batch."""
+        empty = create_empty_array(space, len(self._worlds))
+        return concatenate(space, [things[world] for world in self._worlds], empty)
+
+    def _with(self, infos: ByName, more: ByName) -> ByName:
+        """Infos of the batch with those of some worlds."""
+        for world, info in more.items():
+            infos = self._add_info(infos, info, int(world))
+        return infos
+
+
 class Delays:
     """What some agents observe, do and earn, late: the wrappers pass it through here in each step.
 
@@ -119,9 +196,15 @@ class Delays:
 
     def reset(self, observations: ByName, seed: int | None) -> tuple[ByName, ByName]:
         """What agents are told first, and their infos; a seed decides all later delays."""
-        self._observations.reset(observations, seed)
-        self.actions.reset(self._default, seed)
-        self._rewards.reset(dict.fromkeys(self._default, 0.0), seed)
+        for link in (self._observations, self.actions, self._rewards):
+            link.reset(seed)
+        return self.begin(observations, self._default)
+
+    def begin(self, observations: ByName, agents: Collection[str]) -> tuple[ByName, ByName]:
+        """The same where the episodes of some agents begin."""
+        self._observations.begin(observations)
+        self.actions.begin({agent: self._default[agent] for agent in agents})
+        self._rewards.begin(dict.fromkeys(agents, 0.0))
         return self._told(observations)
 
     def step(self, observations: ByName, rewards: ByName, ended: list[str]) -> tuple[ByName, ByName, ByName]:
@@ -197,8 +280,8 @@ class _Link:
         self._sent: dict[str, dict[int, tuple[Any, float]]] = {sender: {} for sender in senders}
         """What was sent, and when it arrives, by sender and time."""
 
-    def reset(self, firsts: ByName, seed: int | None) -> None:
-        """Forget all messages, and begin episodes; a seed decides all later delays."""
+    def reset(self, seed: int | None) -> None:
+        """Forget all messages; a seed decides all later delays."""
         self._sent = {sender: {} for sender in self.age}
         if self._memory is None or seed is not None:
             entropy = np.random.SeedSequence(seed).generate_state(1, np.uint64).view(np.int64)
@@ -206,9 +289,8 @@ class _Link:
             streams = streams_for(self.sampler, streams, len(streams))
             memory = self._line.init_memory([], streams)
             self._memory, self._now = memory | {"agents": torch.arange(len(streams))}, 0
-        self._begin(firsts)
 
-    def _begin(self, firsts: ByName) -> None:
+    def begin(self, firsts: ByName) -> None:
         """Begin the episodes of some senders, whose ``firsts`` are known at once."""
         mask = torch.tensor([sender in firsts for sender in self.age])
         self._memory, _ = self._line.reset(cast(Memory, self._memory), [], mask)
@@ -235,7 +317,7 @@ class _Link:
             recent, held = now - self._kept, now - self.age[sender]
             self._sent[sender] = {t: each for t, each in sent.items() if t >= recent or t == held}
         if new := {s: each for s, each in things.items() if self._now - self.age[s] not in self._sent[s]}:
-            self._begin(new)
+            self.begin(new)
         return {sender: self._sent[sender][self._now - self.age[sender]][0] for sender in things}
 
     def recent(self, sender: str) -> dict[int, tuple[Any, float]]:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sequence, Text, Tuple
 from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
 from torchrl.envs import Compose, GymEnv, TransformedEnv
@@ -24,7 +25,7 @@ from damian import (
 )
 from damian.common.errors import InputError
 from damian.delays.samplers import MessageContext
-from damian.interop import DelayWrapper
+from damian.interop import DelayVectorWrapper, DelayWrapper
 from damian.interop.pettingzoo import DelayParallelWrapper
 
 
@@ -144,9 +145,13 @@ def test_a_space_without_zero_asks_for_a_default_only_where_an_action_is_late():
 
 
 @pytest.mark.filterwarnings("ignore:.*WARN")  # of the wrapped environments themselves
-@pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
-def test_gymnasiums_checker_finds_nothing(name):
-    check_env(DelayWrapper(gymnasium.make(name).unwrapped, Uniform(0, 3), 2), skip_render_check=True)
+@pytest.mark.parametrize(
+    ("name", "wide"), [("Pendulum-v1", {"history": 3, "timeline": 4}), ("CartPole-v1", {})], ids=str
+)
+def test_gymnasiums_checker_finds_nothing(name, wide):
+    check_env(
+        DelayWrapper(gymnasium.make(name).unwrapped, Uniform(0, 3), 2, 1, **wide), skip_render_check=True
+    )
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
@@ -249,43 +254,62 @@ def test_the_losses_of_parts_are_their_own():
         assert info["age"] == {"place": 0, "word": t}
 
 
-def test_environments_in_a_vector_are_those_alone():
-    late = partial(
-        DelayWrapper,
-        observation=Uniform(1, 4),
-        action=1,
-        reward=Uniform(0, 3),
-        loss=0.2,
-        history=2,
-        timeline=3,
-    )
-    options = {"max_episode_steps": 8}
-    vector = gymnasium.make_vec("CartPole-v1", 3, vectorization_mode="sync", wrappers=[late], **options)
-    singles = [late(gymnasium.make("CartPole-v1", **options)) for _ in range(3)]
-    observations, _ = vector.reset(seed=4)
-    assert vector.observation_space.contains(observations)
+DRAWN = {"observation": Uniform(1, 4), "action": 1, "reward": Uniform(0, 3), "loss": 0.2}
+BY_TIME = {"observation": LOSSY, "action": 2, "reward": by_time}  # without chance
+
+
+@pytest.mark.parametrize(
+    ("wraps_each", "mode"), [(True, "NextStep"), (False, "NextStep"), (False, "SameStep")], ids=str
+)
+def test_environments_in_a_vector_are_those_alone(wraps_each, mode):
+    late = {**(DRAWN if wraps_each else BY_TIME), "history": 2, "timeline": 3}
+
+    def made(delayed: bool) -> gymnasium.Env:
+        env = gymnasium.make("CartPole-v1", max_episode_steps=8)
+        return DelayWrapper(env, **late) if delayed else env
+
+    mode = AutoresetMode(mode)
+    vector = SyncVectorEnv([partial(made, wraps_each)] * 3, autoreset_mode=mode)
+    vector = vector if wraps_each else DelayVectorWrapper(vector, **late)
+    singles = [made(True) for _ in range(3)]
+    observations, infos = vector.reset(seed=4)
     firsts = [env.reset(seed=4 + i)[0] for i, env in enumerate(singles)]
     vector.action_space.seed(0)
     done = [False] * 3
     for _ in range(30):
+        assert vector.observation_space.contains(observations)
         for i, first in enumerate(firsts):
             assert data_equivalence({key: each[i] for key, each in observations.items()}, first)
         actions = vector.action_space.sample()
-        observations, rewards, _, _, infos = vector.step(actions)
+        observations, rewards, *_, infos = vector.step(actions)
         for i, env in enumerate(singles):
-            if done[i]:  # a vector begins a new episode in the step after the last one
+            if done[i]:  # the new episode begins in the step after the last one
                 (firsts[i], info), reward, done[i] = env.reset(), 0.0, False
             else:
                 firsts[i], reward, terminated, truncated, info = env.step(actions[i])
                 done[i] = terminated or truncated
+                at_end = infos
+                if done[i] and mode == AutoresetMode.SAME_STEP:
+                    assert data_equivalence(infos["final_obs"][i], firsts[i])
+                    at_end, done[i] = infos["final_info"], False
+                    assert at_end["age"][i] == info["age"]
+                    firsts[i], first_info = env.reset()
+                    info |= first_info
+                assert at_end["received"][i] == info["received"]
             assert rewards[i] == reward
             assert infos["age"][i] == info["age"]
 
 
-@pytest.mark.filterwarnings("ignore:.*WARN")
-def test_gymnasiums_checker_finds_nothing_in_wide_observations():
-    env = DelayWrapper(gymnasium.make("Pendulum-v1").unwrapped, Uniform(0, 3), 2, 1, history=3, timeline=4)
-    check_env(env, skip_render_check=True)
+def test_the_worlds_of_a_vector_draw_apart_and_the_seed_decides():
+    env, found = DelayVectorWrapper(gymnasium.make_vec("CartPole-v1", 2), Uniform(0, 4)), []
+    for seed in (0, 1, 0):
+        env.reset(seed=seed)
+        found.append([env.step([0, 1])[-1]["age"].tolist() for _ in range(7)])
+    assert found[0] == found[2] != found[1]
+    assert len({*map(tuple, np.transpose(found[0]))}) == 2
+    by_hand = SyncVectorEnv([partial(gymnasium.make, "CartPole-v1")], autoreset_mode=AutoresetMode.DISABLED)
+    with pytest.raises(InputError, match=r"env: .*DISABLED is no autoreset_mode in which"):
+        DelayVectorWrapper(by_hand, 3)
 
 
 def test_what_a_user_can_get_wrong_is_said_in_one_line():
