@@ -26,12 +26,7 @@ class ScenarioDelays:
         self.links = link_sampler(links.delay, links.loss, dt, "links.delay")
         """Of what the UAVs receive from the server (updown), or from each other (matrix)."""
         checks.require(not self.rew.loses, "delay.rew", delay.rew, LOSES)
-        laws = {
-            "delay.obs": law,
-            "delay.act": self.act,
-            "delay.rew": self.rew,
-            "links.delay": self.links,
-        }
+        laws = {"delay.obs": law, "delay.act": self.act, "delay.rew": self.rew, "links.delay": self.links}
         for key, sampler in laws.items():
             told_receiver = key == "links.delay" and links.kind == "matrix"
             known = ["position", *["receiver_position"] * told_receiver]

@@ -119,10 +119,7 @@ class Mappo:
 
 
 def mappo_losses(
-    entries: dict[NestedKey, Tensor],
-    actor: ProbabilisticActor,
-    critic: TensorDictModule,
-    config: MappoConfig,
+    entries: dict[NestedKey, Tensor], actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig
 ) -> tuple[Tensor, Tensor]:
     """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
 

@@ -450,14 +450,7 @@ def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, _Ring, Tensor]:
 
 
 @torch.library.custom_op("damian::begin_belief", mutates_args=["ring"])
-def _begin(
-    tables: _Tables,
-    ring: _Ring,
-    slot: Tensor,
-    first: Tensor,
-    place: Tensor,
-    mask: Tensor,
-) -> None:
+def _begin(tables: _Tables, ring: _Ring, slot: Tensor, first: Tensor, place: Tensor, mask: Tensor) -> None:
     grid, window = SourceGrid._make(tables), Window._make([*ring, slot])
     (world,) = _chosen(mask)
     if not len(world):

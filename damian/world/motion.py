@@ -83,12 +83,7 @@ def air_length(way: Tensor, wind: Tensor, airspeed: Tensor, least: float) -> tup
 
 
 def poses(
-    way: Tensor,
-    level: Tensor,
-    elapsed: Tensor,
-    vertical: Tensor,
-    cruise: Tensor,
-    degree: int,
+    way: Tensor, level: Tensor, elapsed: Tensor, vertical: Tensor, cruise: Tensor, degree: int
 ) -> tuple[Tensor, Tensor]:
     """Positions [*, 3] m of UAVs ``elapsed`` seconds after takeoff, and how much of the cruise is flown [*].
 
