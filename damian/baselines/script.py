@@ -72,7 +72,7 @@ class Seeker:
         scenario, simulation, server = worlds.scenario, worlds.simulation, worlds.server
         source = scenario.source
         self.unpack, self.region_of, self.counted = server.messages, server.region_of, server.counted
-        self.grid = server.grid
+        self.grid, self.level = server.grid, server.level
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
@@ -192,14 +192,14 @@ class Searcher(Seeker):
         """
         known = self.unpack(message)
         own = known if own_message is None else self.unpack(own_message)
-        region = self.region_of(known)
+        region, level = self.region_of(known), self.level(known)
         belief = belief.unsqueeze(1) if own_belief is None else own_belief
         assert self.grid is not None
-        place = places(self.grid, region).unsqueeze(1).expand(belief.shape[:3])
+        place = places(self.grid, region, level).unsqueeze(1).expand(belief.shape[:3])
         ground = self.points[region]
         chance = any_of(detection_chance(self.grid, belief, place)).expand(-1, known.time.shape[1], -1)
         here = own.trail[..., :1] % self.points.shape[1]
-        rows = report_rows(self.grid, own).movedim(-1, -2)
+        rows = report_rows(self.grid, own, level).movedim(-1, -2)
         each = belief.expand(*rows.shape, -1)
         stays = any_of(chance_of_staying(self.grid, each, rows.unsqueeze(-1)))
         chance = chance.scatter(-1, here, stays).masked_fill(self.taken(known), 0.0)

@@ -90,8 +90,8 @@ class ScenarioConfig(WorldConfig):
         self.refuse(observation.own and links == "updown", "observation.own", problem)
         problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
         self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
-        drawn = any(key.startswith("source.") for key in self.randomise)
-        problem = "does not go with randomise of the source: the filter knows its settings"
+        drawn = {"source.miss", "source.false_alarm"} & {*self.randomise}
+        problem = "does not go with randomise of source.miss or source.false_alarm, which the filter knows"
         self.refuse(observation.belief and drawn, "observation.belief", problem)
         per_action = "belief_gain" in observation.belief
         problem = "needs discrete actions: it has a value for each of them"

@@ -146,12 +146,16 @@ class Belief(WorldTransform):
         self.step_keys = reads
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        n_beliefs, n_agents = self.rows.numel() * len(self.grid.first), tensordict[keys.MESSAGE].shape[-2]
+        n_beliefs, n_agents = (
+            self.rows.numel() * self.grid.first.shape[-1],
+            tensordict[keys.MESSAGE].shape[-2],
+        )
         return empty_window(self.grid, self.longest, n_beliefs, n_agents, self.own)._asdict()
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         messages = self.server.messages(self.to_rows(entries[keys.MESSAGE]))
-        rows, place = report_rows(self.grid, messages), places(self.grid, self.server.region_of(messages))
+        region, level = self.server.region_of(messages), self.server.level(messages)
+        rows, place = report_rows(self.grid, messages, level), places(self.grid, region, level)
         beliefs = begin_beliefs(
             self.grid, Window(**memory), rows.flatten(0, 1), place.flatten(), self._of_each(mask)
         )
@@ -160,21 +164,21 @@ class Belief(WorldTransform):
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         rows = {key: self.to_rows(entries[key]) for key in self.in_keys}
         messages = self.server.messages(rows[keys.MESSAGE])
-        report = report_rows(self.grid, messages, rows[keys.MESSAGE_SENT])
-        region = self.server.region_of(messages)
+        region, level = self.server.region_of(messages), self.server.level(messages)
+        report = report_rows(self.grid, messages, level, rows[keys.MESSAGE_SENT])
         delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(messages.motions)
         every = torch.ones_like(region, dtype=torch.bool)
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        told = report.flatten(0, 1), self._of_each(delay), places(self.grid, region).flatten()
+        told = report.flatten(0, 1), self._of_each(delay), places(self.grid, region, level).flatten()
         window, beliefs = advance_beliefs(self.grid, Window(**memory), *told, self._of_each(stepped))
         return window._asdict(), self._written(beliefs)
 
     def _of_each(self, values: Tensor) -> Tensor:
         """Values of worlds [B, ...] for the belief about each source, [B K, ...]."""
-        return values.repeat_interleave(len(self.grid.first), 0)
+        return values.repeat_interleave(self.grid.first.shape[-1], 0)
 
     def _written(self, beliefs: Beliefs) -> Entries:
-        server, own = (each.unflatten(0, (-1, len(self.grid.first))) for each in beliefs)
+        server, own = (each.unflatten(0, (-1, self.grid.first.shape[-1])) for each in beliefs)
         pairs = zip(self.out_keys, (server, own.transpose(1, 2)), strict=False)  # own ones if they are wanted
         return {key: self.from_rows(belief.contiguous()) for key, belief in pairs}
 
@@ -186,7 +190,7 @@ class Belief(WorldTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         worlds, n_agents = observation_spec[keys.MESSAGE].shape[:-2], observation_spec[keys.MESSAGE].shape[-2]
-        cells = len(self.grid.first), self.grid.prior.shape[-1]
+        cells = self.grid.first.shape[-1], self.grid.prior.shape[-1]
         for key, shape in ((keys.BELIEF, worlds), (keys.OWN_BELIEF, (*worlds, n_agents))):
             if key in self.out_keys:
                 size = torch.Size((*shape, *cells))
@@ -242,8 +246,7 @@ def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, age
     if isinstance(transform, Belief) and lag <= transform.longest:
         messages = transform.server.messages(message.view(1, 1, -1))
         slot = (memory["slot"] + 1 - lag) % len(memory["report"])
-        every = torch.ones_like(messages.spotted)
-        source = torch.arange(len(slot), device=slot.device)
-        memory["report"][slot, agent, source] = report_rows(transform.grid, messages, every).view(-1)
+        source, level = torch.arange(len(slot), device=slot.device), transform.server.level(messages)
+        memory["report"][slot, agent, source] = report_rows(transform.grid, messages, level).view(-1)
         memory["delay"][slot, agent] = lag
     return memory

@@ -55,10 +55,10 @@ def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     arrived = arrived_by_now(delay, len(delay) - 1 - step)
     begins = (steps[keys.STEP_COUNT] == 0).unsqueeze(-1)
     before, after = steps[keys.BELIEF], steps[next_key(keys.BELIEF)]
-    rows, first = report_rows(grid, messages, arrived), server.messages(steps[keys.MESSAGE])
-    first = report_rows(grid, first, torch.ones_like(first.spotted))
+    level, first = server.level(messages), server.messages(steps[keys.MESSAGE])
+    rows, first = report_rows(grid, messages, level, arrived), report_rows(grid, first, level)
     previous = torch.where(begins, first, rows.roll(1, 0))
-    place = places(grid, server.region_of(messages))
+    place = places(grid, server.region_of(messages), level)
     likely = likelihood(grid, repeated(grid, rows, previous), place)
     belief, corrected = before[0], []
     for i in range(len(delay)):  # each belief follows from the one before

@@ -81,7 +81,7 @@ class SourceGrid(NamedTuple):
     false_alarm: Tensor
     """Probability of a report from out of reach, [P] in double precision."""
     first: Tensor
-    """Index of the first region's tables for each source, [K]."""
+    """Index of the first region's tables for each source, at each level that may be drawn, [V, K]."""
 
     @property
     def no_report(self) -> int:
@@ -114,7 +114,7 @@ def build_source_grids(
         moves=None if all(each.moves is None for each in grids) else torch.cat(moves),
         next_staying=torch.cat([*(each.next_staying[:-1] for each in grids), torch.zeros_like(last)]),
         log_reports=torch.cat([*reports, last]),
-        first=torch.tensor([kinds.index(each) for each in alike]) * len(airspace.regions),
+        first=torch.tensor([[kinds.index(each) for each in alike]]) * len(airspace.regions),
     )
 
 
@@ -158,7 +158,7 @@ def build_source_grid(
     emits, alarm, first = chances.expand(3, len(polygons))
     moves = None if moves is None else moves.unsqueeze(0)
     grid = SourceGrid(
-        centres, prior, moves, staying, reports, reports, log_reports, emits, alarm, first[:1].long()
+        centres, prior, moves, staying, reports, reports, log_reports, emits, alarm, first[None, :1].long()
     )
     again = log_reports[grid.no_report // 2 : -1].exp()
     again[::2] = 1 - again[::2]
@@ -284,17 +284,23 @@ def repeated(grid: SourceGrid, rows: Tensor, before: Tensor) -> Tensor:
     return torch.add(rows, same, alpha=grid.no_report // 2)  # takes a third of the time of ``where``
 
 
-def places(grid: SourceGrid, region: Tensor) -> Tensor:
-    """Index of the tables of each source in the regions of worlds [*], [*, K]."""
-    return region.unsqueeze(-1) + grid.first
+def places(grid: SourceGrid, region: Tensor, level: Tensor | None) -> Tensor:
+    """Index of the tables of each source in the regions of worlds [*], [*, K].
+
+    ``level`` [*]: numbers of the drawn levels; None if none is drawn.
+    """
+    return region.unsqueeze(-1) + grid.first[0 if level is None else level]
 
 
-def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor | bool = True) -> Tensor:
+def report_rows(
+    grid: SourceGrid, messages: Messages, level: Tensor | None, sent: Tensor | bool = True
+) -> Tensor:
     """The rows of messages [*, N], if ``sent`` in this step [*, N] bool, by source [*, K, N].
 
-    A UAV in flight detects nothing.
+    A UAV in flight detects nothing. ``level`` is as in ``places``.
     """
-    point = messages.trail[..., 0].unsqueeze(-2) + (grid.first * grid.n_points).unsqueeze(-1)
+    first = grid.first[0 if level is None else level]
+    point = messages.trail[..., 0].unsqueeze(-2) + (first * grid.n_points).unsqueeze(-1)
     row = 2 * point + messages.spots.movedim(-1, -2)
     return torch.where((sent & ~messages.in_flight).unsqueeze(-2), row, grid.no_report)
 

@@ -149,7 +149,8 @@ def _belief(v: FeatureCache) -> Tensor:
     """The belief of the context, or that after the first messages, [*, K, C]."""
     if v.context.belief is not None:
         return v.context.belief
-    return first_belief(v.grid, report_rows(v.grid, v.messages), places(v.grid, v.region))
+    level = v.context.footprint
+    return first_belief(v.grid, report_rows(v.grid, v.messages, level), places(v.grid, v.region, level))
 
 
 class Feature(NamedTuple):
@@ -427,10 +428,10 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     point, or to the second nearest if another UAV is known to stand there.
     """
     everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
-    standing = v.wanted(v.messages.trail[..., 0])
-    rows = v.wanted(report_rows(v.grid, v.messages).movedim(-2, -1)).movedim(-1, -2)
+    standing, level = v.wanted(v.messages.trail[..., 0]), v.context.footprint
+    rows = v.wanted(report_rows(v.grid, v.messages, level).movedim(-2, -1)).movedim(-1, -2)
     stays = any_of(chance_of_staying(v.grid, v.belief, rows)).unsqueeze(-1)
-    chance = any_of(detection_chance(v.grid, v.belief, places(v.grid, v.region)))
+    chance = any_of(detection_chance(v.grid, v.belief, places(v.grid, v.region, level)))
     chance = chance.scatter(-1, everyone, -chance.gather(-1, everyone))  # negative where a UAV stands
     chance = chance.unsqueeze(-2).expand(*standing.shape, -1)
     chance = chance.scatter(-1, (standing % n_points).unsqueeze(-1), stays)
@@ -462,7 +463,8 @@ def _belief_map(v: FeatureCache) -> Tensor:
     """Probability that each source is in each sector of three rings about the UAV, [*, N, 24 K]."""
     position = v.wanted(v.messages.position)
     east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, C]
-    distance = torch.hypot(east, north) / v.context.radius
+    radius = v.context.radius
+    distance = torch.hypot(east, north) / (radius[..., None, None] if isinstance(radius, Tensor) else radius)
     ring = sum((distance > edge).long() for edge in BELIEF_RINGS)
     turn = torch.atan2(east, north) / (2 * math.pi)
     part = ring * BELIEF_SECTORS + (turn * BELIEF_SECTORS).round().long() % BELIEF_SECTORS

@@ -89,10 +89,9 @@ class Server:
         levels = simulation.vehicles.values.choices.get("source.level_db")
         source, radii, scaled = simulation.config.source, [simulation.radius], None
         if levels is not None:
-            ranged = len(levels) == 2 and (surrounded or "coverage" in self.names)
-            problem = (
-                "is a range, but coverage has a table for each footprint: give a list, as in [138,140,142]"
-            )
+            tabled = surrounded or "coverage" in self.names or observation.belief
+            ranged, remedy = len(levels) == 2 and bool(tabled), "give a list, as in [138,140,142]"
+            problem = f"is a range, but coverage and beliefs have tables for each footprint: {remedy}"
             checks.require(not ranged, "randomise.source.level_db", levels, problem)
             radii = [*map(footprint_radius, (replace(source, level_db=level) for level in levels))]
             scaled = torch.cat([airspace.points.flatten(0, 1) * (radii[0] / each) for each in radii])
@@ -102,7 +101,10 @@ class Server:
             footprints = tables_of_all(polygons, points.numpy(), radii)
         grid = None
         if observation.belief:
-            grid = build_source_grids(airspace, simulation.sources, self.dt, observation.belief_cell)
+            drawn = [{"level_db": each} for each in levels or ()] or [{}]
+            kinds = [replace(each, **level) for level in drawn for each in simulation.sources]
+            grid = build_source_grids(airspace, kinds, self.dt, observation.belief_cell)
+            grid = grid._replace(first=grid.first.view(len(drawn), -1))
         gains = "belief_gain" in observation.belief
         self._context = ServerContext(
             now=torch.zeros(()),
@@ -250,10 +252,18 @@ class Server:
         context = self._context._replace(now=steps * self.dt, scale=self.scales(messages))
         if self._radii is None:
             return context
-        first, _ = context.readings[FOOTPRINT]
-        told = messages.readings[..., 0, first]
-        number = (told.unsqueeze(-1) - self._radii).abs().argmin(-1)
-        return context._replace(radius=told, footprint=number)
+        return context._replace(radius=self._told_radius(messages), footprint=self.level(messages))
+
+    def level(self, messages: Messages) -> Tensor | None:
+        """Number of the drawn level of the source in each world, [*]; None if none is drawn."""
+        if self._radii is None:
+            return None
+        return (self._told_radius(messages).unsqueeze(-1) - self._radii).abs().argmin(-1)
+
+    def _told_radius(self, messages: Messages) -> Tensor:
+        """Radius of the footprints of each world's UAVs [m], [*], if it is drawn."""
+        first, _ = self._context.readings[FOOTPRINT]
+        return messages.readings[..., 0, first]
 
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""

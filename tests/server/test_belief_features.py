@@ -33,7 +33,7 @@ def flown():
     simulation, server = env.simulation, env.server
     messages, steps = simulation.initial.sent, simulation.initial.steps
     torch.manual_seed(0)
-    possible = server.grid.prior[places(server.grid, server.region_of(messages))] > 0
+    possible = server.grid.prior[places(server.grid, server.region_of(messages), None)] > 0
     weight = torch.rand(possible.shape).square() * possible
     belief = weight / weight.sum(-1, keepdim=True)
     return simulation, server, messages, server.features(messages, steps, belief=belief), belief

@@ -131,33 +131,39 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
     assert set(seen[:, 1].tolist()) <= {1.0, 2.0, 3.0}
 
 
-@pytest.mark.parametrize("kind", ["instant", "polynomial"])
-def test_worlds_with_a_drawn_level_are_those_of_this_level(kind):
+@pytest.mark.parametrize(("kind", "belief"), [("instant", True), ("polynomial", False)])
+def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     levels, flying = [138.0, 142.0, 145.0], MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
     base = replace(
         WORLD,
         motion=flying,
         battery=BatteryConfig(),
-        observation=ObservationConfig(global_features=["coverage", "source_distance", "coverage_map"]),
+        observation=ObservationConfig(
+            global_features=["coverage", "source_distance", "coverage_map"],
+            belief=["belief_gain", "belief_map"] * belief,
+            belief_cell=150.0,
+            own=True,
+        ),
+        delay=DelayConfig(obs=2 * belief),
         reward=RewardConfig(coverage=1.0, served=1.0),
         requests=RequestConfig(rate=30.0),
         episode=EpisodeConfig(15),
     )
     scenarios = [replace(base, source=replace(base.source, level_db=level)) for level in levels]
-    envs = [UavEnv(replace(base, randomise={"source.level_db": levels}), 8, seed=0)]
-    envs += [UavEnv(scenario, 8, seed=0) for scenario in scenarios]
+    envs = [make_env(replace(base, randomise={"source.level_db": levels}), 8)]
+    envs += [make_env(scenario, 8) for scenario in scenarios]
     for env in envs:
-        env.simulation.draws = True  # requests of the first step, too, are drawn in each episode
+        env.uav_env.simulation.draws = True  # requests of the first step, too, are drawn in each episode
         env.set_seed(1)
     tds, met = [env.reset() for env in envs], set()
-    for step in range(40):
+    for step in range(30):
         action, steps = torch.randint(24, (8, 3), generator=torch.Generator().manual_seed(step)), []
         for i, env in enumerate(envs):
             before, tds[i] = env.step_and_maybe_reset(tds[i].set(("agents", "action"), action))
             steps.append(before["next"])
         if step % 15 == 14:  # these outputs belong to an episode whose level is gone
             continue
-        for world, level in enumerate(envs[0].state.drawn[:, 0].tolist()):
+        for world, level in enumerate(envs[0].uav_env.state.drawn[:, 0].tolist()):
             one = steps[1 + levels.index(level)]["agents"][world]
             met.add(level)
             for name in ("observation", "reward"):
