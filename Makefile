@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-gpu | fleet | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-gpu | fleet | benchmarl | upstream | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -8,7 +8,7 @@ PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-gpu fleet benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-gpu fleet benchmarl upstream pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
@@ -100,6 +100,12 @@ benchmarl: $(BENCHMARL)/ready
 	$(BENCHMARL_TRAIN) --algorithm masac $(ARGS)
 	$(BENCHMARL_TRAIN) --algorithm qmix $(ARGS)
 	$(BENCHMARL_TRAIN) --algorithm mappo --scenario vmas/navigation $(ARGS)
+
+# Delays in a checkout of TorchRL, as docs/upstream.md proposes them, and TorchRL's tests of them.
+RL := ../rl
+upstream: $(VENV)/test
+	$(PY) docs/upstream/to_torchrl.py $(RL)
+	cd $(RL) && PYTHONPATH=. $(abspath $(PY)) -m pytest test/transforms/test_delay_transforms.py $(ARGS)
 
 # The film of the README, the figures of the delays, and those of the stored results.
 pictures: $(VENV)/base

@@ -1,5 +1,6 @@
 """The examples run from any folder, do what their text says, and learn under delay (slow)."""
 
+import importlib
 import os
 import re
 import runpy
@@ -12,7 +13,10 @@ import numpy as np
 import pytest
 import torch
 from episodes import flight
-from torchrl.envs import SerialEnv
+from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
+
+import damian.transforms
+from damian.delays.laws import Uniform
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -57,13 +61,22 @@ def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
     assert [line for line in lines if "torchrl" not in line] == printed.splitlines()  # it logs there, too
 
 
-@pytest.mark.slow
-def test_a_belief_head_learns_to_predict_on_an_environment_that_is_not_ours(monkeypatch):
-    pytest.importorskip("vmas")
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    example = load("belief_head")
-    assert example["batch"]["agents", "timeline"].shape == (8, 16, 3, 12, 18 + 1)
-    assert example["errors"][-1] < example["errors"][0]
+def test_the_delays_for_torchrl_stand_alone_and_are_ours(tmp_path, monkeypatch):
+    for folder in ("torchrl/envs", "test/transforms"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "torchrl/envs/__init__.py").touch()
+    runpy.run_path(str(ROOT / "docs" / "upstream" / "to_torchrl.py"))["main"](tmp_path)
+    monkeypatch.syspath_prepend(tmp_path / "torchrl" / "envs" / "transforms")
+    rollouts = []
+    for package, uniform in ((importlib.import_module("delays"), (1, 4)), (damian.transforms, Uniform(1, 4))):
+        late = package.ObservationDelay(uniform, "observation", "received", loss=0.2, delay_key="delay")
+        timeline = package.ObservationTimeline(6, delay_key="delay")
+        env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(package.ActionDelay(2), late, timeline))
+        package.set_seed(env, 0)
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(30))
+    assert (rollouts[0] == rollouts[1]).all()
+    assert rollouts[0]["delay"].unique().tolist() == [-1, 0, 1, 2, 3, 4]
 
 
 def test_a_late_pendulum_prints_the_age_of_what_it_observes(capsys):
