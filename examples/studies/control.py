@@ -1,26 +1,22 @@
 """Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed late.
 
     python examples/studies/control.py --jobs 2                  (Pendulum-v1; an hour, two free cores)
-    python examples/studies/control.py --methods history history+bpql         (these methods only)
+    python examples/studies/control.py --methods history bpql         (these methods only)
     python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out runs/control_random
     python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 --hidden 256 \\
         --lr 3e-4 --episodes 10 --out runs/cheetah               (pip install "gymnasium[mujoco]"; 50 minutes)
     ... --shortest 1 --out runs/cheetah_random                   (delays are drawn from 1 to 9 steps)
 
-These methods are trained for each seed: undelayed; naive, whose observations are late; and three that also
-observe the agent's latest actions: history, with the age of the observation if that varies (an augmented
-state); buffer, which holds each observation until it is as old as the longest delay (a jitter buffer); and
-timeline, with all that has arrived of the latest steps, by when it was true (``ObservationTimeline``), in
-place of the newest observation. With bpql the actor is the same, but the critics read only the state, or the
-timeline, as it is known once it has arrived (``BackupdateStorage``). The undelayed policy is also evaluated
-under the delay. The folder gets the mean returns as results.md and results.csv, and a JSON file for each
-method and seed, with the learning curve.
+These methods are trained for each seed: undelayed; naive, whose observations are late; history, which also
+observes the agent's latest actions, with the age of the observation if that varies (an augmented state); and
+bpql, whose actor is the same, but whose critics read only the state, as it is known once it has arrived
+(``BackupdateStorage``). The undelayed policy is also evaluated under the delay. The folder gets the mean
+returns as results.md and results.csv, and a JSON file for each method and seed.
 """
 
 import csv
 import statistics
 from argparse import Namespace
-from collections.abc import Callable
 from typing import NamedTuple, cast
 
 import gymnasium
@@ -34,7 +30,6 @@ from torchrl.envs import (
     Compose,
     DoubleToFloat,
     EnvBase,
-    FlattenObservation,
     GymEnv,
     RenameTransform,
     RewardSum,
@@ -48,28 +43,23 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common.tables import markdown_table
-from damian.delays.laws import Uniform, sampler_of
-from damian.delays.samplers import HeldSampler
+from damian.delays.laws import Uniform
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.config import BpqlConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
-from damian.replay.backupdate import BackupdateStorage, corrections_of
+from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
-from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline, set_seed
-from damian.transforms.base import Correction
-from damian.transforms.entries import Entries
+from damian.transforms import ActionHistory, ObservationDelay, set_seed
 
-AWARE = ("history", "buffer", "timeline")  # methods that observe their latest actions
-METHODS = ("undelayed", "naive", *AWARE, *(f"{method}+bpql" for method in AWARE))
+METHODS = ("undelayed", "naive", "history", "bpql")
 RANDOM_STEPS = 1000  # steps with random actions before the first update
-CURVE = 10  # points of a learning curve
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 BATCH, GAMMA, TAU = 256, 0.99, 0.005
 OBSERVED = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION)  # of the actor, and the state for critics
 SENT = ("observation", "delay")  # in each step, and how late
-OUTPUTS = (*OBSERVED, *SENT, "received", "age", "timeline", "step_count", keys.REWARD)
+OUTPUTS = (*OBSERVED, *SENT, "received", "age", "step_count", keys.REWARD)
 STORED = [*OBSERVED, *SENT, "step_count", keys.ACTION, *map(next_key, (*OUTPUTS, *keys.ENDS))]
 
 
@@ -83,10 +73,6 @@ class Task(NamedTuple):
     """Longest delay [steps]."""
     history: int = 0
     """Number of latest actions that are appended to the actor's observation."""
-    slots: int = 0
-    """Number of latest steps that are observed as a timeline; 0: only the newest observation is."""
-    buffer: bool = False
-    """Whether each observation is held until it is as old as the longest delay."""
 
     @property
     def horizon(self) -> int:
@@ -111,19 +97,14 @@ def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
 
     varies = task.shortest < task.longest
     law = Uniform(task.shortest, task.longest) if varies else task.longest
-    law = HeldSampler(sampler_of(law)) if task.buffer else law
     transforms: list[Transform] = [
         RewardSum(),
         StepCounter(),
         ObservationDelay(law, ["observation"], ["received"], delay_key="delay"),
     ]
-    seen, ages = "received", ["age"] * (varies and task.history > 0 and not task.buffer)
-    if task.slots:
-        transforms.append(ObservationTimeline(task.slots, delay_key="delay"))
-        transforms.append(FlattenObservation(-2, -1, ["timeline"], ["slots"]))
-        seen, ages = "slots", []
-    transforms.append(CatTensors([seen], "state", del_keys=False))
-    transforms.append(CatTensors([seen, *ages], "observed", del_keys=False))
+    ages = ["age"] * (varies and task.history > 0)
+    transforms.append(CatTensors(["received"], "state", del_keys=False))
+    transforms.append(CatTensors(["received", *ages], "observed", del_keys=False))
     if task.history:
         transforms.append(ActionHistory(task.history, append_to="observed"))
     # The learner expects these keys; a single agent needs no agent dimension.
@@ -137,11 +118,6 @@ def arrived_states(steps: TensorDictBase, observations: Tensor) -> dict[NestedKe
     return {next_key(keys.GLOBAL_OBSERVATION): observations}
 
 
-def arrived_timelines(entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
-    """The same for critics of timelines, which ``ObservationTimeline`` has corrected, [T, B, K (D + 1)]."""
-    return entries | {next_key(keys.GLOBAL_OBSERVATION): entries[next_key("timeline")].flatten(-2)}
-
-
 def make_learner(
     env: TransformedEnv, bpql: bool, steps: int, delay: int, hidden: int, lr: float = 1e-3
 ) -> Sac:
@@ -153,17 +129,13 @@ def make_learner(
     if not bpql:
         return config.make(env, setup, ReplayBuffer(storage=TimeStorage(steps)))
     names = {"message_key": "observation", "received_key": "received", "delay_key": "delay", "age_key": "age"}
-    corrections = corrections_of(env.transform, ["timeline"])
-    corrections += [Correction(arrived_timelines)] * len(corrections)
-    storage = BackupdateStorage(steps, arrived_states, longest=delay, corrections=corrections, **names)
+    storage = BackupdateStorage(steps, arrived_states, longest=delay, **names)
     setup = setup._replace(longest_delay=delay, critic_key=keys.GLOBAL_OBSERVATION)
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
 
-def train(
-    env: EnvBase, learner: Sac, steps: int, bar: tqdm, watch: Callable[[int], None] | None = None
-) -> None:
-    """Train for ``steps`` environment steps, with one update after each; ``watch`` is told each step."""
+def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
+    """Train for ``steps`` environment steps, with one update after each."""
     td = env.reset()
     for step in range(steps):
         # Outside of such a context TorchRL's actor takes the most likely action, and explores nothing.
@@ -174,8 +146,6 @@ def train(
         if step >= RANDOM_STEPS:
             learner.update(draw(learner))
         bar.update()
-        if watch:
-            watch(step + 1)
         if transition["next", "done"].item():
             bar.set_postfix({"return": f"{transition['next', 'episode_reward'].item():.0f}"})
 
@@ -201,29 +171,20 @@ def evaluate_under(task: Task, actor: nn.Module, episodes: int) -> float:
 
 
 def run_method(method: str, seed: int, args: Namespace) -> dict[str, float]:
-    """Train and evaluate a method; returns its mean returns by the delay of the evaluation and by step."""
+    """Train and evaluate a method; returns its mean returns by the delay of the evaluation."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     shortest = args.delay if args.shortest is None else args.shortest
-    seen = method.removesuffix("+bpql")
-    history, slots = args.delay * (seen in AWARE), (args.delay + 1) * (seen == "timeline")
-    late = Task(args.env, shortest, args.delay, history, slots, seen == "buffer")
+    late = Task(args.env, shortest, args.delay, args.delay * (method in ("history", "bpql")))
     task = Task(args.env) if method == "undelayed" else late
     env = make_env(task)
     set_seed(env, seed)
-    learner = make_learner(env, method != seen, args.steps, args.delay, args.hidden, args.lr)
-    found = {}
-
-    def watch(step: int) -> None:
-        if step % (args.steps // CURVE) == 0 and step < args.steps:
-            with torch.random.fork_rng():
-                found[f"after {step}"] = evaluate_under(task, learner.actor, args.episodes)
-
+    learner = make_learner(env, method == "bpql", args.steps, args.delay, args.hidden, args.lr)
     with tqdm(total=args.steps, desc=f"seed {seed} {method}") as bar:
-        train(env, learner, args.steps, bar, watch)
+        train(env, learner, args.steps, bar)
     name = f"{shortest} to {args.delay}" if shortest < args.delay else str(args.delay)
     flown = {"0": task, name: late} if method == "undelayed" else {name: late}
-    return found | {name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()}
+    return {name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()}
 
 
 def table(results: Results, args: Namespace) -> str:
@@ -237,7 +198,7 @@ def table(results: Results, args: Namespace) -> str:
     with (args.out / "results.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows(rows)
     title = f"# {args.env}, SAC, {args.steps} steps: return, mean of {args.episodes} episodes"
-    text = f"{title}\n\n{markdown_table(rows[0], [row for row in rows[1:] if 'after' not in row[1]])}\n"
+    text = f"{title}\n\n{markdown_table(rows[0], rows[1:])}\n"
     (args.out / "results.md").write_text(text, encoding="utf-8")
     return text
 

@@ -31,24 +31,10 @@ def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(bpql, w
     assert learner.loss.qvalue_network.in_keys == [read, keys.ACTION]
 
 
-def test_critics_of_timelines_read_what_was_true_when_and_actors_what_had_arrived_of_it():
-    slots = DELAY + 1
-    learner = trained(Task(shortest=1, longest=DELAY, history=DELAY, slots=slots), True)
-    steps = learner.buffer.storage.steps[: 20 - DELAY, 0]
-    sent = torch.cat([steps["observation"][:1], steps["next", "observation"]])
-    critic, actor = (
-        torch.cat([steps[key][:1], steps["next", *key]])[:, : 4 * slots].view(-1, slots, 4)
-        for key in (keys.GLOBAL_OBSERVATION, keys.OBSERVATION)
-    )
-    for t in range(1, len(sent)):
-        for k in range(slots):
-            known = torch.cat([sent[t - k], torch.ones(1)]) if k <= t else torch.zeros(4)
-            assert critic[t, k].equal(known)
-            assert actor[t, k].equal(known) or not actor[t, k].any()
-        assert not actor[t, 0].any()
-        assert actor[t, DELAY].equal(critic[t, DELAY])
-
-
-def test_a_jitter_buffer_shows_observations_as_old_as_the_longest_delay():
-    steps = make_env(Task(shortest=1, longest=DELAY, buffer=True)).rollout(8)["next"]
-    assert steps["age"].flatten().tolist() == [1, 2, 3, 3, 3, 3, 3, 3]
+def test_critics_read_what_was_true_and_actors_what_had_arrived():
+    learner = trained(Task(shortest=1, longest=DELAY, history=DELAY), True)
+    steps = learner.buffer.storage.steps[: 20 - DELAY, 0]["next"]
+    assert steps[keys.GLOBAL_OBSERVATION].equal(steps["observation"])
+    late = torch.cat([steps["age"], steps["received"]], -1)
+    assert steps[keys.OBSERVATION][:, :4].equal(late)
+    assert not late[:, 1:].equal(steps["observation"])
