@@ -73,33 +73,13 @@ class EpsilonGreedy(nn.Module):
 
     def __init__(self, network: nn.Module, epsilon: float) -> None:
         super().__init__()
-        self.network = network
-        self.epsilon = nn.Buffer(torch.tensor(epsilon, device=next(network.parameters()).device))
+        self.network, device = network, next(network.parameters()).device
+        self.epsilon, self.learnt = (nn.Buffer(torch.tensor(n, device=device)) for n in (epsilon, 0))
 
     def forward(self, observation: Tensor, legal: Tensor) -> Tensor:
         values = self.network(observation).masked_fill(~legal, -math.inf)
         greedy = torch.zeros_like(values).scatter(-1, values.argmax(-1, keepdim=True), 1.0)
         return ((1 - self.epsilon) * greedy + self.epsilon * legal / legal.sum(-1, keepdim=True)).log()
-
-
-class LinearSchedule:
-    """A number that goes linearly from one value to another in so many ``frames``."""
-
-    def __init__(self, first: float, last: float, frames: int) -> None:
-        self.first, self.last, self.frames, self.learnt = first, last, frames, 0
-        self.value = first
-
-    def advance(self, n_steps: int) -> None:
-        """Count environment steps that have been learnt from, over all worlds."""
-        self.learnt += n_steps
-        self.value = self.first + (self.last - self.first) * min(self.learnt / self.frames, 1.0)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"learnt": self.learnt}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.learnt = 0
-        self.advance(int(state["learnt"]))
 
 
 class Qmix:
@@ -108,8 +88,7 @@ class Qmix:
     def __init__(self, env: EnvBase, config: QmixConfig, setup: LearningSetup, buffer: Any) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = config.make_actor(env, setup.model)
-        self.chooser, annealed = self.actor[0].module, max(int(config.annealed * setup.frames), 1)
-        self.epsilon = LinearSchedule(config.epsilon, config.epsilon_end, annealed)
+        self.chooser = self.actor[0].module
         n_agents, n_columns = env.observation_spec[setup.critic_key].shape[-2:]
         mixer, read = VDNMixer(n_agents, env.device), [CHOSEN]
         if config.mixer == "qmix":
@@ -126,8 +105,7 @@ class Qmix:
         self.targets = SoftUpdate(self.loss, tau=0.01)
 
     def components(self) -> dict[str, Any]:
-        networks = {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
-        return networks | {"epsilon": self.epsilon}
+        return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         self.buffer.extend(batch.exclude("collector", keys.LOGITS, keys.ACTION_LOG_PROB))
@@ -142,9 +120,11 @@ class Qmix:
             nn.utils.clip_grad_norm_(self.loss.parameters(), 10.0)
             self.optimizer.step()
             self.targets.step()
-        self.epsilon.advance(batch.numel())
-        self.chooser.epsilon.fill_(self.epsilon.value)
-        return {"loss": loss.item(), "epsilon": self.epsilon.value}
+        self.chooser.learnt += batch.numel()  # environment steps, over all worlds
+        first, last, annealed = self.config.epsilon, self.config.epsilon_end, self.config.annealed
+        share = min(self.chooser.learnt.item() / max(int(annealed * self.setup.frames), 1), 1.0)
+        self.chooser.epsilon.fill_(first + (last - first) * share)
+        return {"loss": loss.item(), "epsilon": self.chooser.epsilon.item()}
 
     def joint(self, steps: TensorDictBase) -> TensorDictBase:
         """Turn stored steps [K] into those of a team that chooses at once, as the loss reads them."""
