@@ -1,25 +1,24 @@
-"""Compare with a published table: MAPPO in PettingZoo's simple_spread_v3, with late observations.
+"""Compare with a published table: MAPPO in PettingZoo's simple_spread_v3 or simple_tag_v3, observed late.
 
     python examples/studies/spread.py                          (an hour on one core; --jobs 2 takes two)
-    python examples/studies/spread.py --methods undelayed naive   (these methods only)
+    python examples/studies/spread.py --game tag --methods undelayed naive registered+backupdate
     python examples/studies/spread.py --delay 6 12 --out runs/spread_6_12
     python examples/studies/spread.py --seeds 0 --frames 100000 --out runs/spread0
 
-Three agents cover three landmarks in episodes of 25 steps; the return is the sum of all agents' rewards. An
-agent knows its own velocity and position at once; it sees each landmark and each other agent late, and begins
-with what it sees at the beginning. Methods: random actions; undelayed, trained without delay; and, trained
-while each of these messages takes 3 to 9 steps, naive and those whose actors also observe the ages of what
-they see and their own latest actions. Of these
+Three agents cover three landmarks, or catch a prey, in episodes of 25 steps; the return is the sum of all
+agents' rewards. An agent knows its own velocity and position at once; it sees each landmark, each other agent
+and the prey late, and begins with what it sees at the beginning. Methods: random actions; undelayed, trained
+without delay; and, trained while each of these messages takes 3 to 9 steps, naive, backupdate, and those
+whose actors also observe the ages of what they see and their own latest actions. Of these
 
-- history shows what is seen as it was seen, as naive does;
-- registered moves it into the agent's present frame, by the agent's own way since then, which it knows;
+- registered moves what is seen into the agent's present frame, by the agent's own way since then;
 - buffer, the same, holds it until it is as old as the longest delay in training (a jitter buffer);
 - timeline shows all that has arrived of the latest steps, registered, by when it was true
   (``ObservationTimeline``).
 
 With backupdate the critic learns from what has arrived since (``BackupdateStorage``); undelayed+registered
 acts as undelayed does, but is flown late with what is registered. Each policy is evaluated under several
-delays, in episodes that begin alike for all.
+delays, by its most likely actions, in episodes that begin alike for all.
 
 The folder gets results.csv, a row for each method, delay and seed, the means as table.md beside those
 published (Fu et al. 2025, "Rainbow Delay Compensation", arXiv 2505.03586), and a JSON file for each
@@ -35,7 +34,19 @@ from functools import partial
 from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
-from simple_spread import AGES, DELAYS, HELD, HORIZON, KINEMATICS, PAST, SEEN, late_spread, observed
+from particles import (
+    AGES,
+    DELAYS,
+    HELD,
+    HORIZON,
+    KINEMATICS,
+    PAST,
+    SEEN,
+    SimpleSpread,
+    SimpleTag,
+    late_game,
+    observed,
+)
 from study import Results, carried_out, parser
 from tensordict import TensorDictBase
 from torch import Tensor, nn
@@ -88,16 +99,15 @@ METHODS: dict[str, Method | None] = {
     "undelayed+registered": Method(delayed=False, registered=True),
     "naive": Method(),
     "backupdate": Method(backupdate=True),
-    "history+backupdate": Method(history=True, backupdate=True),
     "registered": Method(history=True, registered=True),
     "registered+backupdate": Method(history=True, registered=True, backupdate=True),
     "buffer": Method(history=True, registered=True, buffer=True),
-    "buffer+backupdate": Method(history=True, registered=True, buffer=True, backupdate=True),
     "timeline": Method(history=True, timeline=True),
     "timeline+backupdate": Method(history=True, timeline=True, backupdate=True),
 }
 PUBLISHED = {"undelayed": (-33.1, -37.6, -48.8, -59.9, -67.2), "random": (-82.4,)}
-"""Published returns by method, under the first of the delays that are evaluated."""
+"""Published returns in simple_spread by method, under the first of the delays that are evaluated."""
+GAMES = {"spread": SimpleSpread, "tag": SimpleTag}
 
 WORLDS = 256  # an update learns from one episode of each
 MODEL = ModelConfig(hidden=[64, 64])
@@ -105,16 +115,16 @@ LEARNER: dict[str, Any] = {"steps": HORIZON, "lr": 5e-3, "gamma": 0.9, "lmbda": 
 LEARNER |= {"entropy_coeff": 0.003, "normalize_value": True}  # the bonus falls to 0 in the training
 SLOTS = 13  # of a timeline: as old as the longest delay that is evaluated
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
-ACTING = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
-"""How an evaluated policy acts: by its most likely action, or by one that is drawn from it."""
 
 
-def make_env(method: Method, worlds: int, delay: Delays, longest: int) -> TransformedEnv:
+def make_env(
+    method: Method, worlds: int, delay: Delays, longest: int, game: str = "spread"
+) -> TransformedEnv:
     """The environment of a method, under a delay; ``longest`` is the longest one in training."""
     low, high = (max(steps, longest) for steps in delay) if method.buffer else delay
     slots = SLOTS if method.timeline else 0
     late = {"aware": method.history, "registered": method.registered, "slots": slots}
-    return late_spread(worlds, Uniform(low, high), longest, **late)
+    return late_game(GAMES[game], worlds, Uniform(low, high), longest, **late)
 
 
 def recompute(method: Method, steps: TensorDictBase, blocks: Tensor) -> Entries:
@@ -166,10 +176,10 @@ def make_learner(env: TransformedEnv, method: Method, longest: int) -> Mappo:
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
 
-def train(method: Method, seed: int, frames: int, delay: Delays, bar: tqdm) -> nn.Module:
-    """Train for at least ``frames`` environment steps; returns the policy."""
-    longest = delay[1]
-    env = make_env(method, WORLDS, delay if method.delayed else NONE, longest)
+def train(method: Method, seed: int, args: Namespace, bar: tqdm) -> nn.Module:
+    """Train for at least ``args.frames`` environment steps; returns the policy."""
+    frames, longest = args.frames, args.delay[1]
+    env = make_env(method, WORLDS, tuple(args.delay) if method.delayed else NONE, longest, args.game)
     set_seed(env, seed)
     learner, done = make_learner(env, method, longest), 0
     collector = Collector(
@@ -198,29 +208,23 @@ def returns_in(batch: TensorDictBase) -> float:
 
 
 @torch.no_grad()
-def evaluate(
-    method: Method, actor: nn.Module | None, delay: Delays, longest: int, episodes: int
-) -> dict[str, float]:
-    """Mean returns over episodes that have the same initial conditions at every call."""
-    returns = {}
-    for name, how in ACTING.items():
-        env = make_env(method, episodes, delay, longest)
-        set_seed(env, EVALUATION_SEED)
-        with set_exploration_type(how):
-            returns[name] = returns_in(env.rollout(HORIZON, actor, break_when_any_done=False))
-    return returns
+def evaluate(env: TransformedEnv, actor: nn.Module | None) -> float:
+    """Mean return of the most likely actions, in episodes that begin alike at every call."""
+    set_seed(env, EVALUATION_SEED)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return returns_in(env.rollout(HORIZON, actor, break_when_any_done=False))
 
 
-def run_method(name: str, seed: int, args: Namespace) -> dict[str, dict[str, float]]:
-    """Train and evaluate a method; returns its mean returns by delay, and by how the policy acts."""
+def run_method(name: str, seed: int, args: Namespace) -> dict[str, float]:
+    """Train and evaluate a method; returns its mean returns by delay."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     method, actor, (low, high) = METHODS[name], None, args.delay
     if method:
         with tqdm(total=args.frames, desc=f"seed {seed} {name}") as bar:
-            actor = train(method, seed, args.frames, (low, high), bar)
+            actor = train(method, seed, args, bar)
     return {
-        named(delay): evaluate(method or Method(), actor, delay, high, args.episodes)
+        named(delay): evaluate(make_env(method or Method(), args.episodes, delay, high, args.game), actor)
         for delay in dict.fromkeys((*EVALUATED, (low, high)))
     }
 
@@ -235,50 +239,41 @@ def table(results: Results, args: Namespace) -> str:
     """Write the results as results.csv and table.md; returns the latter's text."""
     with (args.out / "results.csv").open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["method", "delay", "seed", *ACTING])
+        rows.writerow(["method", "delay", "seed", "return"])
         for (method, seed), returns in results.items():
-            for delay, found in returns.items():
-                rows.writerow([method, delay, seed, *(f"{found[name]:.2f}" for name in ACTING)])
+            rows.writerows([method, delay, seed, f"{found:.2f}"] for delay, found in returns.items())
     trained, flown = named(args.delay), list(next(iter(results.values())))
-    parts = [
-        f"# simple_spread_v3, MAPPO, {args.frames} steps, delays of {trained}: returns",
-        f"Mean of {args.episodes} episodes and {len(args.seeds)} seeds (smallest and largest of a seed), "
-        f"by delay [steps]. Recovery under {trained}: (method - base) / (undelayed without delay - base); "
-        "the base is the best method without backupdate or, as published, undelayed flown late.",
-    ]
-    for how in ACTING:
 
-        def mean(method: str, delay: str = trained, how: str = how) -> float:
-            return statistics.mean(results[method, seed][delay][how] for seed in args.seeds)
+    def mean(method: str, delay: str) -> float:
+        return statistics.mean(results[method, seed][delay] for seed in args.seeds)
 
-        late = [name for name in args.methods if (method := METHODS[name]) and method.delayed]
-        naive = [mean(name) for name in late if "backupdate" not in name]
-        known = "undelayed" in args.methods
-        bases = [max(naive) if naive and known else None, mean("undelayed") if known else None]
-        lines = []
-        for method in args.methods:
-            found = [[results[method, s][delay][how] for s in args.seeds] for delay in flown]
-            cells = [f"{statistics.mean(x):.1f} ({min(x):.1f}, {max(x):.1f})" for x in found]
-            recovered = [
-                f"{(mean(method) - base) / (mean('undelayed', '0') - base):.2f}"
-                if method in late and base
-                else ""
-                for base in bases
-            ]
-            lines.append([method, *cells, *recovered])
-        width = len(flown) + len(bases)
+    lines = []
+    for method in args.methods:
+        found = [[results[method, seed][delay] for seed in args.seeds] for delay in flown]
+        cells = [f"{statistics.mean(x):.1f} ({min(x):.1f}, {max(x):.1f})" for x in found]
+        recovered = ""
+        if method not in ("undelayed", "random") and "undelayed" in args.methods:
+            base, best = mean("undelayed", trained), mean("undelayed", "0")
+            recovered = f"{(mean(method, trained) - base) / (best - base):.2f}"
+        lines.append([method, *cells, recovered])
+    if args.game == "spread":
         for method, returns in PUBLISHED.items():
-            lines.append([f"{method}, published", *map(str, returns), *[""] * (width - len(returns))])
-        titles = ["method", *flown, "recovery", "as published"]
-        parts += [f"## Actions: {how}", markdown_table(titles, lines)]
-    text = "\n\n".join(parts) + "\n"
+            blank = [""] * (len(flown) + 1 - len(returns))
+            lines.append([f"{method}, published", *map(str, returns), *blank])
+    text = (
+        f"# simple_{args.game}_v3, MAPPO, {args.frames} steps, delays of {trained}: returns\n\n"
+        f"Mean of {args.episodes} episodes and {len(args.seeds)} seeds (smallest and largest of a seed), by "
+        f"delay [steps]. Recovery under {trained}: (method - base) / (undelayed without delay - base); the "
+        f"base is undelayed, flown late.\n\n{markdown_table(['method', *flown, 'recovery'], lines)}\n"
+    )
     (args.out / "table.md").write_text(text, encoding="utf-8")
     return text
 
 
 def main(words: list[str] | None = None) -> None:
     """Train, evaluate and print the table."""
-    options = parser("MAPPO in simple_spread_v3 with late observations.", list(METHODS), "runs/spread")
+    options = parser("MAPPO in games of PettingZoo with late observations.", list(METHODS), "runs/spread")
+    options.add_argument("--game", choices=GAMES, default="spread", help="simple_spread or simple_tag")
     options.add_argument(
         "--delay",
         type=int,

@@ -5,7 +5,7 @@ from itertools import product
 import pytest
 import spread
 import torch
-from simple_spread import AGES, DELAYS, HELD, HORIZON, KINEMATICS, SEEN
+from particles import AGES, DELAYS, HELD, HORIZON, KINEMATICS, SEEN
 from spread import METHODS, SLOTS, make_env, make_learner
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -27,7 +27,7 @@ def flown(method: str) -> TensorDictBase:
 
 @pytest.fixture(scope="module")
 def steps() -> TensorDictBase:
-    return flown("history+backupdate")
+    return flown("registered+backupdate")
 
 
 def sent(steps: TensorDictBase, t: int) -> tuple[Tensor, Tensor]:
@@ -119,6 +119,14 @@ def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, met
         undelayed = torch.cat([kinematics, seen.flatten(-2), torch.eye(3).expand(4, HORIZON, 3, 3)], -1)
         assert critic.equal(undelayed)
         assert not late["next", *keys.OBSERVATION][..., :17].equal(undelayed)
+
+
+def test_a_prey_is_seen_late_in_the_frame_of_now():
+    steps = make_env(METHODS["registered"], WORLDS, (4, 4), 9, "tag").rollout(HORIZON - 1)["next"]
+    prey = steps[keys.OBSERVATION][..., 4 : 4 + 12].unflatten(-1, (6, 2))[..., 4, :]
+    sent = steps[SEEN].unflatten(2, (3, 6))[..., 4, :]  # registered: a place in the plane
+    torch.testing.assert_close(prey[:, 4:], sent[:, :-4] - steps[KINEMATICS][:, 4:, :, 2:])
+    assert (sent[:, 1:] - sent[:, :-1]).norm(dim=-1).max() > 0.1
 
 
 def test_a_jitter_buffer_holds_each_message_until_it_is_as_old_as_the_longest_delay_in_training():
