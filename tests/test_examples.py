@@ -62,9 +62,11 @@ def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
 
 
 def test_the_delays_for_torchrl_stand_alone_and_are_ours(tmp_path, monkeypatch):
-    for folder in ("torchrl/envs", "test/transforms"):
+    for folder in ("torchrl/envs", "test/transforms", "docs/source/reference"):
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "torchrl/envs/__init__.py").touch()
+    reference = tmp_path / "docs/source/reference/envs_transforms.rst"
+    reference.write_text("    ActionDiscretizer\n    ObservationNorm\n    ObservationTransform\n")
     runpy.run_path(str(ROOT / "docs" / "upstream" / "to_torchrl.py"))["main"](tmp_path)
     monkeypatch.syspath_prepend(tmp_path / "torchrl" / "envs" / "transforms")
     rollouts = []
@@ -75,6 +77,7 @@ def test_the_delays_for_torchrl_stand_alone_and_are_ours(tmp_path, monkeypatch):
         package.set_seed(env, 0)
         torch.manual_seed(0)
         rollouts.append(env.rollout(30))
+    assert [*reference.read_text().split()][::2] == ["ActionDelay", "ObservationDelay", "ObservationTimeline"]
     assert (rollouts[0] == rollouts[1]).all()
     assert rollouts[0]["delay"].unique().tolist() == [-1, 0, 1, 2, 3, 4]
 

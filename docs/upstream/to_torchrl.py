@@ -99,6 +99,14 @@ def imported(node: ast.Import | ast.ImportFrom, used: set[str]) -> str:
     return ast.unparse(node) if names else ""
 
 
+def insert(text: str, file: Path, before: str | None = None) -> None:
+    """Insert a text into a file that does not have it, before a line or at the end."""
+    old = file.read_text(encoding="utf-8")
+    place = old.index(before) if before else len(old)
+    if text not in old:
+        file.write_text(old[:place] + text + old[place:], encoding="utf-8")
+
+
 def main(checkout: Path) -> None:
     """Write the package, its names among TorchRL's, its entry in the documents, and its tests."""
     modules = {name: read(name) for name in MODULES}
@@ -125,14 +133,12 @@ def main(checkout: Path) -> None:
     ]
     lines += ["from .base import set_seed", f"\n__all__ = {[*ROOTS]}\n"]
     (checkout / FOLDER / "__init__.py").write_text("\n".join(lines), encoding="utf-8")
-    environments, entry = (
-        checkout / "torchrl/envs/__init__.py",
-        f"from .transforms.delays import {', '.join(names)}",
-    )
-    text = environments.read_text(encoding="utf-8")
-    if entry not in text:
-        text += f"\n{entry}  # noqa: E402\n\n__all__ += {names}\n"
-    environments.write_text(text, encoding="utf-8")
+    entry = f"\nfrom .transforms.delays import {', '.join(names)}  # noqa: E402\n\n__all__ += {names}\n"
+    insert(entry, checkout / "torchrl/envs/__init__.py")
+    for name, after in zip(
+        names, ("ActionDiscretizer", "ObservationNorm", "ObservationTransform"), strict=True
+    ):
+        insert(f"    {name}\n", checkout / "docs/source/reference/envs_transforms.rst", f"    {after}\n")
     shutil.copy(OWN / "test_delay_transforms.py", checkout / "test/transforms")
 
 
