@@ -183,9 +183,7 @@ class Comparison:
 
     def _present(self, task: str, delay: str) -> list[str]:
         """Methods that have a finished run of a task under a delay."""
-        return [
-            method for method in self.methods if (task, delay, method, self.policy_of(method)) in self._runs
-        ]
+        return [m for m in self.methods if (task, delay, m, self.policy_of(m)) in self._runs]
 
     def _compared(self, scores: pd.DataFrame, method: str) -> dict[str, Any]:
         """``COMPARED`` of a delayed method, over the seeds that it and its rivals have finished."""

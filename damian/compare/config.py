@@ -80,9 +80,7 @@ class Experiment(Settings):
                 should = "cannot name a folder: use letters, digits, _ . + - but not none, random or script"
                 checks.require(bool(good), f"experiment.{kind}", name, should)
         for kind in ("tasks", "methods"):
-            self.refuse(
-                not getattr(self, kind), kind, "is missing or empty; an experiment needs at least one"
-            )
+            self.refuse(not getattr(self, kind), kind, "is missing or empty; an experiment needs one")
         self._check_methods()
         for name, held_out in self.held_out.items():
             for kind in ("tasks", "delays", "methods"):

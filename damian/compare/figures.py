@@ -128,9 +128,7 @@ def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
     The setting along the axis has most values, and numbers if any has. The trained policy stands with its
     95 % intervals before those of the other panels, in grey. There are 40 panels at most.
     """
-    along = max(
-        groups, key=lambda key: (is_numeric_dtype(lines[key]), lines[key].nunique()), default="policy"
-    )
+    along = max(groups, key=lambda k: (is_numeric_dtype(lines[k]), lines[k].nunique()), default="policy")
     names = [] if is_numeric_dtype(lines[along]) else [*lines[along].unique()]
     places = lines[along].map(names.index) if names else lines[along]
     titles = ["\n".join(f"{k}={line[k]}" for k in groups if k != along) for line in lines.to_dict("records")]

@@ -131,9 +131,7 @@ class DelayedEnv(TransformedEnv):
         if torch.compiler.is_compiling() or not devices.data_dependent(done.device) or done.any():
             mask = done.view(-1)
             worlds, memories, first = self.reset_fn(worlds, memories, mask)
-            following |= {
-                k: torch.where(expand_mask(mask, new), new, following[k]) for k, new in first.items()
-            }
+            following |= {k: torch.where(expand_mask(mask, x), x, following[k]) for k, x in first.items()}
         return worlds, memories, outputs, following
 
     def _fused(self) -> list[StatefulTransform]:

@@ -107,10 +107,8 @@ def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
     other, gain = np.abs(best.chances - own.chances).sum() / 2, (own.likelihood - best.likelihood) / best.n
     law, loss = str(best.written).replace("'", ""), f" delay.loss={best.loss}" * (best.loss > 0)
     text = f'best law: "delay.obs={law}"{loss} clock.simulation={dt:g}s\n'
-    text += (
-        f"it gives {other:.1%} of the messages another delay; {own.written} are likelier by {gain:.3f} nats"
-    )
-    text += " a message"
+    text += f"it gives {other:.1%} of the messages another delay; "
+    text += f"{own.written} are likelier by {gain:.3f} nats a message"
     if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
         text += "\na bad fit: take the trace"
     return text

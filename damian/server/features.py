@@ -201,9 +201,7 @@ def feature(
     return declare
 
 
-FEATURES = Registry[Feature](
-    "feature", Feature, "is not a feature: decorate the function with damian.feature"
-)
+FEATURES = Registry[Feature]("feature", Feature, "is not a feature: decorate a function with damian.feature")
 """Features by name; those outside the package as ``package.module:name``."""
 
 

@@ -67,9 +67,7 @@ class RewardDelay(StatefulTransform):
     ) -> None:
         super().__init__(reward_key, reward_key, seed=seed)
         self.reward_key: NestedKey = self.in_keys[0]
-        self.delay_key, self.earned_key = (
-            sibling_key(self.reward_key, key) for key in (delay_key, earned_key)
-        )
+        self.delay_key, self.earned_key = (sibling_key(self.reward_key, k) for k in (delay_key, earned_key))
         self.out_keys = [self.reward_key, *existing([self.delay_key, self.earned_key])]
         self.sampler = sampler_of(delay, dt)
         checks.require(not self.sampler.loses, "delay", delay, LOSES)

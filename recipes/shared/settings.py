@@ -79,9 +79,7 @@ def _check_backupdate(config: TrainConfig) -> None:
     unable = "hindsight" in config.learner.reads and no_messages
     checks.require(not unable, "learner", config.learner.name, problem)
     onboard = "actor" in config.corrected and config.links.kind != "server"
-    problem = (
-        f"does not go with links={config.links.kind}: an actor sees what the links bring, not the server"
-    )
+    problem = f"does not go with links={config.links.kind}: an actor sees what links bring, not the server"
     checks.require(not onboard, "corrected", config.corrected, problem)
     for key, default in (("settle", False), ("corrected", ["reward", "critic"])):
         alone = getattr(config, key) != default and not config.backupdate

@@ -147,9 +147,7 @@ def _lattice(bounds: tuple[float, float, float, float], step: float, slant: floa
     width, height, rise = max_x - min_x, max_y - min_y, step * np.sin(slant)
     # Compared as products, since a quotient by a tiny step could overflow.
     if (width + 4 * step) * (height + rise) > MAX_CANDIDATES * step * rise:
-        problem = (
-            f"is too fine for a polygon of {width:g} m x {height:g} m: more than {MAX_CANDIDATES} points"
-        )
+        problem = f"is too fine for a polygon of {width:g} m x {height:g} m: over {MAX_CANDIDATES} points"
         raise InputError(f"region.lattice_step: {step:g} m {problem}; take a longer one")
     rows, start, ends = [], min_x, itertools.cycle([(max_x, 1), (min_x, -1)])
     for y, (end, sign) in zip(min_y + rise * np.arange(int(height / rise) + 1), ends, strict=False):
