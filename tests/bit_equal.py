@@ -33,17 +33,11 @@ SCENARIOS = [
     ["scenario=paper/usecase2"],
 ]
 DELAYS = [["delay=none"], ["delay=paper"], ["delay.obs=4"], ["delay=burst", "aware=belief"]]
+LATE = ["delay.act=2", "delay.rew=3", "delay.history=4"]
 OTHERS = [
     ["scenario=tracking", "delay=lag", "motion=polynomial"],
     ["scenario=energy", "delay=distance", "actions=continuous", "motion=polynomial"],
-    [
-        "scenario=mixed",
-        "delay=paper",
-        "delay.act=2",
-        "delay.rew=3",
-        "delay.history=4",
-        "aware=backupdate+history",
-    ],
+    ["scenario=mixed", "delay=paper", *LATE, "aware=backupdate+history"],
     ["scenario=coverage", "region=random", "agents=5", "delay.obs=2", "observation.own=true"],
     ["scenario=tracking", "links=matrix", "delay=paper"],
     ["scenario=tracking", "links=updown", "delay=paper"],
@@ -112,9 +106,7 @@ def training(overrides: list[str]) -> dict[str, list[str]]:
 def record(path: Path, word: str = "") -> None:
     """Write the record of the version that is installed, of all cases whose name has a word."""
     cases = [[*scenario, *delay] for scenario in SCENARIOS for delay in DELAYS] + OTHERS
-    content = (
-        json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    )  # what a stopped call has recorded
+    content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}  # of a stopped call
     for kind, overrides in [*(("rollout", case) for case in cases), *(("training", c) for c in TRAININGS)]:
         name = f"{kind} {' '.join(overrides)}"
         if word not in name or name in content:

@@ -159,9 +159,8 @@ class Counting(EnvBase):
     def _flag(self, salt: int) -> Tensor:
         """A flag that is true with probability 2/3, [B, N]."""
         agents = torch.arange(self.n_agents)
-        return (
-            counter_rng.bits(self.names.unsqueeze(-1), agents, torch.tensor([2 * self.total + salt])) % 3 > 0
-        )
+        bits = counter_rng.bits(self.names.unsqueeze(-1), agents, torch.tensor([2 * self.total + salt]))
+        return bits % 3 > 0
 
     def _outputs(self) -> TensorDict:
         shape = (*self.batch_size, self.n_agents)

@@ -129,9 +129,8 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
                     log -= (outside / (BLUR_M + policy.speed * age / 2)) ** 2 / 2
             expected.append(log)
         best = max(expected)
-        assert likely[world, 0].tolist() == pytest.approx(
-            [math.exp(log - best) for log in expected], abs=1e-4
-        )
+        found = likely[world, 0].tolist()
+        assert found == pytest.approx([math.exp(log - best) for log in expected], abs=1e-4)
         assert recent[world].item() == (min(ages) * policy.speed <= RECENT * radius)
 
 
@@ -165,9 +164,7 @@ def test_uavs_choose_one_after_the_other_where_their_footprints_hold_most_new_gr
             claimed.append(ends[torch.where(best, flown, torch.inf).argmin()])
 
 
-def ends_and_gains(
-    env: DelayedEnv, region: int, start: Tensor, weight: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def ends_and_gains(env: DelayedEnv, region: int, start: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
     """Where each action leads [A, 2], the weight in the footprint there, and the way [m], [A]."""
     simulation = env.uav_env.simulation
     points = simulation.airspace.points[region]

@@ -27,9 +27,7 @@ def believing(own: bool = False, **changed) -> DelayedEnv:
     sections = {
         "region": region,
         "observation": ObservationConfig(belief=["belief_moments"], own=own),
-        "actions": ActionConfig(
-            distances=[37.5 * n for n in range(9)], headings=[22.5 * n for n in range(16)]
-        ),
+        "actions": ActionConfig("discrete", [37.5 * n for n in range(9)], [22.5 * n for n in range(16)]),
     }
     return make_env(square(**(sections | changed)), 1, extras=["message"])
 
@@ -38,9 +36,7 @@ def believing(own: bool = False, **changed) -> DelayedEnv:
 def test_all_uavs_fly_to_where_they_detect_the_source(own):
     env = believing(own=own)
     td, centres = env.reset(), env.server.grid.centres
-    cell = (
-        (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()
-    )  # the cell in which the source certainly is
+    cell = (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()  # the source certainly is there
     td[keys.BELIEF] = torch.nn.functional.one_hot(cell, len(centres)).float().view(1, 1, -1)
     if own:
         td[keys.OWN_BELIEF] = td[keys.BELIEF].unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()

@@ -53,9 +53,8 @@ def test_every_method_trains_and_has_a_row_for_each_width(monkeypatch):
     methods = [words for words in METHODS if "compile" not in words]
     monkeypatch.setattr(bench_training, "METHODS", methods)
     table = training(worlds=2, steps=8, repeats=1)
-    assert [row[0] for row in table] == [
-        f"{width}: {name}" for width in WIDTHS for name in [*methods, bench_training.PRODUCTS, *rivals]
-    ]
+    every = [*methods, bench_training.PRODUCTS, *rivals]
+    assert [row[0] for row in table] == [f"{width}: {name}" for width in WIDTHS for name in every]
     assert {len(row) for row in table} == {len(HEADER)}
 
 

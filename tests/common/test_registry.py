@@ -72,7 +72,5 @@ def test_what_cannot_be_used_is_said_in_one_line(message):
 def test_an_import_that_fails_inside_the_module_blames_its_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "blame.py").write_text("\n\nimport no_such_package\n")
-    with pytest.raises(
-        InputError, match=r"importing it raised ModuleNotFoundError: .* \(blame\.py, line 3\)"
-    ):
+    with pytest.raises(InputError, match=r"importing it raised ModuleNotFound.*: .* \(blame\.py, line 3\)"):
         greetings().get("blame:formal", "greeting")

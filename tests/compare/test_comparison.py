@@ -1,5 +1,7 @@
 """Comparisons of methods: pairs of seeds, J_norm, recovery, and the tables of them."""
 
+import itertools
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,14 +20,8 @@ METHODS = {
 
 def row(task: str, delay: str, method: str, seed: int, value: float, policy: str = TRAINED) -> dict:
     """A row of results in which every measure has the same value."""
-    labels = {
-        "task": task,
-        "delay": delay,
-        "method": method,
-        "regime": "late data",
-        "seed": seed,
-        "policy": policy,
-    }
+    labels = {"task": task, "delay": delay, "method": method, "regime": "late data"}
+    labels |= {"seed": seed, "policy": policy}
     return labels | {"frames": 400, "seconds": 36.0} | dict.fromkeys((*MEASURED, "episodes"), value)
 
 
@@ -39,9 +35,7 @@ def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float
     ]
 
 
-def comparison(
-    rows: list[dict], methods: dict[str, Method] = METHODS, curves: list[tuple] = ()
-) -> Comparison:
+def comparison(rows: list[dict], methods: dict[str, Method] = METHODS, curves: list = ()) -> Comparison:
     columns = ["task", "delay", "method", "seed", "frames", "hindsight_return", "perceived_success_rate"]
     return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), methods)
 
@@ -115,11 +109,8 @@ def test_a_recovery_is_from_the_naive_method_of_the_same_track_if_the_delay_cost
 def test_an_untrained_network_stands_beside_the_trained_one_and_as_a_method_of_its_own():
     methods = METHODS | {"prior": Method(untrained=True)}
     rows = rows_of("t", "late", SCORES)
-    rows += [
-        row("t", "late", method, seed, 2.0 + seed, UNTRAINED)
-        for method in ("aware", "prior")
-        for seed in (0, 1)
-    ]
+    prior = itertools.product(("aware", "prior"), (0, 1))
+    rows += [row("t", "late", method, seed, 2.0 + seed, UNTRAINED) for method, seed in prior]
     table = comparison(rows, methods).table
     lines = table[table["policy"] == UNTRAINED]
     assert [*lines["method"]] == ["aware", "prior"]

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from damian.compare.figures import METHOD_COLOURS, plot_sweep
-from damian.compare.paired import means
+from damian.compare.paired import MEASURES, means
 
 TO_CONES = [[0.41222, 0.53633, 0.05145], [0.21190, 0.68070, 0.10740], [0.08830, 0.28172, 0.62998]]
 TO_LAB = [[0.21045, 0.79362, -0.00407], [1.97800, -2.42859, 0.45059], [0.02590, 0.78277, -0.80868]]
@@ -27,47 +27,34 @@ def oklab(colour: str, seen: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seen", [np.eye(3), np.array(DEUTERANOPIA)], ids=["all receptors", "deuteranopia"])
 def test_colours_of_methods_are_far_apart(seen):
     places = [oklab(colour, seen) for colour in METHOD_COLOURS]
-    assert (
-        min(np.linalg.norm(a - b) for a, b in itertools.combinations(places, 2)) > 0.15
-    )  # 1: black to white
+    pairs = itertools.combinations(places, 2)
+    assert min(np.linalg.norm(a - b) for a, b in pairs) > 0.15  # 1: black to white
     assert all(place[0] < 0.85 for place in places)  # they are seen on white
 
 
 def test_a_sweep_has_a_panel_for_each_value_with_the_other_panels_in_grey(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
-    groups, returns = ["aware", "delay.obs"], {("none", 4): 2.0, ("none", 0): 9.0, ("timeline", 4): 7.0}
+    returns = {("none", 4): 2.0, ("none", 0): 9.0, ("timeline", 4): 7.0}
     rows = pd.DataFrame(
         [
-            {
-                "aware": aware,
-                "delay.obs": steps,
-                "policy": policy,
-                "seed": seed,
-                "return": mean + seed - 10 * (policy == "script"),
-            }
-            for (aware, steps), mean in returns.items()
+            (*place, policy, seed, mean + seed - 10 * (policy == "script"), 0.0, 1.0, 0.0, 0.0)
+            for place, mean in returns.items()
             for seed in (-1, 0, 1)
             for policy in ("trained", "script", "untrained")
-        ]
-    ).assign(success_rate=0.0, steps=1.0, perceived_return=0.0, age=0.0)
-    for keys in (groups, ["aware"], []):
-        plot_sweep(means(rows, keys), keys, tmp_path / "figure.png")
-    first, second = drawn[0].axes[:2]
-    assert (first.get_title(), second.get_title(), first.get_xlabel()) == (
-        "aware=none",
-        "aware=timeline",
-        "delay.obs",
+        ],
+        columns=[*(groups := ["aware", "delay.obs"]), "policy", "seed", *MEASURES],
     )
-    found = {
-        line.get_label(): line.get_xydata().tolist()
-        for line in first.lines
-        if line.get_color() != METHOD_COLOURS[0]
-    }
+    for keys in (groups, groups[:1], []):
+        plot_sweep(means(rows, keys), keys, tmp_path / "figure.png")
+    assert len(drawn) == 2  # without a setting there is nothing to draw
+    first, second = drawn[0].axes[:2]
+    assert (first.get_title(), second.get_title()) == ("aware=none", "aware=timeline")
+    assert first.get_xlabel() == "delay.obs"
+    trained, (error,) = first.containers[0][0], first.containers[0][2]
+    found = {line.get_label(): line.get_xydata().tolist() for line in first.lines if line is not trained}
     assert found == {"other panels": [[4, 7]], "script": [[0, -1], [4, -8]]}
-    bars = first.containers[0]
-    assert bars[0].get_xydata().tolist() == [[0, 9], [4, 2]]
-    low, high = bars[2][0].get_segments()[1][:, 1]
+    assert trained.get_xydata().tolist() == [[0, 9], [4, 2]]
+    low, high = error.get_segments()[1][:, 1]
     assert low < 2 < high
     assert [label.get_text() for label in drawn[1].axes[0].get_xticklabels()] == ["none", "timeline"]
-    assert len(drawn) == 2  # without a setting there is nothing to draw

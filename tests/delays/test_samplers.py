@@ -45,11 +45,6 @@ def test_links_keep_the_states_of_all_samplers_floats_or_not():
         assert found[:, link].equal(drawn(sampler, streams, 9)[:, link])
 
 
-def test_a_sampler_must_draw():
-    with pytest.raises(TypeError, match="abstract"):
-        Sampler(3)  # type: ignore[abstract]
-
-
 # Contexts.
 
 

@@ -212,11 +212,8 @@ def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
     for sender, (w, n) in zip(senders(transform, law), ROWS, strict=True):
         purse, in_transit = Purse(), 0.0
         for t in range(STEPS):
-            delay, reward, ended = (
-                sender.send(t + 1, seen[t][w][n][4], N_AGENTS) or 0,
-                earned[t][w][n][0],
-                done[t][w][0],
-            )
+            delay = sender.send(t + 1, seen[t][w][n][4], N_AGENTS) or 0
+            reward, ended = earned[t][w][n][0], done[t][w][0]
             assert reported[t][w][n] == [delay]
             assert received[t][w][n][0] == purse.step(t, reward, delay, ended)
             in_transit += reward - received[t][w][n][0]

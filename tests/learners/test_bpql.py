@@ -64,9 +64,7 @@ def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_fr
                 place = world, step, agent
                 before, after = flight["agents"][place], flight["next", "agents"][place]
                 twin = [
-                    torch.cat(
-                        [each["observation"], each["privileged_observation"][:-2]]
-                    )  # without the source
+                    torch.cat([each["observation"], each["privileged_observation"][:-2]])  # no source
                     for each in (before, after)
                 ]
                 expected.append(torch.cat(twin))
@@ -83,7 +81,5 @@ def test_bpql_waits_for_states_and_refuses_to_learn_without_back_updating():
     with pytest.raises(InputError, match="learner: bpql needs back-updating"):
         config.check(learning(SMALL, longest_delay=3))
     config.check(learning(SMALL, longest_delay=3, backupdate=True))
-    config.check(
-        learning(SMALL, longest_delay=3, critic_key=keys.PRIVILEGED_OBSERVATION)
-    )  # states that are true anyway
+    config.check(learning(SMALL, longest_delay=3, critic_key=keys.PRIVILEGED_OBSERVATION))  # always true
     config.check(learning(SMALL))  # nothing is late

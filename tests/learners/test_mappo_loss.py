@@ -166,9 +166,7 @@ def test_values_are_those_of_two_passes_over_the_batch(case):
         hook.remove()
         expected = (learner.critic(batch.copy()), learner.critic(batch["next"].copy()))
     torch.testing.assert_close(values, tuple(td[keys.STATE_VALUE] for td in expected))
-    assert evaluated == [
-        batch.numel() + 4 + int(ends[:, :-1].sum()) + 1
-    ]  # last steps, ends, and the correction
+    assert evaluated == [batch.numel() + 4 + int(ends[:, :-1].sum()) + 1]  # last steps, ends, correction
 
 
 @pytest.mark.sample(2)

@@ -64,9 +64,7 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
     ],
     ids=lambda part: part[-1] if isinstance(part, list) else "",
 )
-def test_a_mistake_is_answered_in_one_line_and_leaves_no_folder(
-    capsys, tmp_path, monkeypatch, words, message
-):
+def test_a_mistake_is_one_line_and_leaves_no_folder(capsys, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stop:
         main(words)

@@ -21,14 +21,8 @@ from damian.runs.run_folder import locked
 from damian.runs.run_record import read_record
 
 ROOT = Path(__file__).parents[2]
-SMALL = [
-    "frames=16",
-    "worlds=2",
-    "learner.steps=4",
-    "learner.epochs=1",
-    "eval_episodes=3",
-    "model.hidden=[4]",
-]
+SMALL = ["frames=16", "worlds=2", "learner.steps=4", "learner.epochs=1"]
+SMALL += ["eval_episodes=3", "model.hidden=[4]"]
 
 
 def listed(*words: str) -> str:
@@ -134,12 +128,8 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
     assert read_record(place / "paper" / "finetuned" / "seed_3")[POLICY] == policy
     rows = measured(folder)
     regimes = {row["method"]: row["regime"] for row in rows}
-    assert regimes == {
-        "undelayed": "no delay",
-        "naive": "late data",
-        "finetuned": "simulator",
-        "student": "simulator",
-    }
+    others = dict.fromkeys(("finetuned", "student"), "simulator")
+    assert regimes == {"undelayed": "no delay", "naive": "late data", **others}
 
     shutil.rmtree(place)
     compare(*words, "keep=true")

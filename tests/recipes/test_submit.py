@@ -89,9 +89,7 @@ def test_every_submission_of_the_leaderboard_is_whole():
 def test_a_comparison_is_submitted(tmp_path, monkeypatch):
     """As docs/delaybench.md tells it, with a few steps."""
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(
-        "damian.runs.run_record.commit", lambda: "abc"
-    )  # files may be changed while tests run
+    monkeypatch.setattr("damian.runs.run_record.commit", lambda: "abc")  # files may change meanwhile
     small = "['frames=64','worlds=2','learner.steps=8','eval_episodes=100','episode.max_steps=2']"
     what = ["tasks=[crowded]", "delays=['1-7']", "methods=[undelayed,timeline]", f"overrides={small}"]
     main(["compare", "experiment=delaybench", "seeds=5", *what, f"hydra.run.dir={tmp_path}/runs"])

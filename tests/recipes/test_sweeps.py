@@ -107,9 +107,7 @@ def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, caps
 
 
 def test_a_difference_takes_only_seeds_that_both_have():
-    runs = pd.DataFrame(
-        {"seed": [0, 1, 2, 5], "return": [3.0, 5.0, 4.0, 99.0], "steps": [1.0, 2.0, 3.0, 0.0]}
-    )
+    runs = pd.DataFrame({"seed": [0, 1, 2, 5], "return": [3.0, 5.0, 4.0, 99.0], "steps": [1, 2, 3, 0]})
     others = pd.DataFrame({"seed": [2, 1, 0], "return": [3.5, 4.0, 1.0], "steps": [4.0, 5.0, 6.0]})
     found = difference(runs, others, "return")
     assert found["difference"] == pytest.approx((2 + 1 + 0.5) / 3)

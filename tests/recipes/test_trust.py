@@ -173,9 +173,7 @@ def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(stor
 
     word = "logger.custom=[mine:X]"
     store("logger.custom", ["mine:X"])
-    with pytest.raises(
-        InputError, match=r"logger\.custom\.logger: this run uses code outside DAMIAN \(mine:X"
-    ):
+    with pytest.raises(InputError, match=r"logger\.custom\.logger: this run uses code outside DAMIAN .mine:"):
         imported(lambda: damian.load("run"))
     assert imported(lambda: damian.load("run", word))
     assert imported(lambda: damian.load("run", trust=True))

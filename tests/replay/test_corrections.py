@@ -194,9 +194,8 @@ class Twin:
     def message(self, t: int, row: tuple[int, ...]) -> list[float]:
         g, name = self.newest[t][self.senders.index(row)], key(self.group, "message")
         at_reset = g < self.start[t]
-        return (
-            self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
-        ).tolist()
+        found = self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
+        return found.tolist()
 
     def observation(self, t: int, row: tuple[int, ...]) -> list[float]:
         number, draw = self.message(t, row)
@@ -267,11 +266,8 @@ def test_stored_steps_become_what_a_slow_twin_says(group, seed):
         for world in range(WORLDS):
             twin = Twin(steps, world, group, case)
             done = [a or b for a, b in zip(twin.terminated, twin.truncated, strict=True)]
-            for name, right in (
-                ("terminated", twin.terminated),
-                ("truncated", twin.truncated),
-                ("done", done),
-            ):
+            ends = {"terminated": twin.terminated, "truncated": twin.truncated, "done": done}
+            for name, right in ends.items():
                 assert after["next", name][:, world, 0].tolist() == right[n_older:]
             assert after["valid"][:, world, 0].tolist() == twin.valid[n_older:]
             for t in range(n_older, 40):

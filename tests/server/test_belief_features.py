@@ -86,9 +86,8 @@ def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
     for world, uav, source in ((0, 0, 0), (5, 2, 0), (5, 2, 1)):
         expected = [0.0] * (len(BELIEF_RINGS) + 1) * BELIEF_SECTORS
         x, y = messages.position[world, uav].tolist()
-        for p, (east, north) in zip(
-            belief[world, source].tolist(), server.grid.centres.tolist(), strict=True
-        ):
+        pairs = zip(belief[world, source].tolist(), server.grid.centres.tolist(), strict=True)
+        for p, (east, north) in pairs:
             distance = math.hypot(east - x, north - y)
             ring = sum(distance > radius * simulation.radius for radius in BELIEF_RINGS)
             sector = round(math.atan2(east - x, north - y) / (2 * math.pi) * BELIEF_SECTORS) % BELIEF_SECTORS

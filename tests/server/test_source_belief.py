@@ -61,16 +61,11 @@ def test_reports_of_a_source_that_stays_have_the_probabilities_of_all_cases(miss
             now, both, before = 0.0, 0.0, 0.0
             for covered, weight in ((True, share), (False, 1 - share)):
                 heard = 1 - miss if covered else alarm
-                fits = (
-                    heard if row % 2 else 1 - heard
-                )  # while it emits, and before, when it may have been silent
+                fits = heard if row % 2 else 1 - heard  # while it emits; before, it may have been silent
                 quiet = alarm if row % 2 else 1 - alarm
                 earlier = emission * fits + (1 - emission) * quiet
-                now, both, before = (
-                    now + weight * fits,
-                    both + weight * fits * earlier,
-                    before + weight * earlier,
-                )
+                now, before = now + weight * fits, before + weight * earlier
+                both += weight * fits * earlier
             assert grid.log_reports[row, cell].exp().item() == pytest.approx(now, rel=1e-4)
             assert grid.log_reports[row + half, cell].exp().item() == pytest.approx(both / before, rel=1e-4)
 

@@ -92,9 +92,7 @@ def test_a_film_of_the_space_cuts_nothing_and_says_how_heights_are_drawn(up, sai
 @pytest.mark.parametrize("view", ["2d", "3d"])
 def test_charging_places_are_drawn_and_explained(view):
     places = flight(about={"charging_points": [[150.0, 150.0]]})
-    plain, charged = (
-        np.asarray(Film(each, view).frame(0), int)[100:500, :500] for each in (flight(), places)
-    )
+    plain, charged = (np.asarray(Film(e, view).frame(0), int)[100:500, :500] for e in (flight(), places))
     assert 20 < (np.abs(plain - charged).sum(-1) > 0).sum() < 200
     assert "charging place" in [text.get_text() for text in Film(places).figure.legends[0].get_texts()]
 

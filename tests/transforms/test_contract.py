@@ -194,9 +194,8 @@ def test_a_transform_works_around_a_vector_of_environments(case):
 
 def some(cases, fast):
     """The cases as a parameter; all but the ``fast`` ones are slow tests, because they take seconds."""
-    values = [
-        pytest.param(case, id=n, marks=() if n in fast else pytest.mark.slow) for n, case in cases.items()
-    ]
+    slow = pytest.mark.slow
+    values = [pytest.param(case, id=n, marks=() if n in fast else slow) for n, case in cases.items()]
     return pytest.mark.parametrize("case", values)
 
 

@@ -107,9 +107,8 @@ def test_equal_values_for_each_uav_are_bit_for_bit_one_value():
 
 def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
     drawn = {"wind.speed": [0, 6], "motion.max_acceleration": [1, 2, 3], "source.miss": [0.0, 0.5]}
-    scenario = replace(
-        WORLD, motion=MotionConfig(kind="polynomial"), wind=WindConfig(gusts=2.0), randomise=drawn
-    )
+    flying, gusty = MotionConfig(kind="polynomial"), WindConfig(gusts=2.0)
+    scenario = replace(WORLD, motion=flying, wind=gusty, randomise=drawn)
     together, alone = UavEnv(scenario, 5, seed=0), UavEnv(scenario, 1, seed=0)
     seeds = torch.arange(5) * 17
     together.seed_worlds(seeds)
@@ -248,10 +247,7 @@ def test_rewards_by_the_truth_are_those_without_misses_and_false_alarms():
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        (
-            {"motion": MotionConfig(kind="polynomial", max_speed=[1.0, 2.0])},
-            "motion.max_speed: .* each of the 3",
-        ),
+        ({"motion": MotionConfig("polynomial", max_speed=[1.0, 2.0])}, "motion.max_speed: .* each of the 3"),
         ({"motion": MotionConfig(), "wind": WindConfig(speed=3.0)}, "wind: .* needs motion=polynomial"),
         ({"randomise": {"agents": [1, 2]}}, "randomise.agents: .* cannot be drawn, only motion.max_speed"),
         ({"randomise": {"wind.speed": [0, 1000]}}, "wind.speed: 1000"),

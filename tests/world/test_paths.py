@@ -78,9 +78,8 @@ def test_a_flight_around_a_zone_takes_the_time_of_its_way():
     region = RegionConfig(kind="vertices", vertices=DENTED, zones=ZONES, lattice_step=45.0)
     env = UavEnv(ScenarioConfig(agents=1, region=region, motion=MotionConfig(kind="polynomial")), 1, 0)
     airspace, vehicles = env.simulation.airspace, env.simulation.vehicles
-    origin, goal = (
-        torch.tensor([[each]]) for each in divmod(int(airspace.detours.pair[0]), airspace.max_points)
-    )
+    first = divmod(int(airspace.detours.pair[0]), airspace.max_points)
+    origin, goal = (torch.tensor([[each]]) for each in first)
     state, yes = env.state._replace(goal=origin), torch.ones(1, 1, dtype=torch.bool)
     state = vehicles.take_off(state, goal, yes, yes)
     straight = torch.dist(airspace.points[0, origin.item()], airspace.points[0, goal.item()])

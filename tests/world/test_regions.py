@@ -134,9 +134,7 @@ def _map(file: Path, crs: str = "EPSG:4326", ring: list = RING) -> Path:
         "yard": [[x + 0.01, y, 0.0] for x, y in ring],
     }
     if file.suffix == ".kml":
-        rings = {
-            name: " ".join(",".join(map(str, corner)) for corner in area) for name, area in areas.items()
-        }
+        rings = {n: " ".join(",".join(map(str, corner)) for corner in area) for n, area in areas.items()}
         folders = "".join(PLACEMARK.format(name, ring) for name, ring in rings.items())
         kml = f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{folders}</Document></kml>'
         return _written(file.parent, file.name, kml)
