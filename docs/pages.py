@@ -24,6 +24,8 @@ ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
 TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff", "SECURITY.md": "SECURITY.md"}
 TEXTS |= {"examples/fleet/README.md": "fleet.md", "examples/fleet/docs/mavlink.md": "mavlink.md"}
+CARDS = ROOT.glob("damian/data/*/README.md")
+TEXTS |= {f"damian/data/{card.parent.name}/README.md": f"policies/{card.parent.name}.md" for card in CARDS}
 """Files beside docs/, and what they are called in the site."""
 SHOWN = (*SCHEMAS,)
 """Programs whose settings have a page."""
@@ -106,7 +108,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         path = posixpath.normpath(posixpath.join(folder, match[1]))
         if path.startswith("examples/") and path not in TEXTS:
             path += ".md"
-        if path.startswith("damian/"):  # a module; its page has a heading for it
+        if path.startswith("damian/") and path not in TEXTS:  # a module; its page has a heading for it
             module = path.removesuffix(".py").replace("/", ".")
             path = f"api/{module.split('.')[1]}.md#{module}"
         site = TEXTS.get(path, path.removeprefix("docs/"))

@@ -50,7 +50,7 @@ class TrainConfig(ScenarioConfig):
         "With ``backupdate``: what late messages correct: reward, critic (its observation), actor (its own).",
     )
     checkpoint: str | None = setting(
-        None, "Run folder, or the best.pt in it, of the policy to begin with or to fly; its settings apply."
+        None, "Run folder, its best.pt, or damian:NAME: the policy to begin with or to fly, and its settings."
     )
     overrides: list[str] = constant([], "Words of the command line, to be shown; the program fills them in.")
     resume: str | None = setting(None, "Run folder of the run to continue.")
@@ -183,7 +183,7 @@ class AdviseConfig(FlownPolicyConfig):
 class ExportConfig(Settings):
     """All settings of ``damian export``."""
 
-    checkpoint: str | None = setting(None, "Run folder, or the best.pt in it, of the policy to export.")
+    checkpoint: str | None = setting(None, "Run folder, its best.pt, or damian:NAME: the policy to export.")
     trust: bool = setting(False, "Import the components package.module:Name that the run folder names.")
 
 

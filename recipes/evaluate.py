@@ -70,7 +70,7 @@ def load(
     """Load the trained policy of a run folder, with an environment of its scenario or of a changed one.
 
     Args:
-        run: run folder, or the ``best.pt`` in it.
+        run: run folder, the ``best.pt`` in it, or ``damian:NAME``, one of the package (docs/policies.md).
         *overrides: changes to the settings of the run, such as ``delay.obs=6`` or ``agents=5``.
         worlds: number of parallel worlds of the environment, B.
         seed: of the environment; that of ``damian evaluate`` if not given.
@@ -93,7 +93,7 @@ def load(
         config = with_policy_of(values, words)
         check_components(config)  # imports all of the user's own that is ever needed
         eval_seed = config.eval_seed if seed is None else seed
-        env = make_env(config, worlds, eval_seed, config.device)
+        env = make_env(config, worlds, eval_seed, config.device, ["message"])
         policy = stored_actor(config, env).eval().requires_grad_(False)
     add_recurrent_state(env, policy)
     kind = InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM

@@ -47,12 +47,13 @@ def export(run: Path, trust: bool = False) -> Path:
     except ImportError as error:
         raise InputError(f"export needs {error.name}: pip install 'damian[export]'") from None
     actor, env = load(run, worlds=2, deterministic=True, trust=trust)
-    config, target = stored_config(run_folder(run), "checkpoint"), run_folder(run) / EXPORT
+    config, shipped = stored_config(run_folder(run), "checkpoint"), str(run).startswith("damian:")
+    target = (Path("runs", run_folder(run).name) if shipped else run_folder(run)) / EXPORT
     any_number = any_number_of_uavs(config)
     policy, program, onnx = exported(actor, env, any_number, config.learner.name)
     described = describe(run, policy, env, any_number)
     with writing(target):
-        target.mkdir(exist_ok=True)
+        target.mkdir(parents=shipped, exist_ok=True)
         torch.export.save(program, target / "policy.pt2")
         onnx.save(target / "policy.onnx", external_data=False)
     text = json.dumps(described, indent=2, default=lambda x: x.tolist() if isinstance(x, Tensor) else str(x))
@@ -137,8 +138,8 @@ def main(given: DictConfig) -> None:
     config = cli.checked(given, [], "export")
     if config.checkpoint is None:
         raise InputError("checkpoint: it is missing: the run folder of the policy to export")
-    folder = Path(config.checkpoint)
-    target = export(folder, config.trust)
-    if not (folder / RESULTS).exists() and not folder.is_file():
-        print(f"{folder}: the training has not finished; its latest checkpoint is exported")
+    written = Path(config.checkpoint)
+    target = export(written, config.trust)
+    if not (run_folder(written) / RESULTS).exists() and not written.is_file():
+        print(f"{written}: the training has not finished; its latest checkpoint is exported")
     print(f"results: {target}")

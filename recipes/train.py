@@ -118,7 +118,8 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
         checks.require(made - made / updates < config.frames, "frames", config.frames, problem)
     elif config.checkpoint:
         trained = stored_values(run_folder(Path(config.checkpoint)), "checkpoint")["learner"]["name"]
-        names = ["actor", "critic"] if trained == config.learner.name else ["actor"]
+        shipped = config.checkpoint.startswith("damian:")  # without a critic
+        names = ["actor", "critic"] if trained == config.learner.name and not shipped else ["actor"]
         networks = {name: state.components[name] for name in names if name in state.components}
         load_networks(Path(config.checkpoint), "checkpoint", networks)
     if not config.resume:

@@ -12,6 +12,7 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
 
+from damian.common.text_files import data_file
 from damian.learners.schedule import SystemClock
 from damian.runs.checkpoint import read_checkpoint, restore, to_tensordict, write_checkpoint
 from damian.runs.metrics import EpisodeLog, HindsightReturns
@@ -103,7 +104,8 @@ def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> Non
 
 
 def checkpoint_file(written: Path) -> Path:
-    """The file that a run folder, or a file in one, stands for."""
+    """The file that a run folder, a file in one, or ``damian:NAME`` of the package's own, stands for."""
+    written = Path(data_file(str(written)))
     return written if written.is_file() else written / CHECKPOINT
 
 

@@ -167,8 +167,8 @@ def save_config(config: TrainConfig, folder: Path) -> None:
 
 
 def run_folder(written: Path) -> Path:
-    """The run folder that a folder, or a checkpoint file in it, stands for."""
-    return written.parent if written.is_file() else written
+    """The run folder that is written as ``checkpoint_file`` reads it."""
+    return checkpoint_file(written).parent
 
 
 def stored_values(folder: Path, key: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The evaluation recipe, run by its command line: a trained policy with other UAVs, regions and delays."""
+"""A trained policy with other UAVs, regions and delays: ``damian evaluate``, and ``damian.load``."""
 
 import shutil
 import sys
@@ -10,11 +10,16 @@ from helpers import check_refused
 from omegaconf import OmegaConf
 
 import damian
+from damian import keys
+from damian.common.errors import InputError
+from damian.common.tables import read_csv
 from damian.compare.comparison import OF_METHOD
 from damian.recipes import train
+from damian.runs.metrics import evaluate
 
 TRAINED = ["frames=64", "worlds=4", "learner.steps=8", "model.hidden=[16]", "eval_episodes=8", "logger=csv"]
 TRAINED += ["episode.max_steps=10", "region.lattice_step=60", "seed=3", "delay.obs=1"]
+SHIPPED = sorted(Path(damian.__file__).parent.glob("data/*/"))
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +79,25 @@ def test_an_option_replaces_what_its_group_sets_and_all_else_stays(fly):
     assert (config.episode.max_steps, config.region.lattice_step, config.seed) == (10, 60, 3)
 
 
+def test_a_loaded_policy_flies_as_it_was_evaluated(trained):
+    policy, env = damian.load(trained, worlds=8, deterministic=True)
+    rollout = env.rollout(10, policy, break_when_any_done=False)
+    perceived = rollout["next", *keys.REWARD].sum(1).mean().item()
+    rows = damian.results(trained).set_index("policy")
+    assert perceived == pytest.approx(rows.at["trained, deterministic", "perceived_return"])
+
+
+def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
+    policy, env = damian.load(trained / "best.pt", "agents=5", "delay.obs=3", worlds=4, seed=1)
+    one, other = (env.rollout(5, policy)[keys.ACTION] for _ in range(2))
+    assert one.shape == (4, 5, 5)
+    assert not one.equal(other)  # actions are drawn
+    with pytest.raises(InputError, match=r"model.hidden: the policy was trained with \[16\]"):
+        damian.load(trained, "model.hidden=[8]")
+    with pytest.raises(InputError, match=r"checkpoint: .*nowhere holds no config.yaml"):
+        damian.load(trained.parent / "nowhere")
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -84,3 +108,21 @@ def test_an_option_replaces_what_its_group_sets_and_all_else_stays(fly):
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path, overrides, message):
     check_refused(lambda: fly(*overrides), message, capsys)
     assert [*tmp_path.glob("*/*")] == []
+
+
+def test_the_policies_of_the_package_are_a_megabyte_of_plain_data():
+    assert len(SHIPPED) == 5
+    files = [file for folder in SHIPPED for file in folder.iterdir()]
+    assert {file.name for file in files} == {"checkpoint.pt", "config.yaml", "result.csv", "README.md"}
+    assert sum(file.stat().st_size for file in files) <= 1_000_000
+
+
+@pytest.mark.sample(5)
+@pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
+def test_a_policy_of_the_package_returns_what_its_card_says(folder):
+    policy, env = damian.load(f"damian:{folder.name}", worlds=50, seed=1)
+    told = read_csv(folder / "result.csv", ["law", "policy"]).iloc[0]
+    assert (told["law"], told["policy"]) == ("as trained", "sampled")
+    assert f"{told['return']:.1f} ± {told['interval']:.1f}" in (folder / "README.md").read_text("utf-8")
+    horizon = env.uav_env.scenario.episode.max_steps
+    assert evaluate(env, policy, horizon).return_ == pytest.approx(told["return"], rel=0.1)

@@ -13,7 +13,6 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
-from damian.recipes.shared.environments import compose_scenario
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import (
     ActionConfig,
@@ -34,6 +33,7 @@ WORLD = ScenarioConfig(
     actions=ActionConfig(distances=[0.0, 110.0, 230.0]),
     clock=clock("2s"),
 )
+STILL = replace(WORLD, motion=MotionConfig(), battery=BatteryConfig())
 
 
 def through_the_air(way, wind, speed):
@@ -134,9 +134,8 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
 def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     levels, flying = [138.0, 142.0, 145.0], MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
     base = replace(
-        WORLD,
+        STILL,
         motion=flying,
-        battery=BatteryConfig(),
         observation=ObservationConfig(
             global_features=["coverage", "source_distance", "coverage_map"],
             belief=["belief_gain", "belief_map"] * belief,
@@ -170,25 +169,18 @@ def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     assert met == {*levels}
 
 
-def test_words_say_what_is_drawn():
-    drawn = compose_scenario("scenario=patrol", "randomise={source.level_db: [150], delay.loss: [0, 0.2]}")
-    assert drawn.randomise == {"source.level_db": [150], "delay.loss": [0, 0.2]}
-
-
-def test_coverage_of_a_range_of_levels_is_refused():
-    watched = replace(WORLD, observation=ObservationConfig(global_features=["coverage_map"]))
+@pytest.mark.parametrize("seen", [{"global_features": ["coverage_map"]}, {"belief": ["belief_map"]}])
+def test_what_has_tables_for_each_level_refuses_a_range_of_them(seen):
+    drawn = {"source.level_db": [138, 142]}
     with pytest.raises(InputError, match=r"randomise.source.level_db: .* is a range, .* give a list"):
-        UavEnv(replace(watched, randomise={"source.level_db": [138, 142]}))
+        make_env(replace(STILL, observation=ObservationConfig(**seen), randomise=drawn))
 
 
 def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
     losses, law = [0.0, 0.3, 0.9], {"law": "lag", "lag": {"law": "uniform", "low": 1, "high": 4}}
-    base = replace(WORLD, motion=MotionConfig(), battery=BatteryConfig(), delay=DelayConfig(obs=law))
-    envs = [make_env(replace(base, randomise={"delay.loss": losses}), 12, 0, extras=["message"])]
-    envs += [
-        make_env(replace(base, delay=DelayConfig(law, loss=loss)), 12, 0, extras=["message"])
-        for loss in losses
-    ]
+    scenarios = [replace(STILL, delay=DelayConfig(law), randomise={"delay.loss": losses})]
+    scenarios += [replace(STILL, delay=DelayConfig(law, loss=loss)) for loss in losses]
+    envs = [make_env(each, 12, 0, extras=["message"]) for each in scenarios]
     actions = [torch.randint(24, (12, 3), generator=torch.Generator().manual_seed(i)) for i in range(60)]
     flown = []
     for env in envs:
@@ -207,7 +199,7 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
 
 def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
     source = replace(WORLD.source, level_db=150.0, miss=0.3, false_alarm=0.1)
-    env = UavEnv(replace(WORLD, motion=MotionConfig(), battery=BatteryConfig(), source=source), 64, seed=0)
+    env = UavEnv(replace(STILL, source=source), 64, seed=0)
     td, counts = env.reset(), torch.zeros(2, 2)
     for _ in range(40):
         state = env.state
@@ -222,13 +214,8 @@ def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
 
 
 def test_rewards_by_the_truth_are_those_without_misses_and_false_alarms():
-    clear = replace(
-        WORLD,
-        motion=MotionConfig(),
-        battery=BatteryConfig(),
-        reward=RewardConfig(spotted=0.0, spotting_agents=1.0),
-        source=replace(WORLD.source, level_db=150.0),
-    )
+    reward = RewardConfig(spotted=0.0, spotting_agents=1.0)
+    clear = replace(STILL, reward=reward, source=replace(WORLD.source, level_db=150.0))
     reported = replace(clear, source=replace(clear.source, miss=0.5, false_alarm=0.2))
     judged, rewards = replace(reported, reward=replace(clear.reward, detection="truth")), []
     for scenario in (clear, judged, reported):
