@@ -90,7 +90,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         return told[""], rewards[""], terminated, truncated, info | more[""]
 
 
-class DelayVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
     """Delays the B worlds of a Gymnasium vector environment as one batch, each as ``DelayWrapper`` does.
 
     Its arguments are those of ``DelayWrapper``; the parts of an observation have one law. Each world draws

@@ -112,7 +112,7 @@ def _shortest(polygon: shapely.Geometry, points: Floats, pairs: NDArray[np.int64
     straight = np.full((len(corners), len(places)), np.inf)
     one, other = np.divmod(np.arange(straight.size), len(places))
     seen = (one != other) & _visible(polygon, places[one], places[other])
-    one, other = one[seen], other[seen]
+    one, other = (each[seen].astype(np.int32) for each in (one, other))  # scipy 1.14 takes no others
     straight[one, other] = np.linalg.norm(places[one] - places[other], axis=1)
     graph = csr_array((straight[one, other], (one, other)), shape=(len(places),) * 2)
     along, before = dijkstra(graph, indices=np.arange(len(corners)), return_predecessors=True)
