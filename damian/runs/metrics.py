@@ -169,7 +169,7 @@ class EpisodeLog:
 
 
 def _latest(known: Tensor, ended: Tensor) -> Tensor:
-    """Numbers of the latest episodes of each world, [B, K, N].
+    """Numbers of the latest episodes of each world in order of time, [B, K, N].
 
     Args:
         known: those of the latest ones so far, [B, K, N], nan where there were fewer.
@@ -177,7 +177,7 @@ def _latest(known: Tensor, ended: Tensor) -> Tensor:
     """
     both = torch.cat([known, ended], 1)
     when = torch.arange(both.shape[1]).where(~both[..., 0].isnan(), -1)
-    latest = when.topk(known.shape[1], 1).indices.unsqueeze(-1).expand(-1, -1, both.shape[2])
+    latest = when.topk(known.shape[1], 1).indices.sort(1).values.unsqueeze(-1).expand(-1, -1, both.shape[2])
     return both.gather(1, latest)
 
 
