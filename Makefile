@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-gpu | fleet | benchmarl | upstream | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-gpu | fleet | fleet-campaign | benchmarl | upstream | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -8,7 +8,7 @@ PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-gpu fleet benchmarl upstream pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-gpu fleet fleet-campaign benchmarl upstream pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
@@ -38,11 +38,12 @@ coverage: $(VENV)/dev
 test-slow: $(VENV)/slow
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist worksteal -m slow $(ARGS)
 
-# The replay page, and every page of the documentation site, in Chromium: Debian and Ubuntu have it in these packages.
+# The replay page, the map of a fleet, and every page of the documentation site, in Chromium: Debian and Ubuntu have it in these packages.
 CHROMIUM = command -v chromium && command -v chromedriver || (apt-get update && apt-get install -y chromium chromium-driver)
-test-browser: $(VENV)/browser
+test-browser: $(VENV)/browser $(VENV)/fleet
 	$(CHROMIUM)
 	$(PY) -m pytest -m browser tests/show/test_replay_browser.py $(ARGS)
+	cd examples/fleet && $(abspath $(PY)) -m pytest -m browser $(ARGS)
 
 test-site: $(VENV)/browser $(VENV)/docs
 	$(CHROMIUM)
@@ -89,6 +90,10 @@ $(JAXMARL)/ready:
 # The tests of the service for fleets, a distribution of its own (examples/fleet).
 fleet: $(VENV)/fleet
 	cd examples/fleet && $(abspath $(PY)) -m pytest $(ARGS)
+
+# 1,000 seeded faults over a fleet of five in virtual time: the tables of its README, in some minutes.
+fleet-campaign: $(VENV)/fleet
+	cd examples/fleet && PYTHONPATH=. $(abspath $(PY)) -W ignore tests/campaign.py $(ARGS)
 
 bench-quick: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py --quick

@@ -1,11 +1,12 @@
-"""Where each UAV should land next, from a table of reports: one answer, when all rows have come in."""
+"""Where each UAV should land next, from what UAVs report."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pandas as pd
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
@@ -15,47 +16,83 @@ from damian.field.rows import Rows
 from damian.field.tracker import Tracker
 from damian.learners.recurrent import AgentGRU
 
+Policy = Callable[[TensorDictBase], TensorDictBase]
 
-def next_landings(
-    rows: Rows, node: Node, policy: TensorDictModuleBase, now: float, drawn: bool = False
-) -> pd.DataFrame:
+
+class Adviser(Tracker):
+    """A tracker that asks a policy, and keeps its hidden states.
+
+    With ``drawn``, actions are drawn from torch's generator; if not, the most likely ones are taken. Other
+    arguments as of ``Tracker``.
+    """
+
+    def __init__(
+        self, node: Node, uavs: Sequence[str], policy: Policy, drawn: bool = False, **more: Any
+    ) -> None:
+        self.policy, self.kind = policy, ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC
+        modules = policy.modules() if isinstance(policy, torch.nn.Module) else ()
+        sizes = [each.cell.hidden_size for each in modules if isinstance(each, AgentGRU)]
+        self._start = torch.zeros(1, len(uavs), sizes[0]) if sizes else None
+        self.hidden, self._hidden_after = self._start, self._start
+        """Hidden states before this step, [1, N, H]; None if the policy has none."""
+        super().__init__(node, uavs, **more)
+
+    def read(self, asking: Sequence[str]) -> TensorDictBase:
+        """What the policy reads, if these UAVs are ready to choose."""
+        read = self.observe().clone(False)
+        if keys.ACTION_MASK in read.keys(True):
+            read[keys.ACTION_MASK] = self.node.simulation.action_mask(self.state(asking))
+        if self.hidden is not None:
+            read[keys.HIDDEN] = self.hidden.clone()
+        return read
+
+    @torch.no_grad()
+    def ask(self, asking: Sequence[str]) -> Tensor:
+        """Actions of all UAVs, [1, N, ...], of which those of who asks count."""
+        with set_exploration_type(self.kind):
+            chosen = self.policy(self.read(asking))
+        self._hidden_after = None if self.hidden is None else chosen[keys.HIDDEN].detach()
+        return chosen[keys.ACTION]
+
+    def next_step(self) -> None:
+        if self.hidden is not None and self._hidden_after is self.hidden:
+            self.ask([])  # hidden states change in every step
+        super().next_step()
+        self.hidden = self._hidden_after
+
+    def begin_anew(self, step: int) -> None:
+        super().begin_anew(step)
+        self.hidden = self._hidden_after = self._start
+
+
+def next_landings(rows: Rows, node: Node, policy: Policy, now: float, drawn: bool = False) -> pd.DataFrame:
     """Where each UAV should land next, as the policy chooses once all rows have come in.
 
     Columns: ``ID``; ``state``, ``fly``, ``hold``, or ``in flight``, where it goes on; ``lat``, ``lon`` [deg],
     or over a region without a place on Earth ``x``, ``y`` [m], of the landing point; ``distance`` [m] and
     ``heading``, clockwise from north [deg], from where it stands; ``age`` of its newest report [s].
 
-    A row that does not say when it came in came in ``now`` [s since 1970]. With ``drawn``, actions are drawn
-    from torch's generator; if not, the most likely ones are taken.
+    A row that does not say when it came in came in ``now`` [s since 1970]. ``drawn`` as of ``Adviser``.
     """
     for where, report in rows:
         with named(where):
             report.stamp(now, file=True)
-    tracker = Tracker(node, [*dict.fromkeys(report.id for _, report in rows)], rows)
+    uavs = [*dict.fromkeys(report.id for _, report in rows)]
+    adviser = Adviser(node, uavs, policy, drawn, rows=rows)
     latest = max(report.received for _, report in rows)
-    sizes = [each.cell.hidden_size for each in policy.modules() if isinstance(each, AgentGRU)]
-    hidden = torch.zeros(1, len(tracker.uavs), sizes[0]) if sizes else None
-    kind = ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC
-    with torch.no_grad(), set_exploration_type(kind):
-        read: TensorDictBase = TensorDict()
-        for read in tracker.steps(latest):
-            if hidden is not None:
-                read[keys.HIDDEN] = hidden
-                hidden = policy(read.clone(False))[keys.HIDDEN]
-        asking = [uav for uav in tracker.uavs if not tracker.held[uav].report.flies]
-        if keys.ACTION_MASK in read.keys(True):
-            read[keys.ACTION_MASK] = node.simulation.action_mask(tracker.state(asking))
-        action = policy(read)[keys.ACTION]
-    before, ground = tracker.state(asking), node.ground
-    chooses = torch.tensor([[uav in asking for uav in tracker.uavs]])
-    after = node.simulation.decide(before, action, chooses)
+    for _ in adviser.steps(latest):
+        pass
+    asking = [uav for uav in uavs if not adviser.held[uav].report.flies]
+    before, ground = adviser.state(asking), node.ground
+    chooses = torch.tensor([[uav in asking for uav in uavs]])
+    after = node.simulation.decide(before, adviser.ask(asking), chooses)
     answers = []
-    for i, uav in enumerate(tracker.uavs):
+    for i, uav in enumerate(uavs):
         here, there = int(before.goal[0, i]), int(after.goal[0, i])
         answer: dict[str, Any] = {"ID": uav, "state": "in flight"}
         if uav in asking:
             answer["state"], (distance, heading) = "hold" if here == there else "fly", ground.way(here, there)
             answer |= dict(zip(ground.columns, ground.place(there), strict=True))
             answer |= {"distance": distance, "heading": None if here == there else heading}
-        answers.append(answer | {"age": round(max(latest - tracker.held[uav].report.time, 0.0), 3)})
+        answers.append(answer | {"age": round(max(latest - adviser.held[uav].report.time, 0.0), 3)})
     return pd.DataFrame(answers, columns=["ID", "state", *ground.columns, "distance", "heading", "age"])

@@ -24,7 +24,7 @@ LONGEST_GAP = 1000
 
 def read_log(path: Path) -> list[Report]:
     """The reports of a journal, or of a table with a column ``receive time``; each says when it came in."""
-    if path.suffix == SUFFIX or path.name.endswith(".ended"):
+    if path.suffix == SUFFIX:
         _, lines = read_journal(path)
         reports = [report for _, line in lines for report in line.reports]
     else:

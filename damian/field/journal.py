@@ -12,7 +12,7 @@ from damian.common.text_files import named, read_text
 from damian.field.rows import Report, Time, UavId, parsed_json, validated
 
 SUFFIX = ".jsonl"
-"""End of the name of a journal; that of a fleet that has ended is ``.ended``."""
+"""End of the name of a journal."""
 
 
 class Head(BaseModel):

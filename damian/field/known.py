@@ -5,7 +5,7 @@ Places in reports count as the landing points nearest to them.
 
 import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import zip_longest
@@ -95,6 +95,11 @@ class FilledReport:
     readings: tuple[float, ...] = ()
     """Readings of sensors of your own."""
 
+    @property
+    def order(self) -> tuple[float, int]:
+        """When it was generated; of reports of one instant, their numbers tell, and else which came first."""
+        return self.report.time, self.report.sequence or 0
+
 
 class UavLog:
     """The reports of one UAV."""
@@ -102,6 +107,8 @@ class UavLog:
     def __init__(self, ground: Ground, n_stops: int, n_readings: int, dt: float) -> None:
         self.ground, self.n_stops, self.n_readings, self.dt = ground, n_stops, n_readings, dt
         self.reports: list[FilledReport] = []
+        self.identities: set[Hashable] = set()
+        """Those of all reports that have come in."""
 
     @property
     def newest(self) -> FilledReport | None:
@@ -122,15 +129,15 @@ class UavLog:
         if given is not None and len(given) != n:
             raise InputError(f"readings: {len(given)} numbers are not {n}, as in the training")
 
-    def has(self, time: float) -> bool:
-        """Has a report that was generated at this time come in before."""
-        at = bisect.bisect_left(self.reports, time, key=lambda each: each.report.time)
-        return at < len(self.reports) and self.reports[at].report.time == time
+    def has(self, report: Report) -> bool:
+        """Has this report come in before."""
+        return report.identity in self.identities
 
     def add(self, report: Report, step: int, detected: int | None, origin: int | None = None) -> FilledReport:
         """Add a report, in its place by the time when it was generated; arguments as of ``FilledReport``."""
         filled = FilledReport(report, step, origin, detected=detected)
-        at = bisect.bisect_left(self.reports, report.time, key=lambda each: each.report.time)
+        self.identities.add(report.identity)
+        at = bisect.bisect_right(self.reports, filled.order, key=lambda each: each.order)
         self.reports.insert(at, filled)
         for i in range(at, len(self.reports)):
             self._fill(self.reports[i], self.reports[i - 1] if i else None)
@@ -178,8 +185,10 @@ class UavLog:
             stops = [*zip_longest(points, steps, fillvalue=-1)]
         if report.landed is not None:
             ago = (round((report.time - time) / self.dt) for time in report.landed[: len(stops)])
-            points, steps = [point for point, _ in stops], [filled.step - n_steps for n_steps in ago]
-            stops = [*zip_longest(points, steps, fillvalue=-1)]
+            landed = [filled.step - n_steps for n_steps in ago]
+            stops = [(point, step) for (point, _), step in zip(stops, landed, strict=False)] + stops[
+                len(landed) :
+            ]
         return tuple([*stops, *[(stops[-1][0], -1)] * self.n_stops][: self.n_stops])
 
 

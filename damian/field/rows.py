@@ -5,12 +5,20 @@ mean that the value is not known.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import from_json
 
 from damian.common.errors import InputError
@@ -23,6 +31,8 @@ Place = tuple[float, float]
 
 UNKNOWN = ("", "na", "nan", "none", "null")
 """Cells that mean that a value is not known."""
+GROUND = 0.5
+"""Altitude up to which a UAV whose motors do not turn stands on the ground [m]."""
 LATEST = 4e9
 """Latest time that is understood [s since 1970]."""
 CALENDAR = 1e8
@@ -40,20 +50,59 @@ def _seconds(value: Any) -> Any:
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
+def _below(limit: float, problem: str) -> BeforeValidator:
+    """Refuse numbers of another unit, which are far out of range."""
+
+    def check(value: Any) -> Any:
+        try:
+            far = abs(float(value)) >= limit
+        except (TypeError, ValueError):
+            return value
+        if far:
+            raise ValueError(problem)
+        return value
+
+    return BeforeValidator(check)
+
+
 def _text_split_at(separator: str | None) -> BeforeValidator:
     return BeforeValidator(lambda value: value.split(separator) if isinstance(value, str) else value)
 
 
+_listed = BeforeValidator(lambda value: [value] if isinstance(value, int | float) else value)
+FOREIGN = {
+    "latitude": ("lat", "[deg]"),
+    "longitude": ("lon", "[deg]"),
+    "latitude deg": ("lat", "[deg] (ulog)"),
+    "longitude deg": ("lon", "[deg] (ulog)"),
+    "datetime(utc)": ("time", "in ISO 8601 or seconds since 1970 (AirData, Litchi)"),
+    "time(millisecond)": (
+        "time",
+        "in ISO 8601 or seconds since 1970, as datetime(utc) of AirData and Litchi",
+    ),
+    "timestamp": ("time", "[s since 1970]; that of ulog counts microseconds since the boot"),
+    "header.stamp": ("time", "[s since 1970], 1e-9 times that of MAVROS"),
+    "height above takeoff(feet)": ("fla", "[m], 0.3048 times the feet (AirData)"),
+    "altitude(feet)": ("fla", "[m], 0.3048 times the feet (Litchi)"),
+    "altitude(m)": ("fla", "[m] (Litchi)"),
+    "battery percent": ("battery", "[%] (AirData)"),
+    "remainpowerpercent": ("battery", "[%] (Litchi)"),
+    "remaining": ("battery", "[%], 100 times that of ulog"),
+    "percentage": ("battery", "[%], 100 times that of MAVROS"),
+}
+"""Columns of common logs: which column says the same here, and in which unit."""
 Number: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
-Time: TypeAlias = Annotated[float, Field(ge=0, le=LATEST), BeforeValidator(_seconds)]
+_of_a_clock = _below(1e11, "give seconds, not milliseconds or microseconds")
+Time: TypeAlias = Annotated[float, Field(ge=0, le=LATEST), BeforeValidator(_seconds), _of_a_clock]
 """A time [s], as a number or as ISO 8601."""
 Count: TypeAlias = Annotated[int, Field(ge=0, le=2**31)]
 Flag: TypeAlias = Annotated[
     bool, BeforeValidator(lambda value: value.removesuffix(".0") if isinstance(value, str) else value)
 ]
 """True or false; a table of numbers in which a cell is empty has 1.0 for 1."""
-Latitude: TypeAlias = Annotated[Number, Field(ge=-90, le=90)]
-Longitude: TypeAlias = Annotated[Number, Field(ge=-180, le=180)]
+_degrees = _below(1e5, "give degrees, not degrees times 10^7, as MAVLink and ulog have them")
+Latitude: TypeAlias = Annotated[Number, Field(ge=-90, le=90), _degrees]
+Longitude: TypeAlias = Annotated[Number, Field(ge=-180, le=180), _degrees]
 Coordinate: TypeAlias = Annotated[Number, Field(ge=-2e7, le=2e7)]
 Pair: TypeAlias = Annotated[tuple[Coordinate, Coordinate], _text_split_at(None)]
 UavId: TypeAlias = Annotated[str, Field(pattern=r"^\w[\w .:/-]{0,63}$")]
@@ -89,7 +138,7 @@ class Report(Row):
     id: UavId
     received: Time = Field(alias="receive time", exclude=True, default_factory=lambda: math.nan)
     """When it came in [s]; a column of files only."""
-    aoi: Annotated[Number, Field(ge=0, le=LATEST)] = Field(0.0, exclude=True)
+    aoi: Annotated[Number, Field(ge=0, le=LATEST)] = 0.0
     """Age of the observation when it came in [s], if there is no time."""
     time: Time = Field(default_factory=lambda: math.nan)
     """When the observation was generated [s]."""
@@ -112,7 +161,11 @@ class Report(Row):
     battery: Annotated[Number, Field(ge=0, le=100)] | None = None
     """Battery level [%]."""
     fla: Annotated[Number, Field(ge=-500, le=1e5)] | None = None
-    """Flight altitude [m]: above 0 in flight."""
+    """Flight altitude [m]: above 0.5 in flight, or above 0 while the motors turn."""
+    on_ground: Flag | None = None
+    """Whether the UAV stands on the ground, as its autopilot says."""
+    motors: Flag | None = None
+    """Whether its motors turn: whether it is armed."""
     target_lat: Latitude | None = None
     """Landing point to which it flies."""
     target_lon: Longitude | None = None
@@ -120,13 +173,13 @@ class Report(Row):
     target_y: Coordinate | None = None
     previous: Annotated[tuple[Pair, ...], Field(max_length=16), _text_split_at(";")] | None = None
     """Landing points where it was before, newest first: [[53.1, -4.5]], or 53.1 -4.5; 53.2 -4.5."""
-    landed: Annotated[tuple[Time, ...], Field(max_length=17), _text_split_at(";")] | None = None
+    landed: Annotated[tuple[Time, ...], Field(max_length=17), _text_split_at(";"), _listed] | None = None
     """Times at which it landed, or held, where it is and at the places of ``previous`` [s]."""
     motions: Count | None = None
     """Decisions (holding included) since it last detected the source before."""
     readings: Annotated[tuple[Number, ...], Field(max_length=1000), _text_split_at(";")] | None = None
     """Readings of sensors of your own."""
-    sequence: Count | None = None
+    sequence: Count | None = Field(None, validation_alias=AliasChoices("sequence", "number"))
     """Number of the report, which grows by one."""
 
     @property
@@ -136,8 +189,17 @@ class Report(Row):
 
     @property
     def flies(self) -> bool:
-        """Whether the UAV is in the air."""
-        return self.fla is not None and self.fla > 0
+        """Whether the UAV is in the air: its autopilot knows; else motors and altitude tell."""
+        if self.on_ground is not None:
+            return not self.on_ground
+        return self.fla is not None and self.fla > (0.0 if self.motors else GROUND)
+
+    @property
+    def identity(self) -> Hashable:
+        """By what a report that comes in twice is known: its number and time, or else its whole content."""
+        if self.sequence is not None:
+            return self.sequence, self.time if "time" in self.model_fields_set else None
+        return self.model_dump_json(exclude_none=True)
 
     def place(self, prefix: str = "") -> Place | None:
         """Where the UAV is; ``source_``: where it detected the source; ``target_``: where it flies."""
@@ -153,6 +215,7 @@ class Report(Row):
             self.received = self.time + self.aoi if file and "time" in said else now
         if "time" not in said:
             self.time = self.received - self.aoi
+            said.discard("time")  # it is not what the UAV says
 
     def check_places(self) -> None:
         """Require pairs of coordinates, of one kind, and the UAV's own place."""
@@ -197,7 +260,13 @@ def reports_of(found: Found) -> Rows:
     """Rows as reports."""
     if not found:
         raise InputError("there are no rows")
-    return [(where, validated(Report, row, where)) for where, row in found]
+    reports = [(where, validated(Report, row, where)) for where, row in found]
+    for where, report in reports:
+        for column in report.model_extra or ():
+            own, unit = FOREIGN.get(column.removeprefix("field."), ("", ""))
+            if own and own not in report.model_fields_set:
+                raise InputError(f"{where}: {column}: it is not a column here: give {own} {unit}")
+    return reports
 
 
 def parsed_json(text: str | bytes) -> Any:

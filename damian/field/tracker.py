@@ -6,7 +6,8 @@ to the step in which it was generated, and counts from the step in which it came
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +17,7 @@ from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, named, show
 from damian.field.known import FilledReport, UavLog, messages_of
-from damian.field.node import LateMessage, Node, Reported
+from damian.field.node import LateMessage, Memories, Node, Reported
 from damian.field.rows import Report, Rows
 from damian.world.messages import Messages
 from damian.world.state import State
@@ -30,86 +31,164 @@ _ROUNDING = 1e-3
 
 
 class Tracker:
-    """The server node of a fleet, once every UAV has sent a report; ``rows`` are their reports in any order.
+    """The server node of a fleet, which begins with the newest report of each UAV, once each has sent one.
 
-    It begins with the newest report of each UAV, once each has one.
+    Args:
+        node: the server node for so many UAVs.
+        uavs: their IDs.
+        rows: reports that ``steps`` takes in the order in which they came in, whatever theirs is; others are
+            given to ``add``, in the order in which they come in.
+        standing: number of the landing point where a UAV stands or is bound for, by its ID and whether it
+            asks; as its newest message says, if not given.
     """
 
-    def __init__(self, node: Node, uavs: Sequence[str], rows: Rows) -> None:
+    def __init__(
+        self,
+        node: Node,
+        uavs: Sequence[str],
+        rows: Rows | None = None,
+        standing: Callable[[str, bool], int] | None = None,
+    ) -> None:
         self.node, self.uavs = node, [*uavs]
         self.points = node.simulation.airspace.points[0]
-        told = node.ground, node.server.observation.stops, node.simulation.widths.readings, node.dt
-        self._logs = {uav: UavLog(*told) for uav in uavs}
-        for where, report in rows:
-            with named(where):
-                self._check(report)
-        self._coming = deque(sorted((report for _, report in rows), key=lambda each: each.received))
-        """Reports that have not come in yet."""
-        self._pending: list[tuple[int, str, FilledReport]] = []
+        self.logs = {uav: self.new_log() for uav in uavs}
+        self.held: dict[str, FilledReport] = {}
+        """The message of each UAV that the server holds."""
+        self.pending: list[tuple[int, str, FilledReport]] = []
         """Reports that have come in and count later: the step from which they do, the UAV, the report."""
-        self._arrived: list[tuple[str, FilledReport]] = []
-        """Messages that count from this step on, by UAV."""
-        newest: dict[str, Report] = {}
-        report = self._coming[0]
-        while len(newest) < len(self.uavs):
-            report = self._coming.popleft()
-            if report.id not in newest or report.time > newest[report.id].time:
-                newest[report.id] = report
-        self.start = min(each.time for each in newest.values())
-        """When step 0 began [s]."""
+        self.has_begun, self.start = False, 0.0
+        """Whether every UAV has sent a report, and when step 0 began then [s]."""
+        self.step = self.first_step = 0
+        self.before: Memories | None = None
+        """What the node remembers after the step before; None in the first step."""
+        self._standing = standing or (lambda uav, _: self.held[uav].target)
+        self._outputs: TensorDictBase | None = None
+        """Outputs of this step; None until they are needed."""
+        self._begin_step()
+        self._previous = self.action, self.chosen
+        for where, report in rows or []:
+            with named(where):
+                self.check(report)
+        self._coming = deque(sorted((report for _, report in rows or []), key=lambda each: each.received))
+        """Reports of ``rows`` that have not come in yet."""
+        while self._coming and not self.has_begun:
+            self.add(self._coming.popleft())
         if self._coming and self._coming[-1].received - self.start > SECONDS:
             raise InputError(f"time: the first reports are more than {SECONDS:g} s older: leave them out")
-        self.step = self.first_step = max(self.step_of(report.received), 0)
-        self.held = {uav: self._add(newest[uav]) for uav in self.uavs}
-        """The message of each UAV that the server holds."""
 
-    def _check(self, report: Report) -> None:
-        if report.id not in self._logs:
+    def new_log(self) -> UavLog:
+        """The log of a UAV that has not reported yet."""
+        widths, stops = self.node.simulation.widths, self.node.server.observation.stops
+        return UavLog(self.node.ground, stops, widths.readings, self.node.dt)
+
+    def check(self, report: Report, log: UavLog | None = None) -> None:
+        """Refuse what no UAV of the fleet can say; ``log`` is that of a UAV that joins with this report."""
+        if log is None and report.id not in self.logs:
             raise InputError(f"ID: {show(report.id)} is not a UAV of this fleet: {listed(self.uavs)}")
         for name, time in (("time", report.time), ("source time", report.source_time)):
             if time is not None and time > report.received + FUTURE:
                 late = f"{time:.13g} s is {time - report.received:.1f} s after it came in"
                 raise InputError(f"{name}: {late}: set the clock of the UAV")
-        self._logs[report.id].check(report)
+        (log or self.logs[report.id]).check(report)
 
     def step_of(self, time: float) -> int:
         """The step in which an instant lies."""
         return math.floor((time - self.start) / self.node.dt + _ROUNDING)
 
+    def add(self, report: Report, origin: int | None = None) -> FilledReport | None:
+        """Let a report come in now; None if it is known already, or was generated before the start.
+
+        ``origin`` is the landing point from which a UAV in flight took off, if that is known.
+        """
+        log = self.logs[report.id]
+        if log.has(report) or (self.has_begun and report.time < self.start):
+            return None
+        if not self.has_begun:
+            filled = log.add(report, 0, None)
+            if all(each.newest for each in self.logs.values()):
+                self.begin(report.received)
+            return filled
+        filled = self.put(report, origin)
+        held_back = self.node.scenario.delay.hold == "max"
+        due = max(self.step, filled.step + self.node.law_longest) if held_back else self.step
+        self.pending.append((due, report.id, filled))
+        self._collect()
+        return filled
+
+    def begin(self, now: float) -> None:
+        """Begin at an instant [s], by when every UAV has sent a report."""
+        newest = {uav: log.reports[-1].report for uav, log in self.logs.items()}
+        self.has_begun, self.start = True, min(each.time for each in newest.values())
+        self.step = self.first_step = max(self.step_of(now), 0)
+        for uav, report in newest.items():
+            self.logs[uav].reports.clear()
+            self.held[uav] = self.put(report)
+        self._begin_step()
+
+    def put(self, report: Report, origin: int | None = None) -> FilledReport:
+        """Put a report into the log of its UAV, whatever counts; as of ``add``."""
+        detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
+        return self.logs[report.id].add(report, min(self.step_of(report.time), self.step), detected, origin)
+
+    # Steps.
+
     def steps(self, until: float) -> Iterator[TensorDictBase]:
         """Take all steps up to that in which an instant lies [s], and give the outputs of each."""
-        action = self.node.env.full_action_spec[keys.ACTION].zero()  # nothing here depends on it
-        nobody, memories = torch.zeros(1, len(self.uavs), dtype=torch.bool), None
-        for step in range(self.first_step, self.step_of(until) + 1):
-            self.step = step
-            self._collect()
-            if memories is None:
-                memories, outputs = self.node.begin(self._reported())
+        while True:
+            while self._coming and self.step_of(self._coming[0].received) <= self.step:
+                self.add(self._coming.popleft())
+            yield self.observe()
+            if self.step >= self.step_of(until):
+                return
+            self.next_step()
+
+    def observe(self) -> TensorDictBase:
+        """The outputs of this step, from what has come in by now."""
+        if self._outputs is None:
+            if self.before is None:
+                self._after, self._outputs = self.node.begin(self._reported())
             else:
-                memories, outputs = self.node.step(memories, self._reported(), action, nobody)
-            yield outputs
+                self._after, self._outputs = self.node.step(self.before, self._reported(), *self._previous)
+        return self._outputs
+
+    def next_step(self) -> None:
+        """End this step; in the next one it counts who has ``chosen`` which ``action`` in this one."""
+        self.observe()
+        self.before, self.step, self._previous = self._after, self.step + 1, (self.action, self.chosen)
+        self._begin_step()
+
+    def begin_anew(self, step: int) -> None:
+        """Go on in a later step, or in this one, with nothing but the message of each UAV."""
+        self.before, self.step, self.first_step = None, step, step
+        self._begin_step()
+        self._previous = self.action, self.chosen
+
+    def choose(self, uav: str, action: Any) -> None:
+        """Note the action that a UAV has chosen in this step."""
+        number = self.uavs.index(uav)
+        self.action, self.chosen = self.action.clone(), self.chosen.clone()
+        self.action[0, number], self.chosen[0, number] = torch.tensor(action), True
+
+    def _begin_step(self) -> None:
+        self.action = self.node.env.full_action_spec[keys.ACTION].zero()
+        self.chosen = torch.zeros(1, len(self.uavs), dtype=torch.bool)
+        self._held_before, self._arrived = dict(self.held), list[tuple[str, FilledReport]]()
+        self._outputs = None
+        self._collect()
 
     def _collect(self) -> None:
-        """Let the reports that count by now arrive; those that were generated before the start never do."""
-        while self._coming and self.step_of(self._coming[0].received) <= self.step:
-            report = self._coming.popleft()
-            if report.time >= self.start and not self._logs[report.id].has(report.time):
-                filled = self._add(report)
-                held_back = self.node.scenario.delay.hold == "max"
-                due = filled.step + self.node.law_longest if held_back else self.step
-                self._pending.append((due, report.id, filled))
-        due = sorted((each for each in self._pending if each[0] <= self.step), key=lambda x: x[2].report.time)
-        self._pending = [each for each in self._pending if each[0] > self.step]
-        self._arrived = [(uav, filled) for _, uav, filled in due]
+        """Let the reports that count by now arrive."""
+        due = [(uav, filled) for step, uav, filled in self.pending if step <= self.step]
+        if not due:
+            return
+        self.pending = [each for each in self.pending if each[0] > self.step]
+        arrived = sorted([*self._arrived, *due], key=lambda each: each[1].order)
+        self._arrived = [*{(uav, filled.step): (uav, filled) for uav, filled in arrived}.values()]
+        self.held, self._outputs = dict(self._held_before), None
         by_arrival = self.node.scenario.delay.order == "arrival"
         for uav, filled in self._arrived:
-            if by_arrival or filled.report.time > self.held[uav].report.time:
+            if by_arrival or filled.order >= self.held[uav].order:
                 self.held[uav] = filled
-
-    def _add(self, report: Report) -> FilledReport:
-        """Add a report to the log of its UAV."""
-        detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
-        return self._logs[report.id].add(report, min(self.step_of(report.time), self.step), detected)
 
     def _reported(self) -> Reported:
         arrived = {(uav, filled.step): filled for uav, filled in self._arrived}
@@ -133,7 +212,7 @@ class Tracker:
     def state(self, asking: Sequence[str]) -> State:
         """The world, as far as it is known; the UAVs that ask are ready to choose."""
         sent = self._messages([*self.held.values()])
-        goal = torch.tensor([[each.target for each in self.held.values()]])
+        goal = torch.tensor([[self._standing(uav, uav in asking) for uav in self.uavs]])
         ready = torch.tensor([[uav in asking for uav in self.uavs]])
         return self.node.blank._replace(
             steps=torch.tensor([self.step]),

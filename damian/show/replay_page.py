@@ -16,7 +16,8 @@ from damian.common.atomic_files import write_atomically
 from damian.common.plotting import UAV_COLOURS
 from damian.show.episode import LIKELY, Episode
 
-_PAGE = Path(__file__).parent / "page"
+PAGE = Path(__file__).parent / "page"
+"""Folder of the modules and the style, for pages that draw the same."""
 _LIBRARIES = "libraries.min.js"
 _PLAIN = " !$&'()*+,-./:;<=>?@[]^_`{|}~\\\""
 """Characters that a data URL may hold as they are."""
@@ -40,7 +41,7 @@ def page(episodes: Sequence[Episode]) -> str:
         "libraries" if file.name == _LIBRARIES else f"page/{file.stem}": (
             f"data:text/javascript;charset=utf-8,{quote(_text(file.name), safe=_PLAIN)}"
         )
-        for file in sorted(_PAGE.glob("*.js"))
+        for file in sorted(PAGE.glob("*.js"))
     }
     return Template(_text("index.html")).substitute(
         title=_title([shared, *names]),
@@ -73,7 +74,7 @@ def _settings(episode: Episode) -> list[str]:
 
 
 def _text(name: str) -> str:
-    return (_PAGE / name).read_text(encoding="utf-8").strip()
+    return (PAGE / name).read_text(encoding="utf-8").strip()
 
 
 def _title(parts: Sequence[str]) -> str:

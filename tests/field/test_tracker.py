@@ -163,11 +163,18 @@ def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
     reports = [
         told("a", START + 5, 210),
         told("a", START + 3, 205, START + 6, source_spotted=True),
-        told("a", START + 3, 100, START + 6),  # of the same time: it is known already
+        told("a", START + 3, 205, START + 6.1, source_spotted=True),  # it is known already
         told("a", START - 3, 100, START + 6),  # before the start
     ]
-    held = followed(*reports, until=START + 7).held["a"]
-    assert (held.point, held.detected, held.detected_at) == (210, 3, 205)
+    tracker = followed(*reports, until=START + 7)
+    held, log = tracker.held["a"], tracker.logs["a"].reports
+    assert (held.point, held.detected, held.detected_at, len(log)) == (210, 3, 205, 3)
+
+
+def test_two_reports_of_one_instant_count_and_tell_of_the_landing_before():
+    second = told("a", START + 5, 210, START + 5.2, source_spotted=True, landed=START + 4)
+    held = followed(told("a", START + 5, 210), second, until=START + 7).held["a"]
+    assert (held.detected, held.stops[:2]) == (5, ((210, 4), (200, 0)))
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,6 @@ from damian.common.fields import Settings, setting
 class FieldRules(Settings):
     """What a service of real UAVs holds to, whatever the policy chooses."""
 
-    acknowledge: bool = setting(
-        True, "Whether a UAV counts as following an answer only once it has accepted it; false: at once."
-    )
     answer_time: float = setting(
         10.0, "How long an answer holds; it must be accepted by then.", unit="s", above=0
     )

@@ -1,4 +1,4 @@
-"""The service over HTTP: reports in, advice out, several fleets at once.
+"""The service over HTTP: reports in, advice out, several fleets at once. ``GET`` changes nothing.
 
 Requests carry ``Authorization: Bearer TOKEN``; whoever has the wrong one learns nothing, not even which
 fleets there are. Only the time, the health and the description of the service need none.
@@ -6,273 +6,225 @@ fleets there are. Only the time, the health and the description of the service n
 
 import asyncio
 import contextlib
-import gc
 import hmac
-import json
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
-from typing import Any
+from collections.abc import AsyncIterator, Callable
+from typing import Annotated, Any
 
-from starlette.applications import Starlette
-from starlette.exceptions import HTTPException
-from starlette.requests import Request
-from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
-from starlette.routing import Route
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+import shapely
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
+from fastapi.responses import JSONResponse, PlainTextResponse
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException as AnyHTTPException
 
+import damian
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
-from damian.field.rows import (
-    parsed_json,
-    reports_of,
-    rows_of_csv,
-    rows_of_json,
-    validated,
-    written,
-)
+from damian.field.rows import Found, Report, parsed_json, rows_of_csv, rows_of_json, validated, written
 from damian.show.geojson import on_earth
-from damian_fleet import api
-from damian_fleet.answers import acknowledgements_of, as_csv, as_rows, ignored
-from damian_fleet.clock import Clock
 from damian_fleet.fleet import Waiting
-from damian_fleet.journal import Change, Command
-from damian_fleet.session import AdviceSession, NoFleet
+from damian_fleet.map import router as map_router
+from damian_fleet.rows import Acknowledgement, Advice, Asking, Change, Command, FleetStatus, Members
+from damian_fleet.store import Fleets, NoFleet
 
-MAX_BODY = 1_000_000
-"""Largest body of a request [bytes]."""
-TICK = 1.0
-"""Time between two updates of all fleets [s], so that no request waits for many steps."""
-PUSH = 0.5
-"""Time between two looks for answers to push [s]."""
-ALIVE = 15.0
-"""Time after which a comment is pushed where nothing else is [s], by which a broken connection shows."""
-MOST_LOGGED = 10
-"""Lines that a log gets within a minute."""
-_CSV = "text/csv"
-_BUSY = (
-    b"HTTP/1.1 503 Service Unavailable\r\ncontent-length: 0\r\nretry-after: 1\r\nconnection: close\r\n\r\n"
-)
+MAX_BODY, TICK, JUMP = 1_000_000, 1.0, 1.0
+"""Largest body of a request [bytes]; time between two updates of all fleets, so that no request waits for
+many steps [s]; by how much the system clock must change against the monotonic one for a jump [s]."""
+STATUS = {NoFleet: 404, Waiting: 409, InputError: 422, RunError: 507}
+"""What a request is answered that ends with an error; 507: it could not be stored, and changed nothing."""
+_LOG = logging.getLogger("damian_fleet")
 
 
-def make_app(
-    session: AdviceSession, token: str, clock: Callable[[], float] | None = None, version: str = ""
-) -> Starlette:
-    """The service as an ASGI application; ``clock`` tells its time [s since 1970]."""
-    clock = clock or Clock()
-    service = Service(session, token, clock, version)
-    routes = [Route(each.path, getattr(service, each.name), methods=[each.method]) for each in api.ENDPOINTS]
+class Clock:
+    """Seconds since 1970 that never jump: the system's at the start, then by the monotonic clock.
 
-    @contextlib.asynccontextmanager
-    async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        ticking = asyncio.create_task(_tick(session, clock))
-        try:
-            yield
-        finally:
-            ticking.cancel()
-            session.close()
+    It starts at ``least`` [s] at least, such as the latest time that is stored. ``ahead`` is by how much the
+    clock of the system was ahead of it when somebody looked last [s].
+    """
 
-    handlers: dict[Any, Any] = {
-        InputError: lambda _, error: _error(422, str(error)),
-        NoFleet: lambda _, error: _error(404, str(error)),
-        Waiting: lambda _, error: _error(409, str(error)),
-        RunError: lambda _, error: _error(507, str(error)),
-        HTTPException: lambda _, error: _error(error.status_code, str(error.detail), error.headers),
-    }
-    return Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)
+    def __init__(self, least: float = 0.0, system: Any = time.time, monotonic: Any = time.monotonic) -> None:
+        self._system, self._monotonic = system, monotonic
+        self._base = max(system(), least) - monotonic()
+        self.ahead = system() - self()
+
+    def __call__(self) -> float:
+        return self._base + self._monotonic()
+
+    def watch(self) -> None:
+        """Look at the clock of the system, and note it if it has jumped."""
+        before, self.ahead = self.ahead, self._system() - self()
+        if abs(self.ahead - before) > JUMP:
+            _LOG.warning(
+                "the system clock is now %.1f s ahead of the service, which keeps its time", self.ahead
+            )
 
 
-async def _tick(session: AdviceSession, clock: Callable[[], float]) -> None:
-    """Let the fleets take their steps, one fleet at a time, so that requests come in between."""
-    n_frozen = 0
-    while True:
-        if isinstance(clock, Clock):
-            clock.watch()
-        if len(session.fleets) > n_frozen:  # or every full collection of garbage looks through all of them
-            n_frozen = len(session.fleets)
-            gc.freeze()
-        try:
-            for _ in session.upkeep(clock):
-                await asyncio.sleep(0)
-        except Exception:  # of one fleet: the others go on
-            logging.getLogger("damian_fleet").exception("a fleet could not be brought up to date")
-        await asyncio.sleep(TICK)
+def status_of(error: Exception) -> int:
+    """The HTTP status of an error."""
+    return next((status for kind, status in STATUS.items() if isinstance(error, kind)), 500)
 
 
-class Sparse(logging.Filter):
-    """Lets few lines of a log through within a minute, and counts the others."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.since, self.n = time.monotonic(), 0
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        if time.monotonic() - self.since > 60:
-            if self.n > MOST_LOGGED:
-                record.msg = f"{record.msg} (before it, {self.n - MOST_LOGGED} lines were left out)"
-            self.since, self.n = time.monotonic(), 0
-        self.n += 1
-        return self.n <= MOST_LOGGED
+def refused(_: Request, error: Exception) -> Response:
+    """An error as one line."""
+    if isinstance(error, AnyHTTPException):
+        return JSONResponse({"error": str(error.detail)}, error.status_code, error.headers)
+    return JSONResponse({"error": one_line(str(error))}, status_of(error))
 
 
-def limited(most: int) -> type[HttpToolsProtocol]:
-    """The protocol of connections, at most so many at a time; others are answered 503 and closed."""
-
-    class Limited(HttpToolsProtocol):
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            super().connection_made(transport)
-            if len(self.connections) > most:
-                transport.write(_BUSY)
-                transport.close()
-
-    return Limited
+async def check_size(request: Request) -> None:
+    """Refuse a large body before it is read."""
+    length = request.headers.get("content-length", "0" if request.method in ("GET", "DELETE") else "")
+    if not length.isdecimal():
+        raise HTTPException(411, "say how long the body is: Content-Length")
+    if int(length) > MAX_BODY:
+        raise HTTPException(413, f"the body is larger than {MAX_BODY} bytes", {"Connection": "close"})
 
 
-class Service:
-    """The requests, which ``api`` describes; arguments as of ``make_app``."""
-
-    def __init__(
-        self, session: AdviceSession, token: str, clock: Callable[[], float], version: str = ""
-    ) -> None:
-        self.session, self.token, self.clock, self.version = session, token, clock, version
-
-    # What needs no token.
-
-    async def page(self, _: Request) -> Response:
-        return HTMLResponse(api.page())
-
-    async def openapi(self, _: Request) -> Response:
-        return JSONResponse(api.openapi(self.version))
-
-    async def health(self, _: Request) -> Response:
-        problem, n_fleets = self.session.problem, len(self.session.names)
-        said = {"status": "failing" if problem else "ok", "problem": problem, "fleets": n_fleets}
-        return JSONResponse({**said, "version": self.version}, 503 if problem else 200)
-
-    async def time(self, _: Request) -> Response:
-        now, clock = self.clock(), self.clock
-        ahead, jumps = (clock.ahead, clock.jumps) if isinstance(clock, Clock) else (0.0, 0)
-        said = {"time": now, "written": written(now), "system_ahead": round(ahead, 3), "jumps": jumps}
-        return JSONResponse(said)
-
-    # Fleets.
-
-    async def list(self, request: Request) -> Response:
-        self._check_token(request)
-        return JSONResponse({"fleets": self.session.names})
-
-    async def put(self, request: Request) -> Response:
-        name, body = self._name(request), parsed_json(await _body(request))
-        created = self.session.create(name, body.get("uavs") if isinstance(body, dict) else None)
-        return JSONResponse({"fleet": name, "uavs": self.session.fleet(name).uavs}, 201 if created else 200)
-
-    async def get(self, request: Request) -> Response:
-        name = self._name(request)
-        return JSONResponse(self.session.fleet(name).status(name).model_dump(exclude_unset=True))
-
-    async def delete(self, request: Request) -> Response:
-        self.session.end(self._name(request), self.clock())
-        return Response(status_code=204)
-
-    async def command(self, request: Request) -> Response:
-        name = self._name(request)
-        uavs = self.session.command(name, validated(Command, parsed_json(await _body(request))), self.clock())
-        return JSONResponse({"fleet": name, "uavs": uavs})
-
-    async def members(self, request: Request) -> Response:
-        name = self._name(request)
-        change = validated(Change, parsed_json(await _body(request)))
-        uavs = self.session.change_members(name, change, self.clock())
-        return JSONResponse({"fleet": name, "uavs": uavs})
-
-    async def geofence(self, request: Request) -> Response:
-        region = self.session.fleet(self._name(request)).ground.region
-        if region.origin is None:
-            raise InputError(f"geofence: {region.name} has no place on Earth")
-        shape = on_earth(region.polygon, region.origin)
-        return JSONResponse({"type": "Feature", "properties": {"name": region.name}, "geometry": shape})
-
-    # Reports and advice.
-
-    async def reports(self, request: Request) -> Response:
-        name, rows = self._name(request), reports_of(await _rows(request))
-        unknown = ignored(rows)
-        found = self.session.report(name, rows, self.clock())
-        note = {"ignored": unknown} if unknown else {}
-        return JSONResponse({"accepted": len(found), "found": found, **note})
-
-    async def acknowledge(self, request: Request) -> Response:
-        name, rows = self._name(request), acknowledgements_of(await _rows(request))
-        return JSONResponse({"status": self.session.acknowledge(name, rows, self.clock())})
-
-    async def advice(self, request: Request) -> Response:
-        """Advise all UAVs, or those that ask: ``?uav=A&uav=B``; as a table with ``?format=csv``."""
-        name, wanted = self._name(request), request.query_params
-        kind = wanted.get("format", "json")
-        if {*wanted} - {"uav", "format"} or kind not in ("csv", "json"):
-            raise InputError("query: give uav=ID, once for each that asks, and format=json or csv")
-        asking = wanted.getlist("uav") or None
-        answer = self.session.advise(name, self.clock(), asking, only=asking is not None)
-        if kind == "csv":
-            return Response(as_csv(answer), media_type=_CSV)
-        return JSONResponse({"fleet": name, "advice": as_rows(answer)})
-
-    async def events(self, request: Request) -> Response:
-        name, uavs = self._name(request), request.query_params.getlist("uav") or None
-        fleet = self.session.fleet(name)
-        fleet.numbers_of(uavs)
-        if not fleet.rules.acknowledge:
-            raise InputError("events: a UAV would be taken to follow each of them: needs acknowledge=true")
-        return StreamingResponse(self.pushed(name, uavs), media_type="text/event-stream")
-
-    async def pushed(self, name: str, uavs: Sequence[str] | None) -> AsyncIterator[str]:
-        """The events, for ever or until the fleet ends; UAVs that are not known to be in flight choose."""
-        last: dict[str, Any] = {}
-        quiet = 0.0
-        while name in self.session.names:
-            with contextlib.suppress(Waiting, RunError):
-                rows = as_rows(self.session.advise(name, self.clock()))
-                rows = [row for row in rows if uavs is None or row["ID"] in uavs]
-                new = [row for row in rows if last.get(row["ID"]) != (row["answer"], row["state"])]
-                last |= {row["ID"]: (row["answer"], row["state"]) for row in new}
-                for row in new:
-                    quiet = 0.0
-                    yield f"event: advice\ndata: {json.dumps(row)}\n\n"
-            quiet += PUSH
-            if quiet >= ALIVE:
-                quiet = 0.0
-                yield ": nothing new\n\n"
-            await asyncio.sleep(PUSH)
-
-    def _name(self, request: Request) -> str:
-        """The fleet of a request that has the token."""
-        self._check_token(request)
-        return request.path_params["name"]
-
-    def _check_token(self, request: Request) -> None:
-        """Refuse a request that has not the token."""
-        scheme, _, given = request.headers.get("authorization", "").partition(" ")
-        fits = hmac.compare_digest(given.strip().encode(), self.token.encode())
-        if scheme.lower() != "bearer" or not fits:
-            raise HTTPException(401, "the token is missing or wrong", {"WWW-Authenticate": "Bearer"})
-
-
-async def _rows(request: Request) -> list[tuple[str, Any]]:
-    """The rows of a body, JSON or CSV."""
-    body = await _body(request)
-    is_table = request.headers.get("content-type", "").startswith(_CSV)
+async def rows_of(request: Request) -> Found:
+    """The rows of a body, JSON (one object or a list) or CSV."""
+    body = await request.body()
+    is_table = request.headers.get("content-type", "").startswith("text/csv")
     return rows_of_csv(body.decode("utf-8-sig", "replace")) if is_table else rows_of_json(body)
 
 
-async def _body(request: Request) -> bytes:
-    """The body of a request, unless it is too large."""
-    body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > MAX_BODY:
-            raise HTTPException(413, f"the body is larger than {MAX_BODY} bytes", {"Connection": "close"})
-    return bytes(body)
+def body_of(model: type[BaseModel]) -> Any:
+    """A body as a model, whatever type of content the request names."""
+
+    async def read(request: Request) -> BaseModel:
+        return validated(model, parsed_json(await request.body() or b"{}"))
+
+    return Depends(read)
 
 
-def _error(code: int, text: str, headers: Any = None) -> Response:
-    return JSONResponse({"error": one_line(text)}, code, headers)
+def described(model: type[BaseModel], rows: bool = False) -> dict[str, Any]:
+    """How OpenAPI describes a body; ``rows``: one of these objects, a list of them, or a table."""
+    one, table = model.model_json_schema(), {"text/csv": {"schema": {"type": "string"}}} if rows else {}
+    schema = {"anyOf": [one, {"type": "array", "items": one}]} if rows else one
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}, **table}}}
+
+
+Rows = Annotated[Found, Depends(rows_of)]
+
+
+def make_app(fleets: Fleets, token: str, clock: Callable[[], float] | None = None) -> FastAPI:
+    """The service as an ASGI application; ``clock`` tells its time [s since 1970]."""
+    now = clock or Clock(fleets.latest)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        ticking = asyncio.create_task(_tick(fleets, now))
+        yield
+        ticking.cancel()
+
+    app = FastAPI(title="damian-fleet", version=damian.__version__, lifespan=lifespan)
+    for kind in (AnyHTTPException, InputError, RunError):
+        app.add_exception_handler(kind, refused)
+
+    @app.get("/health")
+    async def health(response: Response) -> dict[str, Any]:
+        """Whether requests can be stored (503 if not)."""
+        response.status_code = 503 if fleets.problem else 200
+        said = {"status": "failing" if fleets.problem else "ok", "problem": fleets.problem}
+        return {**said, "fleets": len(fleets.names), "version": damian.__version__}
+
+    @app.get("/time")
+    async def service_time() -> dict[str, Any]:
+        """The time of the service, and how far the clock of its system is ahead [s]."""
+        ahead = now.ahead if isinstance(now, Clock) else 0.0
+        return {"time": now(), "written": written(now()), "system_ahead": round(ahead, 3)}
+
+    app.include_router(map_router)
+    app.include_router(_fleets(fleets, token, now))
+    return app
+
+
+def _fleets(fleets: Fleets, token: str, now: Callable[[], float]) -> APIRouter:
+    """The requests about fleets."""
+    bearer = HTTPBearer(auto_error=False)
+
+    async def check_token(given: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]) -> None:
+        if not hmac.compare_digest((given.credentials if given else "").encode(), token.encode()):
+            raise HTTPException(401, "the token is missing or wrong", {"WWW-Authenticate": "Bearer"})
+
+    router = APIRouter(prefix="/fleets", dependencies=[Depends(check_token), Depends(check_size)])
+
+    @router.get("")
+    async def names() -> dict[str, list[str]]:
+        """The fleets."""
+        return {"fleets": fleets.names}
+
+    @router.put("/{name}", openapi_extra=described(Members))
+    async def create(name: str, members: Annotated[Members, body_of(Members)], response: Response) -> Members:
+        """Create a fleet (201), or find it (200)."""
+        response.status_code = 201 if fleets.create(name, members.uavs) else 200
+        return members
+
+    @router.get("/{name}", response_model_exclude_unset=True)
+    async def status(name: str) -> FleetStatus:
+        """What is known of a fleet."""
+        return fleets.status(name, now())
+
+    @router.delete("/{name}", status_code=204)
+    async def end(name: str) -> None:
+        """End a fleet; what happened to it is kept."""
+        fleets.end(name, now())
+
+    @router.post("/{name}/reports", openapi_extra=described(Report, rows=True))
+    async def reports(name: str, rows: Rows) -> dict[str, Any]:
+        """Take reports; each is ``new``, ``late``, a ``duplicate`` or too ``old``."""
+        return fleets.report(name, rows, now())
+
+    @router.post("/{name}/advice", openapi_extra=described(Asking), response_model_exclude_unset=True)
+    async def advise(name: str, asking: Annotated[Asking, body_of(Asking)]) -> dict[str, list[Advice]]:
+        """Let UAVs choose, and tell them."""
+        return {"advice": fleets.advise(name, asking.uavs, now())}
+
+    @router.post("/{name}/acknowledgements", openapi_extra=described(Acknowledgement, rows=True))
+    async def acknowledge(name: str, rows: Rows) -> dict[str, list[str]]:
+        """Take what UAVs do with answers; how far these have come."""
+        return {"status": fleets.acknowledge(name, rows, now())}
+
+    @router.post("/{name}/command", openapi_extra=described(Command))
+    async def command(name: str, said: Annotated[Command, body_of(Command)]) -> dict[str, list[str]]:
+        """Hold, resume or return UAVs."""
+        return {"uavs": fleets.command(name, said.command, said.uavs, now())}
+
+    @router.post("/{name}/uavs", openapi_extra=described(Change))
+    async def change(name: str, said: Annotated[Change, body_of(Change)]) -> dict[str, list[str]]:
+        """Let UAVs join and leave."""
+        return {"uavs": fleets.change_members(name, said.join, said.leave, now())}
+
+    @router.get("/{name}/geofence")
+    async def geofence(name: str) -> dict[str, Any]:
+        """The region as a GeoJSON feature, with its landing points."""
+        ground = fleets.fleet(name).ground
+        region = ground.region
+        if region.origin is None:
+            raise InputError(f"geofence: {region.name} has no place on Earth")
+        points = on_earth(shapely.MultiPoint(ground.points.tolist()), region.origin)["coordinates"]
+        shape = on_earth(region.polygon, region.origin)
+        about = {"name": region.name, "landing_points": points}
+        return {"type": "Feature", "properties": about, "geometry": shape}
+
+    @router.get("/{name}/journal", response_class=PlainTextResponse)
+    async def journal(name: str) -> str:
+        """What happened to the fleet, as a journal for ``damian fly`` and ``damian advise``."""
+        return "\n".join([*fleets.journal(name), ""])
+
+    return router
+
+
+async def _tick(fleets: Fleets, now: Callable[[], float]) -> None:
+    """Let the fleets take their steps, one fleet at a time, so that requests come in between."""
+    while True:
+        if isinstance(now, Clock):
+            now.watch()
+        for name, fleet in [*fleets.loaded.items()]:
+            try:
+                fleet.advance(now())
+            except Exception:  # of one fleet: the others go on
+                _LOG.exception("fleet %s could not be brought up to date", name)
+            await asyncio.sleep(0)
+        await asyncio.sleep(TICK)

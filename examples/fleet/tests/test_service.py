@@ -1,131 +1,200 @@
 """The service over HTTP: what it answers, and what it refuses."""
 
-import pytest
-from reporting import FREE
-from starlette.testclient import TestClient
-from test_fleet import LLANBEDR, scenario_of
+import json
+import random
 
-from damian.baselines.script import script_policy
-from damian.field.node import Node, for_uavs
-from damian_fleet.fleet import Fleet
-from damian_fleet.service import MAX_BODY, make_app
-from damian_fleet.session import AdviceSession
+import pytest
+from starlette.testclient import TestClient
+
+from damian_fleet.program import config_of, make_fleets
+from damian_fleet.service import MAX_BODY, Clock, make_app
 
 TOKEN = "a-token-of-the-service"
 NOW = 1.75e9
-UAVS = ["A", "B", "C"]
+PLACE = {"A": (52.8110, -4.1283), "B": (52.8133, -4.1264)}
+NORTH = "/fleets/north"
 
 
-@pytest.fixture(scope="module")
-def parts():
-    node = Node(for_uavs(scenario_of(region=LLANBEDR), 3))
-    return node, script_policy(node.env)
-
-
-@pytest.fixture
-def session(parts, tmp_path):
-    node, policy = parts
-    return AdviceSession(
-        lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
-        tmp_path / "journals",
-        {"policy": "script"},
-    )
-
-
-class Clock:
-    """A clock that stands still unless it is set."""
-
-    now = NOW
-
-    def __call__(self) -> float:
-        return self.now
+def row(uav: str, **changed):
+    lat, lon = PLACE[uav]
+    return {"ID": uav, "time": NOW, "lat": lat, "lon": lon, "battery": 80} | changed
 
 
 @pytest.fixture
-def clock():
-    return Clock()
-
-
-@pytest.fixture
-def client(session, clock):
-    app = make_app(session, TOKEN, clock)
-    with TestClient(
-        app, raise_server_exceptions=False, headers={"Authorization": f"Bearer {TOKEN}"}
-    ) as client:
+def client(tmp_path):
+    words = ["policy=script", "region=llanbedr", "motion=polynomial", f"database={tmp_path / 'fleets.db'}"]
+    fleets = make_fleets(*config_of(words))
+    app = make_app(fleets, TOKEN, lambda: client.now)
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with TestClient(app, raise_server_exceptions=False, headers=headers) as client:
+        client.now = NOW
+        assert client.put(NORTH, json={"uavs": ["A", "B"]}).status_code == 201
         yield client
+    fleets.close()
 
 
-@pytest.fixture
-def fleet(client):
-    """The path of a fleet that is there."""
-    assert client.put("/fleets/north", json={"uavs": UAVS}).status_code == 201
-    return "/fleets/north"
+def begin(client) -> dict:
+    assert client.post(f"{NORTH}/reports", json=[row("A"), row("B")]).status_code == 200
+    return client.post(f"{NORTH}/advice", json={"uavs": ["A"]}).json()["advice"][0]
 
 
-def row(uav: str, point: int, session, **changed):
-    lat, lon = next(iter(session.fleets.values())).ground.place(point)
-    return {"ID": uav, "time": NOW, "lat": lat, "lon": lon, "source_spotted": 0, "battery": 80.0} | changed
-
-
-def rows(session, **changed):
-    return [row(uav, 40 * i, session, **changed) for i, uav in enumerate(UAVS)]
-
-
-def test_reports_go_in_and_landing_points_come_out(client, fleet, session, clock):
-    assert client.get(f"{fleet}/advice").status_code == 409
-    done = client.post(f"{fleet}/reports", json=rows(session))
-    assert (done.status_code, done.json()) == (200, {"accepted": 3, "found": ["new"] * 3})
-    answer = client.get(f"{fleet}/advice").json()["advice"]
-    assert [each["ID"] for each in answer] == UAVS
-    assert all(each["state"] == "fly" and each["distance"] > 0 for each in answer)
-    assert len({(each["lat"], each["lon"]) for each in answer}) == 3
-    assert client.get(f"{fleet}/advice").json()["advice"] == answer, "nobody chooses twice in a step"
-    clock.now += 5
-    assert {each["state"] for each in client.get(f"{fleet}/advice?uav=B").json()["advice"]} <= {"fly", "hold"}
-    assert [e["ID"] for e in client.get(f"{fleet}/advice?uav=B").json()["advice"]] == ["B"]
-    later = row("A", 7, session, time=NOW + 4)
-    table = f"{','.join(later)}\n{','.join(map(str, later.values()))}"
+def test_reports_go_in_and_landing_points_come_out(client):
+    assert client.post(f"{NORTH}/advice").status_code == 409
+    told = begin(client)
+    assert (told["state"], told["altitude"]) == ("fly", 20.0)
+    said = {"ID": "A", "answer": told["answer"], "status": "accepted"}
+    assert client.post(f"{NORTH}/acknowledgements", json=said).json() == {"status": ["accepted"]}
+    both = client.post(f"{NORTH}/advice", content="{}").json()["advice"]
+    assert both[0] == told | {"state": "bound"}
+    assert (both[1]["ID"], both[1]["state"]) == ("B", "fly")
+    table = "ID,time,lat,lon,vx\n" + f"A,{NOW + 1},52.8110,-4.1283,3\n"
     headers = {"Content-Type": "text/csv; charset=utf-8"}
-    found = [
-        client.post(f"{fleet}/reports", content=table, headers=headers).json()["found"] for _ in range(2)
-    ]
-    assert found == [["new"], ["duplicate"]]
-    head, *table = client.get(f"{fleet}/advice?format=csv").text.splitlines()
-    assert (
-        head
-        == "answer,ID,state,reason,lat,lon,altitude,speed,heading,distance,duration,arrival,until,step,age"
+    client.now += 2
+    found = client.post(f"{NORTH}/reports", content=table, headers=headers).json()
+    assert found == {"accepted": 1, "found": ["new"], "ignored": ["vx"]}
+    for uavs, held in ((None, ["A", "B"]), ([], []), (["B"], ["B"])):
+        said = {"command": "hold", "uavs": uavs}
+        assert client.post(f"{NORTH}/command", json=said).json() == {"uavs": held}
+    assert client.post(f"{NORTH}/uavs", json={"join": ["C"]}).json() == {"uavs": ["A", "B"]}
+    assert client.get("/fleets").json() == {"fleets": ["north"]}
+    assert client.put(NORTH, json={"uavs": ["A", "B"]}).status_code == 200
+    assert client.put(NORTH, json={"uavs": ["A"]}).status_code == 422
+    assert client.delete(NORTH).status_code == 204
+    assert client.get(NORTH).status_code == 404
+    assert client.put(NORTH, json={"uavs": ["X"]}).status_code == 201
+
+
+def test_looking_changes_nothing(client):
+    begin(client)
+    paths = [route for route, does in client.get("/openapi.json").json()["paths"].items() if "get" in does]
+    assert len(paths) >= 6
+    before = client.get(f"{NORTH}/journal").text
+    for _ in range(2):
+        client.now += 3
+        for path in paths:
+            assert client.get(path.format(name="north")).status_code == 200, path
+    assert client.get(f"{NORTH}/journal").text == before
+    status = client.get(NORTH).json()
+    assert (status["step"], status["uavs"][1]["advice"]["state"], status["uavs"][0]["age"]) == (
+        0,
+        "none",
+        6.0,
     )
-    assert [(line.split(",")[1], line.split(",")[-1]) for line in table] == [
-        ("A", "1.0"),
-        ("B", "5.0"),
-        ("C", "5.0"),
-    ]
-    status = client.get(fleet).json()
-    assert (status["step"], status["dt"], status["uavs"][0]["reports"]) == (5, 1.0, 3)
-    assert status["uavs"][0] == status["uavs"][0] | {"ID": "A", "age": 1.0, "late": 0, "duplicates": 1}
+    fence = client.get(f"{NORTH}/geofence").json()
+    lon, lat = fence["geometry"]["coordinates"][0][0]
+    assert (fence["type"], round(lat), round(lon)) == ("Feature", 53, -4)
 
 
-def test_who_has_the_wrong_token_learns_nothing(client, fleet, session):
+def test_two_reports_of_one_second_count_and_one_that_comes_twice_counts_once(client):
+    begin(client)
+
+    def found(**changed) -> str:
+        return client.post(f"{NORTH}/reports", json=row("A", **changed)).json()["found"][0]
+
+    assert [found(source_spotted=1), found(source_spotted=1), found()] == ["new", "duplicate", "duplicate"]
+    assert [found(number=7), found(number=8), found(number=7)] == ["new", "new", "duplicate"]
+    one = {"number": 9, "time": None, "AoI": 1}
+    client.now += 1
+    assert found(**one) == "new"
+    client.now += 1
+    assert found(**one) == "duplicate", "by its number, though it came later"
+    assert client.get(NORTH).json()["uavs"][0]["duplicates"] == 4
+
+
+@pytest.mark.parametrize(
+    ("says", "flies"),
+    [
+        ({"FLA": 0.03}, False),
+        ({"FLA": 0.4, "motors": 0}, False),
+        ({"FLA": 0.4, "motors": 1}, True),
+        ({"FLA": 0.6}, True),
+        ({"FLA": 8.0, "on ground": 1, "motors": 1}, False),
+        ({"FLA": 0.0, "on_ground": "0"}, True),
+    ],
+)
+def test_the_autopilot_says_what_is_on_the_ground(client, says, flies):
+    begin(client)
+    client.post(f"{NORTH}/reports", json=row("B", time=NOW + 0.5, **says))
+    assert client.get(NORTH).json()["uavs"][1]["flies"] == flies
+
+
+def test_who_has_the_wrong_token_learns_nothing(client):
     answers = [
-        client.get(path, headers=headers)
-        for path in (fleet, "/fleets/nowhere", f"{fleet}/advice")
-        for headers in ({"Authorization": "Bearer wrong"}, {"Authorization": ""})
+        client.request(method, path, headers={"Authorization": token})
+        for method, path in (("GET", NORTH), ("GET", "/fleets/nowhere"), ("POST", f"{NORTH}/advice"))
+        for token in ("Bearer wrong", "", f"Basic {TOKEN}")
     ]
     assert {(each.status_code, each.text) for each in answers} == {
         (401, '{"error":"the token is missing or wrong"}')
     }
-    assert client.get("/fleets/nowhere").status_code == 404
+    assert [client.get(path, headers={"Authorization": ""}).status_code for path in ("/time", "/health")] == [
+        200,
+        200,
+    ]
 
 
-def test_a_fleet_is_created_once_and_can_be_ended(client, fleet, session):
-    assert client.put(fleet, json={"uavs": UAVS}).status_code == 200
-    assert client.put(fleet, json={"uavs": ["X"]}).status_code == 422
-    client.post(f"{fleet}/reports", json=rows(session))
-    assert client.delete(fleet).status_code == 204
-    assert client.get(fleet).status_code == 404
-    assert client.put(fleet, json={"uavs": ["X"]}).status_code == 201
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"lat": 528110000}, "lat: 528110000: Value error, give degrees, not degrees times 10^7"),
+        ({"time": 1.75e12}, "time: 1750000000000.0: Value error, give seconds, not milliseconds"),
+        ({"lat": None, "latitude": 52.8}, "latitude: it is not a column here: give lat [deg]"),
+        (
+            {"battery": None, "percentage": 0.8},
+            "percentage: it is not a column here: give battery [%], 100 times",
+        ),
+        (
+            {"altitude(feet)": 60},
+            "altitude(feet): it is not a column here: give fla [m], 0.3048 times the feet",
+        ),
+        ({"battery": 101}, "battery: 101: Input should be less than or equal to 100"),
+        ({"lat": 53.9}, "lat, lon: 53.9, -4.1264 is 1"),
+        ({"time": NOW + 60}, "time: 1750000060 s is 60.0 s after it came in: set the clock of the UAV"),
+        ({"ID": "C"}, "ID: 'C' is not a UAV of this fleet: A, B"),
+    ],
+)
+def test_a_report_is_refused_with_its_column_and_what_would_be_right(client, changed, message):
+    answer = client.post(f"{NORTH}/reports", json=[row("A"), row("B", **changed)])
+    assert answer.status_code == 422
+    assert answer.json()["error"].startswith(f"row 2: {message}")
+    assert client.get(NORTH).json()["uavs"][0]["reports"] == 0, "all or none"
 
 
-def test_a_huge_body_is_refused(client, fleet):
-    answer = client.post(f"{fleet}/reports", content=b"[" + b" " * MAX_BODY * 10)
-    assert answer.status_code == 413
+@pytest.mark.parametrize("path", ["reports", "acknowledgements", "command", "uavs"])
+def test_any_nonsense_is_refused_and_changes_nothing(client, path):
+    answer, draw = begin(client)["answer"], random.Random(3)
+    good = {"ID": "A", "answer": answer, "status": "accepted", "command": "hold", "join": ["C"], "leave": []}
+    before = client.get(f"{NORTH}/journal").text
+    junk = [
+        b"[]",
+        b"null",
+        b"3",
+        b"1e999",
+        b'"\\ud800"',
+        b"[" * 20_000,
+        b'{"command": "hold", "uavs": ["Z"]}',
+    ]
+    junk += [b'{"leave": ["Z"]}']
+    for _ in range(40):
+        broken = dict(good)
+        for key in {*draw.sample([*broken], 3), "status", "command", "join"}:
+            broken[key] = draw.choice(["=1", "x" * 99, 7.5, [[]], {"A": {}}, True, "\u202e", ["A", "A", 1]])
+        junk += [json.dumps([broken]).encode(), draw.randbytes(40)]
+    for number, body in enumerate(junk):
+        kind = {"Content-Type": "text/csv" if number % 5 == 4 else "application/json"}
+        told = client.post(f"{NORTH}/{path}", content=body, headers=kind)
+        assert told.status_code == 422, (body, told.text)
+        assert told.json()["error"].isprintable()
+    assert client.get(f"{NORTH}/journal").text == before
+    assert client.post(f"{NORTH}/{path}", content=b" " * (MAX_BODY + 1)).status_code == 413
+    assert client.post(f"{NORTH}/{path}", content=iter([b"{}"])).status_code == 411
+
+
+@pytest.mark.parametrize("jump", [3600.0, -3600.0])
+def test_a_jump_of_the_system_clock_is_noted_and_the_service_keeps_its_time(jump, caplog):
+    hands = {"system": NOW, "monotonic": 5.0}
+    clock = Clock(NOW - 9, lambda: hands["system"], lambda: hands["monotonic"])
+    hands |= {"system": NOW + 2 + jump, "monotonic": 7.0}
+    clock.watch()
+    assert (clock(), clock.ahead, len(caplog.messages)) == (NOW + 2, jump, 1)
+    assert Clock(NOW + 9e6, lambda: hands["system"])() == pytest.approx(NOW + 9e6), "after what is stored"

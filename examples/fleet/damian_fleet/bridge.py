@@ -1,0 +1,742 @@
+"""The bridge between the service and one copter with ArduPilot: a state machine without sockets or clock.
+
+``Bridge.step`` takes the time, and the MAVLink messages and answers of the service that have come; it
+returns the messages and requests to send. What is missing is read off the telemetry: a command is sent again
+until its effect is seen or its acknowledgement has come.
+
+| state | commands | ends | limit |
+|:--|:--|:--|:--|
+| connect | nothing | an ArduPilot copter tells where it is: *join*, or on with the flight in hand | |
+| join | nothing | the service knows the UAV, which may join a fleet that flies: *ground* | |
+| ground | nothing; reports, then asks | there is an answer: *accept*; the UAV is to leave: *left* | |
+| accept | nothing | the service confirms: *guided*; or refuses: *ground* | 30 s: *ground* |
+| guided | mode GUIDED | the vehicle says so: *arm* | 15 s: *landing* |
+| arm | motors on | the vehicle says so: *climb* | 15 s: *landing* |
+| climb | takeoff | it is as high as told: *cruise* | 20 s without a metre more: *landing* |
+| cruise | reposition, then speed | it is slow at its goal: *landing* | twice as told, and 60 s: *landing* |
+| landing | land; or motors off | it is on the ground, its motors off: *ground* | 30 s there: *watch* |
+| watch | nothing; reports on the ground | the pilot hands over: *join* | |
+| left | nothing | | |
+
+**The pilot has the last word**: a mode, or motors on or off, that the bridge has not commanded, a restart of
+the vehicle, and before the flight a refusal or a failsafe, lead to *watch* from every state; so does what has
+changed while the bridge was off. **To hand over again**, the pilot switches the vehicle from another mode to
+GUIDED, on the ground with its motors off. An operator's hold leads from each state of a flight to *landing*;
+a missing answer of the service ends none. In a state that lasts, the log says after 30 s what is waited for,
+then after twice as long, and so on.
+"""
+
+import logging
+import math
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+os.environ.setdefault("MAVLINK20", "1")
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+STATION, AUTOPILOT = (255, 191), 1
+"""MAVLink system and component of the bridge, beside a pilot's station; component of the vehicle."""
+GUIDED, LAND = 4, 9
+"""Custom modes of ArduCopter."""
+COPTERS = (2, 3, 4, 13, 14, 15, 29, 35)
+"""MAV_TYPE of what ArduCopter flies: 4 rotors, coaxial, helicopter, 6, 8, 3, 12 and 10 rotors."""
+SILENCE = 5.0  # age of the newest message above which a link counts as lost [s]
+TIMEOUT = 10.0  # when an answer counts as missing [s]
+NEAR, THERE = 2.0, 10.0  # how near to its goal it begins to land, and must have landed [m]
+LEVEL = 1.0  # difference to its flight level at which it has climbed enough [m]
+TOP_SPEED, SCATTER = 40.0, 20.0  # a place farther away than this speed [m/s] and scatter [m] explain ...
+STEADY = 10.0  # ... counts after so long there [s]
+FALL = 3.0  # descent above which a vehicle whose motors go off has fallen, not landed [m/s]
+GRACE = 3.0  # what was refused may have been done before: its effect counts for so long [s]
+QUIET = 10.0  # a command does not come later than this [s]
+LIMITS = {"accept": 30.0, "guided": 15.0, "arm": 15.0, "climb": 20.0, "landing": 30.0}
+"""Longest times in states [s], as the table of states says."""
+MOTORS = dict.fromkeys(("join", "ground", "accept", "guided"), False) | {"climb": True, "cruise": True}
+"""Whether the motors are on in a state, unless somebody else has a hand in it."""
+FAILSAFES = (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
+"""States of a vehicle in which it does not take off."""
+INTERVALS = {"GLOBAL_POSITION_INT": (33, 0.25), "EXTENDED_SYS_STATE": (245, 0.5), "SYS_STATUS": (1, 1.0)}
+INTERVALS |= {"GPS_RAW_INT": (24, 1.0), "BATTERY_STATUS": (147, 2.0)}
+"""Messages that it asks for while they do not come: their numbers, and the time between two [s]."""
+Take = Callable[[int | None, Any], None]
+"""Takes the status and the content of an answer; None and {} of a missing one."""
+_LOG = logging.getLogger("damian_mavlink")
+
+
+class Request(NamedTuple):
+    """A request to the service; its answer has the same ``number``."""
+
+    method: str
+    path: str
+    body: Any
+    number: int
+
+
+class Answer(NamedTuple):
+    """The answer to a request: status and JSON; None if there is none (no link, time-out, garbage)."""
+
+    status: int | None
+    body: Any
+    number: int
+
+
+class Told(BaseModel):
+    """What the service tells the UAV; what does not fit counts as a missing answer."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+    answer: str | None
+    state: Literal["fly", "hold", "return", "bound", "none"]
+    reason: str | None = None
+    lat: float | None = Field(None, ge=-90, le=90)
+    lon: float | None = Field(None, ge=-180, le=180)
+    altitude: float | None = Field(None, gt=0, le=1000)
+    speed: float | None = Field(None, gt=0)
+    duration: float | None = Field(None, ge=0)
+
+    @model_validator(mode="after")
+    def _leads_somewhere(self) -> "Told":
+        if self.state not in ("hold", "none") and None in (self.answer, self.lat, self.lon, self.altitude):
+            raise ValueError("a flight needs answer, lat, lon and altitude")
+        return self
+
+
+class Memory(BaseModel):
+    """What a bridge that is started again must know."""
+
+    system: int | None = None  # MAVLink system of the vehicle
+    number: int = 0  # of the next report
+    state: str = ""  # of the bridge
+    mode: int = -1  # in which the vehicle was in this state, by command of the bridge or before
+    goal: Told | None = None  # what it has accepted and not ended
+    taken_off: bool = False  # to that goal
+    stops: list[tuple[float, float]] = []  # where it landed, or held, newest first [deg] ...
+    landed: list[float] = []  # ... and when [s since 1970]
+    motions: int = 0  # decisions since it last detected the source before
+
+
+class Offset:
+    """How far another clock is ahead of one's own [s], by questions and answers.
+
+    Worked timeline: asked at 10.0 s, answered 1000.2 s, came in at 10.4 s: the other clock is 990 s ahead,
+    give or take 0.2 s. A later answer counts if it came as fast, contradicts the one that counts (a clock was
+    set), or if that is older than 5 minutes (clocks drift).
+    """
+
+    def __init__(self) -> None:
+        self.ahead, self.trip, self._at = math.nan, math.inf, -math.inf
+
+    def note(self, other: float, sent: float, now: float) -> None:
+        """Note what the other clock said to a question sent then and answered now [s]."""
+        trip, ahead = now - sent, other - (sent + now) / 2
+        contradicts = abs(ahead - self.ahead) > (trip + self.trip) / 2 + 0.1
+        if trip <= self.trip or contradicts or now > self._at + 300:
+            self.ahead, self.trip, self._at = ahead, trip, now
+
+
+def way(origin: Sequence[float], goal: Sequence[float]) -> tuple[float, float]:
+    """Distance [m] and heading, clockwise from north [deg], between near latitudes and longitudes [deg]."""
+    east = math.radians(goal[1] - origin[1]) * 6_378_137 * math.cos(math.radians(origin[0]))
+    north = math.radians(goal[0] - origin[0]) * 6_378_137
+    return math.hypot(east, north), math.degrees(math.atan2(east, north)) % 360
+
+
+def name_of(enum: str, number: int) -> str:
+    """What MAVLink calls a number."""
+    found = mavlink.enums[enum].get(number)
+    return found.name.removeprefix("COPTER_MODE_") if found else f"{enum} {number}"
+
+
+class Bridge:
+    """The bridge of one vehicle.
+
+    Args:
+        uav: ID of the UAV at the service.
+        fleet: name of its fleet there.
+        uavs: the UAVs with which the fleet is created if there is none.
+        period: time between two reports of a vehicle on the ground [s]; a step of the service if not given.
+        listen: how long a landed vehicle listens before it reports [s].
+        system: MAVLink system of the vehicle; the first copter that is heard if not given.
+        memory: that of an earlier bridge of this vehicle.
+    """
+
+    def __init__(
+        self,
+        uav: str,
+        fleet: str,
+        uavs: Sequence[str] = (),
+        period: float | None = None,
+        listen: float = 0.0,
+        system: int | None = None,
+        memory: Memory | None = None,
+    ) -> None:
+        self.uav, self.path, self.uavs = uav, f"/fleets/{fleet}", [*uavs] or [uav]
+        self._period, self.period, self.listen = period, period or 5.0, listen
+        self.memory = memory or Memory()
+        self.memory.system = system or self.memory.system
+        self.state, self.leaving = "connect", False
+        """``leaving``: it ends the flight in hand and leaves the fleet."""
+        self.why = "no heartbeat of a copter with ArduPilot"
+        """What the state waits for."""
+        self.mode, self.height, self.battery, self.time = -1, 0.0, None, math.nan
+        self.armed = self.on_ground = self.in_air = self.is_linked = False
+        self.is_ready = True
+        self.service, self.vehicle = Offset(), Offset()
+        """Clocks: [s since 1970] of the service, and [s] since the boot of the vehicle."""
+        self.seen: dict[str, Any] = {}
+        """The newest messages of the vehicle by their types."""
+        self.here: tuple[float, float] | None = None
+        """Where the vehicle was at last [deg]."""
+        self.now = self._since = self._placed = self._place_at = self._steady = -math.inf
+        self._retry = self._asked_at = self._landed_at = self._commanded = -math.inf
+        self._patience, self._top, self._down, self._number, self._uptime = 30.0, -math.inf, math.inf, 0, 0
+        self._came: dict[str, float] = {}
+        self._due: dict[str, float] = {}
+        self._raw: tuple[tuple[float, float], float] = ((0.0, 0.0), -math.inf)
+        self._falls: deque[tuple[float, float]] = deque()
+        self._levels: dict[int, tuple[float, int]] = {}
+        self._questions: deque[int] = deque(maxlen=32)
+        self._sent: dict[int, float] = {}
+        self._results: dict[int, tuple[bool, float]] = {}
+        self._is_flying = not self.memory.stops or self.memory.taken_off
+        self._was_linked = self._has_booted = self._has_joined = self._is_other = False
+        self._spotted = self._was_spotted = False
+        self._track = self._turned = self._boot = self._reported = self._held = None
+        self._offer: Told | None = None
+        self._pending: tuple[Request, Take, float] | None = None
+        self._wish: tuple[str, str, Any, Take] | None = None
+        self._outbox: deque[tuple[str, dict[str, Any]]] = deque()
+        self._fresh_from = self.memory.number
+        self._out: list[Any] = []
+
+    def step(
+        self, now: float, messages: Iterable[Any] = (), answers: Iterable[Answer] = ()
+    ) -> tuple[list[Any], list[Request]]:
+        """Take what has come, and return the messages and requests to send; ``now`` [s] never goes back."""
+        if self.state == "left":
+            return [], []
+        self._since = now if self._since == -math.inf else self._since
+        self.now, self._out, self._wish = now, [], None
+        for message in messages:
+            self._hear(message)
+        self._look()
+        if self.is_linked != self._was_linked:
+            self._was_linked = self.is_linked
+            self._say("the vehicle is heard" if self.is_linked else "the vehicle is not heard any more")
+            self._since = now if self.state == "climb" else self._since
+            self._need_fresh()
+        if self.is_linked:
+            self._is_flying = self._is_flying or self.in_air
+            if reason := self._act_of_pilot():
+                self._hands_off(reason)
+        for answer in answers:  # after the acts of a pilot, so that none is taken for its own
+            self._hear_answer(answer)
+        self._check_limit()
+        if self.state in ("connect", "join") or (self.is_linked and self.state != "left"):
+            getattr(self, f"_{self.state}")()
+        self._keep_in_touch()
+        if self.now >= self._since + self._patience:
+            lost = "" if self.is_linked else "the vehicle is not heard; "
+            self._say(f"{self.state} for {self.now - self._since:.0f} s: {lost}{self.why}")
+            self._patience *= 2
+        return self._out, self._talk()
+
+    def _say(self, text: str, level: int = logging.INFO) -> None:
+        _LOG.log(level, "%s: %s", self.uav, text)
+
+    def _is_due(self, what: str, period: float) -> bool:
+        """Whether something is due, which then is so again after a period [s]."""
+        if self.now < self._due.get(what, -math.inf) - 1e-6:
+            return False
+        self._due[what] = self.now + period
+        return True
+
+    # Telemetry.
+
+    def _look(self) -> None:
+        """What the newest messages say."""
+        seen, low = self.seen, mavlink.MAV_LANDED_STATE_ON_GROUND
+        self.time = self.now + self.service.ahead
+        levels = [left for at, left in self._levels.values() if left >= 0 and self.now < at + 30]
+        self.battery = min(levels, default=None)
+        is_heard = self.now < self._came.get("HEARTBEAT", -math.inf) + SILENCE  # else the mode is of long ago
+        self.is_linked = is_heard and self.here is not None
+        if "HEARTBEAT" in seen and "GLOBAL_POSITION_INT" in seen:
+            self.mode = seen["HEARTBEAT"].custom_mode
+            self.armed = bool(seen["HEARTBEAT"].base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            self.height = seen["GLOBAL_POSITION_INT"].relative_alt / 1e3
+            said = seen["EXTENDED_SYS_STATE"].landed_state if "EXTENDED_SYS_STATE" in seen else 0
+            self.on_ground = said == low or (not self.armed and self.height < 0.5)
+            self.in_air = not self.on_ground and (said > low or (self.armed and self.height > 1))
+        if "SYS_STATUS" in seen:  # which may tell of the checks before arming
+            status, bit = seen["SYS_STATUS"], mavlink.MAV_SYS_STATUS_PREARM_CHECK
+            self.is_ready = bool(
+                (~status.onboard_control_sensors_present | status.onboard_control_sensors_health) & bit
+            )
+
+    def _hear(self, message: Any) -> None:
+        """Take a message, if it is one of the vehicle."""
+        kind, system = message.get_type(), message.get_srcSystem()
+        if kind == "NAMED_VALUE_FLOAT" and system == self.memory.system and message.name == "spotted":
+            self._spotted = message.value >= 0.5  # the payload may be a component of its own
+        if message.get_srcComponent() != AUTOPILOT or kind == "BAD_DATA":
+            return
+        if self.memory.system is None and kind == "HEARTBEAT" and self._is_copter(message):
+            self.memory.system = system
+        if self.memory.system != system:
+            if kind == "HEARTBEAT" and self._is_due(f"system {system}", 600):
+                self._say(f"system {system} is on this link; commands go to {self.memory.system} alone")
+            return
+        if kind == "HEARTBEAT" and not self._is_copter(message):
+            return
+        is_young = kind in self.seen and self.now < self._came[kind] + SILENCE
+        if is_young and 0 < (self.seen[kind].get_seq() - message.get_seq()) % 256 < 64:
+            return  # an older one, which came on a longer way
+        self._came[kind] = self.now
+        self.seen[kind] = message
+        if kind == "GLOBAL_POSITION_INT":
+            self._hear_position(message)
+        elif kind == "COMMAND_ACK":
+            self._hear_result(message)
+        elif kind in ("SYS_STATUS", "BATTERY_STATUS"):
+            self._levels[getattr(message, "id", -1)] = self.now, message.battery_remaining
+        elif kind == "TIMESYNC" and message.tc1 and message.ts1 in self._questions:  # and none of others
+            self._hear_uptime(message.tc1 / 1e9, message.ts1 / 1e9)
+        elif kind == "STATUSTEXT":
+            self._say(f"the vehicle says (severity {message.severity}): {message.text}")
+
+    def _hear_uptime(self, uptime: float, asked: float) -> None:
+        if uptime < self._uptime - 10:  # and no older message
+            self._has_booted, self.vehicle = True, Offset()
+        self._uptime = uptime
+        self.vehicle.note(uptime, asked, self.now)
+
+    def _is_copter(self, heartbeat: Any) -> bool:
+        if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and heartbeat.type in COPTERS:
+            return True
+        names = name_of("MAV_AUTOPILOT", heartbeat.autopilot), name_of("MAV_TYPE", heartbeat.type)
+        self.why = f"{', '.join(names)} is no copter with ArduPilot, and is refused"
+        if self._is_due("refused", 60):
+            self._say(self.why, logging.ERROR)
+        return False
+
+    def _hear_position(self, message: Any) -> None:
+        """Take a position if it is one: no sentinel, after a fix, no jump."""
+        place, fix = (message.lat / 1e7, message.lon / 1e7), self.seen.get("GPS_RAW_INT")
+        self._falls.append((self.now, message.vz / 100))
+        while self._falls[0][0] < self.now - 3:
+            self._falls.popleft()
+        is_none = max(map(abs, place)) < 1e-3 or abs(place[0]) > 90 or abs(place[1]) > 180
+        if is_none or (fix is not None and fix.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX):
+            self.why = "no position of the vehicle" if self.here is None else self.why
+            return
+        (before, at), self._raw = self._raw, (place, self.now)
+        if way(before, place)[0] > SCATTER + TOP_SPEED * (self.now - at):
+            self._steady = self.now
+        away = way(self.here, place)[0] if self.here is not None else 0.0
+        if away > SCATTER + TOP_SPEED * (self.now - self._place_at) and self.now < self._steady + STEADY:
+            if self._is_due("jump", 10):
+                self._say(f"a position is {away:.0f} m away at once, and not taken")
+            return
+        self._placed = self.now if self.here is None else self._placed
+        self.here, self._place_at, self._boot = place, self.now, message.time_boot_ms
+
+    # Commands.
+
+    def _hear_result(self, ack: Any) -> None:
+        """Note what the vehicle says of a command of this state; none of other stations."""
+        if (ack.target_system, ack.target_component) != STATION or ack.command not in self._sent:
+            return
+        if ack.result not in (mavlink.MAV_RESULT_IN_PROGRESS, mavlink.MAV_RESULT_TEMPORARILY_REJECTED):
+            self._results.setdefault(ack.command, (ack.result == mavlink.MAV_RESULT_ACCEPTED, self.now))
+        if ack.result != mavlink.MAV_RESULT_ACCEPTED:
+            self._say(f"{name_of('MAV_CMD', ack.command)}: {name_of('MAV_RESULT', ack.result)}")
+
+    def _command(self, command: int, *params: float, place: tuple[float, float] | None = None) -> bool:
+        """Send a command, and again until there is a result; returns whether it was accepted."""
+        if command in self._results:
+            return self._results[command][0]
+        if self.now < self._sent.get(command, -math.inf) + 1.0 + 1.5 * min(self.vehicle.trip, 2.0):
+            return False
+        self._sent[command] = self._commanded = self.now
+        own, target = (*params, *[0.0] * 7)[:7], (self.memory.system, AUTOPILOT)
+        if place is None:
+            self._out.append(mavlink.MAVLink_command_long_message(*target, command, 0, *own))
+        else:
+            about = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, command, 0, 0
+            x, y = (round(each * 1e7) for each in place)
+            self._out.append(mavlink.MAVLink_command_int_message(*target, *about, *own[:4], x, y, own[6]))
+        return False
+
+    def _is_refused(self, command: int) -> bool:
+        """Whether a command was refused, and shows no effect of an earlier try."""
+        is_accepted, at = self._results.get(command, (True, self.now))
+        return not is_accepted and self.now > at + GRACE
+
+    def _keep_in_touch(self) -> None:
+        """Heartbeats, the clock of the vehicle, and the messages that do not come."""
+        if self._is_due("heartbeat", 1.0):
+            kind, none = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
+            self._out.append(mavlink.MAVLink_heartbeat_message(kind, none, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
+            self._questions.append(int(self.now * 1e9))
+            self._out.append(mavlink.MAVLink_timesync_message(0, self._questions[-1]))
+        if self.memory.system is None or not self._is_due("intervals", SILENCE):
+            return
+        for kind, (number, interval) in INTERVALS.items():
+            if self.now > self._came.get(kind, -math.inf) + max(SILENCE, 3 * interval):
+                asked = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval * 1e6, 0, 0, 0, 0, 0
+                self._out.append(mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked))
+
+    # The service.
+
+    def _talk(self) -> list[Request]:
+        """The next request, one at a time: the time, what has happened, then what the state wants."""
+        if self._pending is not None and self.now > self._pending[2] + TIMEOUT:
+            self._hear_answer(Answer(None, None, self._pending[0].number))
+        if self._pending is not None or self.now < self._retry:
+            return []
+        if self._is_due("time", 1.0 if math.isnan(self.service.ahead) else 10.0):
+            self._wish = "GET", "/time", None, self._hear_time
+        elif self._outbox:
+            self._wish = "POST", self.path + self._outbox[0][0], self._outbox[0][1], self._hear_delivery
+        if self._wish is None:
+            return []
+        self._number += 1
+        self._pending = Request(*self._wish[:3], self._number), self._wish[3], self.now
+        return [self._pending[0]]
+
+    def _hear_answer(self, answer: Answer) -> None:
+        """Take an answer; an error of the service, or what is not as it should be, is a missing one."""
+        if self._pending is None or answer.number != self._pending[0].number:
+            return
+        request, take, self._asked_at = self._pending
+        self._pending = None
+        known = (200, 201, 400, 409, 413, 422, 404 if request.method == "GET" else 200)
+        is_said, problem = answer.status in known and isinstance(answer.body, dict), f"status {answer.status}"
+        try:
+            take(*((answer.status, answer.body) if is_said else (None, {})))
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            is_said, problem = False, " ".join(str(error).split())[:200]
+            take(None, {})
+        if not is_said:
+            self._retry = self.now + 1.0
+            if self._is_due("no service", 10):
+                said = f"no answer of the service to {request.method} {request.path} ({problem})"
+                self._say(said, logging.WARNING)
+
+    def _hear_time(self, status: int | None, body: dict[str, Any]) -> None:
+        if status is not None:
+            if not 0 < (said := float(body["time"])) < 4e9:
+                raise ValueError
+            self.service.note(said, self._asked_at, self.now)
+
+    def _hear_delivery(self, status: int | None, body: dict[str, Any]) -> None:
+        if status is not None:
+            path, _ = self._outbox.popleft()
+            if status >= 400:
+                self._say(f"the service refuses {path}: {body.get('error')}", logging.WARNING)
+
+    def _say_fact(self, answer: str | None, status: str) -> None:
+        """Tell the service, as soon as it is reached, what has happened."""
+        self._outbox.append(("/acknowledgements", {"ID": self.uav, "answer": answer, "status": status}))
+
+    def _need_fresh(self) -> None:
+        """Before it asks again, it reports."""
+        self._fresh_from = self.memory.number
+        self._due.pop("report", None)
+
+    def _report(self) -> None:
+        """Report what the newest telemetry says, unless that has been reported."""
+        memory, flies = self.memory, self.in_air
+        if math.isnan(self.time) or self.here is None or self._boot is None or self._boot == self._reported:
+            return
+        measured = self._boot / 1e3 - self.vehicle.ahead
+        at = self._place_at if math.isnan(measured) else min(measured, self.now)
+        memory.number = memory.number or int(self.time)  # larger than that of a bridge whose memory is lost
+        row = {"ID": self.uav, "number": memory.number, "time": at + self.service.ahead}
+        row |= {"lat": self.here[0], "lon": self.here[1], "FLA": self.height, "on ground": int(not flies)}
+        row |= {"battery": self.battery, "source spotted": int(self._spotted and not flies)}
+        row |= {"track": self._track, "takeoff-landing time": self._turned}
+        row |= {"previous": memory.stops[1:], "landed": memory.landed, "motions": memory.motions}
+        self._was_spotted, self._reported = self._spotted and not flies, self._boot
+        memory.number += 1
+        self._outbox.append(("/reports", row))
+
+    def _report_in_turn(self) -> None:
+        if self._boot != self._reported and not self._outbox and self._is_due("report", self.period):
+            self._report()
+
+    def _want(self, period: float, take: Take, method: str, path: str, body: Any = None) -> None:
+        """Request something once in a period, if nothing else is under way."""
+        is_free = self._pending is None is self._wish and self.now >= self._retry and not self._outbox
+        if is_free and self._is_due("want", period):
+            self._wish = method, self.path + path, body, take
+
+    def _ask(self) -> None:
+        """Ask for advice, after a fresh report."""
+        if self.memory.number == self._fresh_from:
+            self._report()  # it goes before all that is wanted
+        else:
+            period = min(self.period / 4, 1.0) if self.state == "ground" else min(self.period, 2.0)
+            self._want(period, self._hear_advice, "POST", "/advice", {"uavs": [self.uav]})
+
+    def _hear_advice(self, status: int | None, body: dict[str, Any]) -> None:
+        if status is None or status >= 400:
+            self.why = f"the service says {body.get('error')}" if status else self.why
+            return
+        told, goal = Told.model_validate(body["advice"][0]), self.memory.goal
+        is_new = told.answer not in (None, self._held, goal and goal.answer)
+        if self.state == "ground":
+            self.why = f"it is told {told.state}" + (f" because {told.reason}" if told.reason else "")
+            self._offer = told if is_new and told.state != "none" else None
+            if self._offer is not None and told.state != "hold":
+                self._turn("accept", f"the service to confirm {told.state} {told.answer}")
+        elif goal is not None and is_new and told.state == "hold":
+            self._say_fact(told.answer, "accepted")
+            self._end("aborted")
+            self._turn("landing", f"it is told to hold because {told.reason}")
+
+    def _hear_confirmation(self, status: int | None, body: dict[str, Any]) -> None:
+        if status is None or self._offer is None or self.here is None:
+            return
+        told, come = self._offer, body["status"][0] if status < 400 else "refused"
+        self._offer = None
+        if told.state == "hold":
+            self._held = told.answer
+            if come == "landed" and told.reason is None:  # the policy has chosen to hold
+                self._decided()
+            return
+        if come in ("accepted", "taken off"):
+            self.memory.goal, self.memory.taken_off = told, come == "taken off"
+            self._track = way(self.here, (told.lat, told.lon))[1]
+        if come == "accepted":
+            self._turn("guided", f"mode GUIDED for {told.answer}")
+        else:
+            self._end()  # what was taken off in an earlier life of the bridge has landed since
+            self._turn("ground", f"{told.answer} is {come}")
+
+    # Flights.
+
+    def _turn(self, state: str, why: str) -> None:
+        """Go over to another state, which waits for something."""
+        self._say(f"{self.state} -> {state}: {why}")
+        self.state, self.why, self._since, self._patience = state, why, self.now, 30.0
+        self.memory.state, self.memory.mode = state, self.mode
+        self._sent, self._results = {}, {}
+        self._top, self._down, self._is_other = -math.inf, math.inf, False
+        self._due.pop("want", None)
+
+    def _act_of_pilot(self) -> str:
+        """What somebody else has done with the vehicle in this state; empty if nothing."""
+        has_booted, self._has_booted = self._has_booted, False
+        if self.state not in MOTORS and self.state not in ("arm", "landing"):
+            return ""
+        lands, memory = self.state == "landing", self.memory
+        if self.mode == (LAND if lands else GUIDED) and self.state in ("join", "ground", "accept", "landing"):
+            memory.mode = self.mode  # from now on no other
+        allowed = {memory.mode, LAND} if lands else {memory.mode}
+        if self.state == "guided" or (lands and memory.mode != LAND):
+            allowed.add(GUIDED)
+        if has_booted:
+            return "it has booted again"
+        if self.mode not in allowed:
+            return f"mode {name_of('COPTER_MODE', self.mode)} by somebody else"
+        if self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(self.state, True):
+            return "a failsafe of the vehicle"
+        if self.armed != MOTORS.get(self.state, self.armed):
+            return f"motors {'on' if self.armed else 'off'} by somebody else"
+        return ""
+
+    def _hands_off(self, reason: str) -> None:
+        """The pilot has it."""
+        self._say(f"the pilot has it: {reason}", logging.WARNING)
+        if self._offer is not None:
+            self._say_fact(self._offer.answer, "aborted")
+            self._offer = None
+        self._end()
+        self._turn("watch", f"a pilot to land it, and to hand over by GUIDED with its motors off ({reason})")
+
+    def _check_limit(self) -> None:
+        """End what has taken too long."""
+        goal, lasting, limit = self.memory.goal, self.now - self._since, LIMITS.get(self.state, math.inf)
+        if self.state == "cruise" and goal is not None:
+            limit = 2 * (goal.duration or 60.0) + 60
+        if self.state == "landing":
+            if self.now > self._down + limit:
+                self._hands_off(f"motors on, on the ground for {limit:.0f} s")
+        elif lasting > limit and (self.is_linked or self.state == "accept"):
+            self._offer = None
+            state = "ground" if self.state == "accept" else "landing"
+            self._turn(state, f"not within {limit:.0f} s: {self.why}")
+
+    def _end(self, how: str = "") -> None:
+        """End the flight in hand and say how: by where the vehicle stands, if not given."""
+        goal, memory = self.memory.goal, self.memory
+        if goal is None or self.here is None:
+            return
+        away = way(self.here, (goal.lat, goal.lon))[0]
+        is_there = memory.taken_off and self.on_ground and away <= THERE
+        how = how or ("landed" if is_there else "aborted")
+        self._say(f"{goal.answer} {how}, {away:.0f} m from its goal")
+        self._say_fact(goal.answer, how)
+        memory.goal, memory.taken_off = None, False
+
+    def _decided(self) -> None:
+        """Note that a decision has been followed: where, and when."""
+        memory = self.memory
+        memory.motions = (0 if self._was_spotted else memory.motions) + bool(memory.stops)
+        memory.stops, memory.landed = [self.here, *memory.stops][:17], [self.time, *memory.landed][:17]
+
+    def _stand(self) -> bool:
+        """Note when it has come to stand on the ground; returns whether it does, and has listened."""
+        if self._is_flying and self.on_ground and not self.armed and not math.isnan(self.time):
+            self._decided()
+            self._landed_at, self._turned, self._is_flying, self._spotted = self.now, self.time, False, False
+            self._need_fresh()
+        return not self._is_flying and self.now >= self._landed_at + self.listen
+
+    # States.
+
+    def _connect(self) -> None:
+        if "HEARTBEAT" not in self.seen or self.here is None or not (self.on_ground or self.in_air):
+            return
+        state, mode, is_told = self.memory.state, self.memory.mode, self.memory.goal is not None
+        if self.battery is None and self.now < self._placed + 10:
+            self.why = "no battery tells its level"
+        elif state in ("watch", "cruise", "landing") or (is_told and self.in_air):
+            self._turn(state, "on as before")
+            self.memory.mode = mode  # what has changed since, somebody else has done
+        elif state == "climb" and self.on_ground and not self.armed:
+            self._hands_off("motors off by somebody else")
+        elif is_told and self.on_ground:
+            self._turn("landing", "on the ground as before")
+            self.memory.mode = mode
+        elif self.armed or (mode not in (-1, self.mode) and state != "left"):
+            self._hands_off(f"motors on or mode {name_of('COPTER_MODE', self.mode)} by somebody else")
+        else:
+            self._turn("join", "the service to know the UAV")
+
+    def _join(self) -> None:
+        self._want(1.0, self._hear_fleet, "GET", "")
+
+    def _hear_fleet(self, status: int | None, body: dict[str, Any]) -> None:
+        """Create the fleet, join it, or go on as its member."""
+        if status == 404:
+            self._wish = "PUT", self.path, {"uavs": self.uavs}, self._hear_change
+        elif status == 200 and not self._has_joined and self.uav not in [row["ID"] for row in body["uavs"]]:
+            self._wish = "POST", f"{self.path}/uavs", {"join": [self.uav]}, self._hear_change
+        elif status == 200 and self.state == "join" and self.is_linked:
+            self._has_joined, self.period = True, self._period or float(body["dt"])
+            self._turn("ground", "a report to be taken")
+
+    def _leave(self) -> None:
+        self._want(1.0, self._hear_change, "POST", "/uavs", {"leave": [self.uav]})
+
+    def _hear_change(self, status: int | None, body: dict[str, Any]) -> None:
+        if status is not None:
+            self._has_joined, self.why = True, f"the service says {body.get('error', 'welcome')}"
+            self._turn("join" if self.state == "join" else "left", self.why)
+
+    def _ground(self) -> None:
+        if self.in_air:
+            self._hands_off("it flies, by somebody else")
+        elif self._stand():
+            self._report_in_turn()
+            if self.leaving:
+                self._leave()
+            elif not self.is_ready:
+                self.why = "the vehicle's checks before arming"
+            elif self._offer is not None:
+                self._accept()
+            else:
+                self._ask()
+
+    def _accept(self) -> None:
+        row = {"ID": self.uav, "answer": self._offer.answer, "status": "accepted"}
+        self._want(0.0, self._hear_confirmation, "POST", "/acknowledgements", row)
+
+    def _change(self, command: int, *params: float) -> None:
+        """Command something before the flight; what is refused gives the vehicle back."""
+        if self._is_refused(command):
+            self._hands_off(f"{name_of('MAV_CMD', command)} is refused")
+        elif (
+            self.now < self._came["GLOBAL_POSITION_INT"] + 1
+        ):  # it tells of itself, so that its acts are seen
+            self._command(command, *params)
+            self._ask()
+
+    def _guided(self) -> None:
+        set_mode = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, GUIDED
+        self._turn("arm", "motors on") if self.mode == GUIDED else self._change(*set_mode)
+
+    def _arm(self) -> None:
+        arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1
+        self._turn("climb", "its level") if self.armed else self._change(*arm)
+
+    def _climb(self) -> None:
+        goal, memory = self.memory.goal, self.memory
+        if self.height > self._top + 1:
+            self._top, self._since = self.height, self.now
+        if not self.in_air:
+            self._change(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, goal.altitude)
+        elif not memory.taken_off:
+            memory.taken_off, self._turned = True, None if math.isnan(self.time) else self.time
+            self._say_fact(goal.answer, "taken off")
+            self._report()
+        elif self.height >= goal.altitude - LEVEL:
+            self._turn("cruise", f"{goal.lat:.6f}, {goal.lon:.6f}")
+        else:
+            self._ask()
+
+    def _cruise(self) -> None:
+        goal, position = self.memory.goal, self.seen["GLOBAL_POSITION_INT"]
+        place, pace = (goal.lat, goal.lon), math.hypot(position.vx, position.vy) / 100
+        is_near = way(self.here, place)[0] < NEAR and self.now < self._place_at + 2
+        if self.on_ground:
+            self._hands_off("on the ground in cruise")
+        elif self._is_refused(mavlink.MAV_CMD_DO_REPOSITION):
+            self._turn("landing", "the vehicle refuses the goal")
+        elif is_near and pace < 1.0:
+            self._turn("landing", "at its goal")
+        else:
+            go = mavlink.MAV_CMD_DO_REPOSITION, -1, 0, 0, math.nan, 0, 0, goal.altitude or 0.0
+            if self._command(*go, place=place) and goal.speed:  # the reposition sets the speed anew
+                self._command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, goal.speed, -1)
+            self._ask()
+
+    def _landing(self) -> None:
+        if not self.on_ground:
+            self._results.clear()  # whatever it says: again, until it lands
+            self._down = math.inf
+            if self.mode != LAND:
+                self._command(mavlink.MAV_CMD_NAV_LAND)
+            return
+        self._down = min(self._down, self.now)
+        if self.armed and self.mode not in (GUIDED, LAND):
+            self._hands_off("motors on by somebody else")
+        elif self.armed and self.mode == GUIDED:  # LAND does so itself
+            self._results.clear()
+            self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0)
+        elif self.armed:
+            self.why = "the vehicle to turn its motors off"
+        elif self.now > self._down + 2 and max((fall for _, fall in self._falls), default=0.0) > FALL:
+            self._hands_off("its motors went off in the air")
+        elif self.now > self._down + 2:
+            self._end()
+            self._turn("ground" if self._has_joined else "join", "a report to be taken")
+
+    def _watch(self) -> None:
+        if self._stand():
+            self._report_in_turn()
+            if self.leaving:
+                self._leave()
+        if self.mode != GUIDED or self.now < self._commanded + QUIET:  # or by a command that came late
+            self._is_other = self.mode != GUIDED
+        elif self._is_other and self.on_ground and not self.armed:
+            self._need_fresh()
+            self._turn("join", "the pilot has handed over")
+        elif self._is_other and self._is_due("hand over", 60):
+            self._say("GUIDED in flight hands nothing over: land it, motors off, another mode, GUIDED")

@@ -1,0 +1,469 @@
+"""Seeded faults over a fleet of five in virtual time: service, five bridges and five copters in this process.
+
+``python tests/campaign.py`` plays 1,000 faults and prints the tables of the README (`make fleet-campaign`).
+What counts is what the copters do, whatever the programs believe. A person sees to vehicles that are not the
+bridge's.
+"""
+
+import argparse
+import asyncio
+import logging
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from itertools import combinations
+from pathlib import Path
+from unittest import mock
+
+import httpx2
+import numpy as np
+import torch
+
+from damian.baselines.random import random_policy
+from damian_fleet import program
+from damian_fleet.bridge import Answer, Bridge, Memory
+from damian_fleet.program import config_of, make_fleets
+from damian_fleet.service import Clock, make_app
+from damian_fleet.store import Fleets
+from damian_fleet.vehicles import (
+    ALT_HOLD,
+    ARMED,
+    BRAKE,
+    GUIDED,
+    LAND,
+    LOITER,
+    RTL,
+    STABILIZE,
+    Copter,
+    mavlink,
+)
+
+UAVS, TICK, HOUR = "ABCDE", 0.25, 3600.0
+ORIGIN = (52.8110, -4.1283)
+STARTS = (0j, 170 + 0j, 340 + 0j, 510 + 0j, -170 + 0j)
+SAME_POINT, SAME_LEVEL, CLEARANCE = (
+    15.0,
+    2.5,
+    8.0,
+)  # [m]; levels are 5 m apart, and 10 m are set
+HOVER, LONGEST = 30.0, 600.0  # [s] that a copter may stand in the air in GUIDED, and that it may fly
+HARMLESS = (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE)
+USUAL = {"loss": 0.02, "double": 0.02, "slowest": 0.3}  # of links: the longest delay [s]
+TOKEN = "campaign-campaign"
+WORDS = [
+    "policy=script",
+    "region=llanbedr",
+    "motion=polynomial",
+    "motion.max_speed=8",
+    "motion.max_acceleration=1.5",
+]
+WORDS += ["region.lattice_step=130", "highest_level=20", "port=0"]  # few points, one level: they meet
+
+
+class Line:
+    """A link that delays, loses and doubles what it carries."""
+
+    def __init__(self, rng):
+        self.rng, self.items = rng, []
+        vars(self).update(USUAL)
+
+    def send(self, now, *things):
+        for thing in things:
+            for _ in range(1 + (self.rng.random() < self.double)):
+                if self.rng.random() >= self.loss:
+                    self.items.append((now + self.rng.uniform(0.01, self.slowest), thing))
+
+    def due(self, now):
+        due = sorted((item for item in self.items if item[0] <= now), key=lambda item: item[0])
+        self.items = [item for item in self.items if item[0] > now]
+        return [thing for _, thing in due]
+
+
+class Service:
+    """The service, which can be killed: what is started again has the files that lay on the disk."""
+
+    def __init__(self, folder):
+        self.config, words = config_of([*WORDS, f"database={folder / 'fleets.0'}"])
+        with mock.patch.object(program, "script_policy", random_policy):  # its UAVs meet often
+            self.fleets = make_fleets(self.config, words)
+            self.fleets.make([*UAVS], "", 0.0)  # the policy is made once for so many UAVs
+        self.now, self.jump, self.down_until, self.starts = 0.0, 0.0, 0.0, 0
+        self.loop = asyncio.new_event_loop()
+        self.serve()
+
+    def serve(self):
+        clock = Clock(self.fleets.latest, lambda: 1.7e9 + self.now + self.jump, lambda: self.now)
+        transport = httpx2.ASGITransport(make_app(self.fleets, TOKEN, clock))
+        headers = {"authorization": f"Bearer {TOKEN}"}
+        self.client = httpx2.AsyncClient(transport=transport, base_url="http://fleet", headers=headers)
+
+    def restart(self):
+        before = Path(self.config.database)
+        self.starts += 1
+        after = before.with_suffix(f".{self.starts}")
+        for end in ("", "-wal"):
+            if Path(f"{before}{end}").exists():
+                shutil.copy(f"{before}{end}", f"{after}{end}")
+        self.config.database = str(after)
+        self.fleets = Fleets(self.fleets.make, after, self.fleets.about)
+        self.serve()
+
+    def ask(self, method, path, body=None):
+        """Status and JSON."""
+        answer = self.loop.run_until_complete(self.client.request(method, path, json=body))
+        return answer.status_code, answer.json()
+
+
+class Uav:
+    """A copter, its bridge and the links between them and the service."""
+
+    def __init__(self, name, number, rng):
+        self.name = name
+        self.copter = Copter(ORIGIN, STARTS[number], system=number + 1, station=255)
+        self.lines = self.down, self.up, self.asked, self.answered = [Line(rng) for _ in range(4)]
+        self.memory, self.bridge, self.epoch, self.off_until = None, None, 0.0, 0.0
+        self.act, self.act_seen, self.strayed, self.changed = None, False, False, ()
+        self.last_command = self.hover_since = self.air_since = self.idle_since = None
+        self.flights, self.shown = 0, None
+
+    def stop_bridge(self, until):
+        if self.bridge is not None:
+            self.memory = self.bridge.memory.model_dump_json()
+        self.bridge, self.off_until = None, until
+
+    def start_bridge(self, epoch):
+        memory = Memory.model_validate_json(self.memory) if self.memory else None
+        own = {"system": self.copter.system, "memory": memory}
+        self.epoch, self.bridge = epoch, Bridge(self.name, "north", [*UAVS], 1.0, **own)
+
+    def acted(self, now, why, *changed):
+        """Somebody else has changed mode (0) or motors (1): once it has seen that, the bridge is quiet."""
+        fell = self.copter.crashed and self.copter.height > 2
+        memory = self.bridge.memory if self.bridge else Memory.model_validate_json(self.memory)
+        lands = self.copter.mode == LAND and (self.last_command == LAND or memory.state == "landing")
+        if fell or not lands:
+            self.act, self.act_seen, self.strayed, self.changed = (now, why), False, True, changed
+
+
+class Campaign:
+    """One fleet with faults at random times; ``broken`` tells which invariants did not hold, and how."""
+
+    def __init__(self, seed, folder):
+        self.rng = np.random.default_rng(seed)
+        torch.manual_seed(seed)  # the script draws
+        self.now, self.later, self.station = 0.0, [], mavlink.MAVLink(None, 255, 191)
+        self.service = Service(Path(folder))
+        self.uavs = [Uav(name, number, self.rng) for number, name in enumerate(UAVS)]
+        self.broken, self.faults, self.answers, self.reported = {}, Counter(), {}, {}
+
+    def play(self, faults, every=8.0, afterwards=300.0):
+        """Let it fly, with a fault every so many seconds, then without: in that time every UAV must fly."""
+        self.run(30.0)
+        for _ in range(faults):
+            kind = FAULTS[self.rng.integers(len(FAULTS))]
+            self.faults[kind.__name__.replace("_", " ")] += 1
+            uav, seconds = self.uavs[self.rng.integers(len(self.uavs))], self.rng.uniform(2, 30)
+            logging.info("%.2f s: %s, %s, %.1f s", self.now, kind.__name__, uav.name, seconds)
+            kind(self, uav, seconds)
+            self.run(self.rng.exponential(every))
+        self.run(60.0)
+        flown = {uav.name: uav.flights for uav in self.uavs}
+        self.run(afterwards)
+        rows = {row["ID"]: row for row in self.service.ask("GET", "/fleets/north")[1]["uavs"]}
+        for uav in self.uavs:
+            if uav.flights == flown[uav.name]:
+                state = uav.bridge and (uav.bridge.state, uav.bridge.why)
+                self.break_("flies again", f"{uav.name}: {state}, {rows[uav.name]}")
+        for name, numbers in self.reported.items():
+            if rows[name]["reports"] < len(numbers):
+                self.break_("no report is lost", f"{name}: {rows[name]['reports']} of {len(numbers)}")
+        return self
+
+    def break_(self, invariant, how):
+        self.broken.setdefault(invariant, f"at {self.now:.0f} s: {how}")
+
+    def run(self, seconds):
+        for _ in range(round(seconds / TICK)):
+            self.now = round(self.now + TICK, 6)
+            self.service.now = self.now
+            for item in [item for item in self.later if item[0] <= self.now]:
+                self.later.remove(item)
+                item[1]()
+            for uav in self.uavs:
+                self.step(uav)
+            if self.now % 1 == 0:
+                self.check()
+
+    def after(self, seconds, action):
+        self.later.append((self.now + seconds, action))
+
+    def lines(self, lines, seconds, **change):
+        """Change links for so long [s]."""
+        for line in lines:
+            vars(line).update(change)
+            self.after(seconds, lambda line=line: vars(line).update({name: USUAL[name] for name in change}))
+
+    def command(self, body):
+        """An operator, who asks again until the service answers."""
+        if self.now < self.service.down_until:
+            self.after(1.0, lambda: self.command(body))
+        else:
+            self.service.ask("POST", "/fleets/north/command", body)
+
+    # One step of one UAV.
+
+    def step(self, uav):
+        copter, now = uav.copter, self.now
+        for request in uav.asked.due(now):
+            uav.answered.send(now, Answer(*self.serve(request), request.number))
+        if uav.bridge is None and now >= uav.off_until:
+            uav.start_bridge(self.rng.uniform(-HOUR, HOUR))
+            uav.shown = None
+        heard, answers = uav.up.due(now), uav.answered.due(now)
+        if uav.bridge is not None:
+            for at, message in heard:
+                if message.get_type() == "HEARTBEAT":
+                    shown = message.custom_mode, message.base_mode & ARMED
+                    is_new = uav.shown is None or any(shown[i] != uav.shown[i] for i in uav.changed)
+                    uav.act_seen |= uav.act is not None and at >= uav.act[0] and is_new
+                    uav.shown = shown
+            messages, requests = uav.bridge.step(now + uav.epoch, [message for _, message in heard], answers)
+            for message in messages:
+                message.pack(self.station)
+                self.look_at_command(uav, message)
+            uav.down.send(now, *messages)
+            uav.asked.send(now, *requests)
+        was_landed, failsafe, mode = copter.landed, set(copter.failsafe), copter.mode
+        uav.up.send(now, *((now, message) for message in copter.step(now, uav.down.due(now))))
+        if copter.failsafe - failsafe:
+            uav.acted(now, f"failsafe {copter.failsafe}", 0 if copter.mode != mode else 1)
+        if was_landed and not copter.landed:
+            uav.flights, uav.air_since = uav.flights + 1, now
+            uav.strayed = uav.strayed and uav.act is not None
+        self.see_to(uav)
+
+    def look_at_command(self, uav, message):
+        if message.get_type() not in ("COMMAND_LONG", "COMMAND_INT", "SET_MODE"):
+            return
+        number = getattr(message, "command", mavlink.MAV_CMD_DO_SET_MODE)
+        if number in HARMLESS:
+            return
+        to_land = number == mavlink.MAV_CMD_NAV_LAND or (number == 176 and message.param2 == LAND)
+        uav.last_command = LAND if to_land else number
+        if to_land and not uav.act_seen and uav.copter.mode == LAND:
+            uav.act = None  # both at once: it has what it wanted
+        if uav.act_seen:
+            self.break_("no command after a pilot's act", f"{uav.name} {uav.act}: {message}")
+
+    def serve(self, request):
+        """Status and body of an answer of the service, None without one."""
+        if self.now < self.service.down_until:
+            return None, None
+        status, body = self.service.ask(request.method, request.path, request.body)
+        if status >= 500:
+            self.break_("no error of the service", f"{request}: {status} {body}")
+        if status == 200 and request.path.endswith("/reports"):
+            self.reported.setdefault(request.body["ID"], set()).add(request.body["number"])
+        for row in body.get("advice", []) if status == 200 else []:
+            told = {key: value for key, value in row.items() if key not in ("state", "age")}
+            if row["answer"] and self.answers.setdefault(row["answer"], told) != told:
+                self.break_("an answer never changes", f"{row}, before {self.answers[row['answer']]}")
+        return status, body
+
+    def see_to(self, uav):
+        """What a person does: lands what he has taken over, mends it, and hands it over again."""
+        copter, waits = (
+            uav.copter,
+            uav.act or uav.copter.failsafe or (uav.bridge and uav.bridge.state == "watch"),
+        )
+        if not waits:
+            uav.idle_since = None
+        elif not copter.landed:
+            uav.idle_since = self.now
+            if uav.act and copter.mode not in (LAND, RTL) and self.now > uav.act[0] + 20:
+                copter.change_mode(LAND)
+        elif uav.idle_since is None or copter.armed:
+            uav.idle_since = self.now
+        elif self.now == uav.idle_since + 20:
+            if copter.failsafe:
+                copter.reboot(self.now)
+            copter.crashed, copter.battery = False, [100.0]
+            copter.change_mode(STABILIZE)
+        elif self.now >= uav.idle_since + 35:
+            uav.act, uav.act_seen, uav.idle_since = None, False, self.now
+            copter.change_mode(GUIDED)
+
+    # What must hold.
+
+    def check(self):
+        for uav in self.uavs:
+            copter = uav.copter
+            stands = copter.mode == GUIDED and abs(copter.velocity) < 0.3 and abs(copter.climb) < 0.1
+            if copter.landed or not stands:
+                uav.hover_since = self.now
+            elif self.now > uav.hover_since + HOVER:
+                self.break_("airborne is commanded", f"{uav.name} stands, {uav.bridge and uav.bridge.state}")
+            if not copter.landed and self.now > uav.air_since + LONGEST:
+                self.break_("airborne is commanded", f"{uav.name} flies too long: {copter.mode}")
+        for one, other in combinations([uav for uav in self.uavs if not uav.strayed], 2):
+            sites = [site(uav.copter) for uav in (one, other)]
+            if None not in sites and abs(sites[0] - sites[1]) < SAME_POINT:
+                self.break_("no two at one point", f"{one.name}, {other.name} at {sites}")
+            (a, b) = one.copter, other.copter
+            is_cruise = all(not c.landed and c.position_control for c in (a, b))
+            if is_cruise and abs(a.height - b.height) < SAME_LEVEL and abs(a.place - b.place) < CLEARANCE:
+                self.break_("no two paths too near", f"{one.name}, {other.name} at {a.place}")
+        if self.now % 5:
+            return
+        told = [row["advice"] or {} for row in self.service.ask("GET", "/fleets/north")[1].get("uavs", [])]
+        bound = [row for row in told if row.get("state") in ("fly", "return", "bound")]
+        for one, other in combinations(bound, 2):
+            if (one["lat"], one["lon"]) == (other["lat"], other["lon"]):
+                self.break_("no two bound to one point", f"{one}, {other}")
+
+
+def site(copter):
+    """Where a copter stands or will land by what it was commanded, None in the climb."""
+    if copter.landed or copter.mode == LAND:
+        return copter.place
+    return copter.goal[0] if copter.position_control and copter.goal else None
+
+
+class Faults:
+    """What happens to a UAV, or to the service, for some seconds."""
+
+    def messages_lost(field, uav, seconds):
+        lines = ([uav.down, uav.up], [uav.down], [uav.up])[field.rng.integers(3)]
+        field.lines(lines, seconds, loss=1.0)
+
+    def messages_doubled_and_late(field, uav, seconds):
+        field.lines([uav.down, uav.up], seconds, double=0.5, slowest=2.0)
+
+    def requests_lost(field, uav, seconds):
+        field.lines([uav.asked], seconds, loss=1.0)
+
+    def answers_lost(field, uav, seconds):
+        field.lines([uav.answered], seconds, loss=1.0)
+
+    def requests_doubled_and_late(field, uav, seconds):
+        field.lines([uav.asked, uav.answered], seconds, double=0.5, slowest=5.0)
+
+    def service_restarted(field, _, seconds):
+        field.service.down_until = field.now + seconds
+        field.after(seconds, field.service.restart)
+
+    def bridge_restarted(field, uav, seconds):
+        uav.stop_bridge(field.now + seconds)
+
+    def vehicle_restarted(field, uav, _):
+        if uav.copter.landed:
+            uav.copter.reboot(field.now)
+            uav.acted(field.now, "reboot", 0, 1)
+
+    def clock_set_an_hour(field, _, seconds):
+        jump = HOUR * field.rng.choice([-1, 1])
+        field.service.jump += jump
+        if field.rng.random() < 0.5:
+            Faults.service_restarted(field, None, seconds)
+        field.after(60, lambda: vars(field.service).update(jump=field.service.jump - jump))
+
+    def wind(field, _, seconds):
+        for uav in field.uavs:
+            uav.copter.wind = field.rng.uniform(4, 13) * np.exp(2j * np.pi * field.rng.random())
+            field.after(2 * seconds, lambda uav=uav: vars(uav.copter).update(wind=0j))
+
+    def wrong_acknowledgements(field, uav, seconds):
+        """For another station, from another vehicle; and one of an answer that nobody gave."""
+        for command in (176, 400, 22, 192, 178, 21):
+            for system, target in ((uav.copter.system, (255, 190)), (77, (255, 191))):
+                message = mavlink.MAVLink_command_ack_message(command, field.rng.integers(5), 0, 0, *target)
+                message.pack(mavlink.MAVLink(None, system, 1))
+                late = seconds * field.rng.random()
+                field.after(late, lambda m=message: uav.up.send(field.now, (field.now, m)))
+        row = {"ID": uav.name, "answer": "none-such", "status": "landed"}
+        if field.now >= field.service.down_until:
+            field.service.ask("POST", "/fleets/north/acknowledgements", row)
+
+    def pilot_takes_over(field, uav, seconds):
+        def act():
+            modes = (LOITER, ALT_HOLD, STABILIZE, BRAKE, RTL, LAND)
+            if uav.copter.change_mode(modes[field.rng.integers(len(modes))]):
+                uav.acted(field.now, "mode", 0)
+
+        field.after(seconds, act)
+
+    def pilot_takes_over_as_the_motors_start(field, uav, seconds, tries=400):
+        if uav.copter.armed and uav.copter.landed and uav.copter.change_mode(LOITER):
+            uav.acted(field.now, "mode", 0)
+        elif tries:
+            again = Faults.pilot_takes_over_as_the_motors_start
+            field.after(TICK, lambda: again(field, uav, seconds, tries - 1))
+
+    def pilot_stops_the_motors(field, uav, _):
+        if uav.copter.armed:
+            uav.copter.disarm(force=field.rng.random() < 0.3) and uav.acted(field.now, "disarm", 1)
+
+    def position_lost(field, uav, seconds):
+        uav.copter.fix = False
+        field.after(seconds, lambda: vars(uav.copter).update(fix=True))
+
+    def position_jumps(field, uav, seconds):
+        uav.copter.glitch = 400 * np.exp(2j * np.pi * field.rng.random())
+        field.after(seconds / 4, lambda: vars(uav.copter).update(glitch=0j))
+
+    def battery_low(field, uav, _):
+        uav.copter.battery = [90.0, 10.0]
+        field.after(120, lambda: vars(uav.copter).update(battery=[100.0]))
+
+    def arming_refused(field, uav, seconds):
+        uav.copter.prearm = "Compass not calibrated"
+        field.after(seconds, lambda: vars(uav.copter).update(prearm=None))
+
+    def operator_holds(field, uav, seconds):
+        for delay, command in ((0.0, ("hold", "return")[field.rng.integers(2)]), (2 * seconds, "resume")):
+            body = {"command": command, "uavs": [uav.name]}
+            field.after(delay, lambda body=body: field.command(body))
+
+
+FAULTS = [fault for name, fault in vars(Faults).items() if not name.startswith("_")]
+INVARIANTS = (
+    "no two bound to one point",
+    "no two at one point",
+    "no two paths too near",
+    "no command after a pilot's act",
+    "airborne is commanded",
+    "an answer never changes",
+    "no report is lost",
+    "no error of the service",
+    "flies again",
+)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, default in (("seeds", 10), ("first", 0), ("faults", 100)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--log", action="store_true", help="what bridges say")
+    given = parser.parse_args()
+    logging.basicConfig(level=logging.INFO if given.log else logging.CRITICAL, format="%(message)s")
+    logging.getLogger("httpx2").setLevel(logging.WARNING)
+    faults, broken, totals = Counter(), Counter(), Counter()
+    for seed in range(given.first, given.first + given.seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            field = Campaign(seed, folder).play(given.faults)
+        faults.update(field.faults)
+        broken.update([*field.broken])
+        totals.update(flights=sum(uav.flights for uav in field.uavs), hours=field.now / 3600)
+        print(f"seed {seed}: {field.now:.0f} s, {field.broken or 'everything held'}", flush=True)
+    print(f"\n{faults.total()} faults, {totals['flights']} flights in {totals['hours']:.1f} h of flying\n")
+    for title, rows in (
+        ("fault", dict(sorted(faults.items()))),
+        ("broken", {i: broken[i] for i in INVARIANTS}),
+    ):
+        print(f"| {title} | |", "|:--|--:|", *(f"| {name} | {n} |" for name, n in rows.items()), "", sep="\n")
+    sys.exit(bool(broken))
+
+
+if __name__ == "__main__":
+    main()
