@@ -126,7 +126,7 @@ def test_a_prey_is_seen_late_in_the_frame_of_now():
     prey = steps[keys.OBSERVATION][..., 4 : 4 + 12].unflatten(-1, (6, 2))[..., 4, :]
     sent = steps[SEEN].unflatten(2, (3, 6))[..., 4, :]  # registered: a place in the plane
     torch.testing.assert_close(prey[:, 4:], sent[:, :-4] - steps[KINEMATICS][:, 4:, :, 2:])
-    assert (sent[:, 1:] - sent[:, :-1]).norm(dim=-1).max() > 0.1
+    assert (sent[:, 1:] - sent[:, :-1]).norm(dim=-1).max() > 0.01  # it flees
 
 
 def test_a_jitter_buffer_holds_each_message_until_it_is_as_old_as_the_longest_delay_in_training():
