@@ -146,10 +146,7 @@ class Belief(WorldTransform):
         self.step_keys = reads
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        n_beliefs, n_agents = (
-            self.rows.numel() * self.grid.first.shape[-1],
-            tensordict[keys.MESSAGE].shape[-2],
-        )
+        n_beliefs, n_agents = self.rows.numel() * self.grid.n_sources, tensordict[keys.MESSAGE].shape[-2]
         return empty_window(self.grid, self.longest, n_beliefs, n_agents, self.own)._asdict()
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
@@ -175,10 +172,10 @@ class Belief(WorldTransform):
 
     def _of_each(self, values: Tensor) -> Tensor:
         """Values of worlds [B, ...] for the belief about each source, [B K, ...]."""
-        return values.repeat_interleave(self.grid.first.shape[-1], 0)
+        return values.repeat_interleave(self.grid.n_sources, 0)
 
     def _written(self, beliefs: Beliefs) -> Entries:
-        server, own = (each.unflatten(0, (-1, self.grid.first.shape[-1])) for each in beliefs)
+        server, own = (each.unflatten(0, (-1, self.grid.n_sources)) for each in beliefs)
         pairs = zip(self.out_keys, (server, own.transpose(1, 2)), strict=False)  # own ones if they are wanted
         return {key: self.from_rows(belief.contiguous()) for key, belief in pairs}
 
@@ -190,7 +187,7 @@ class Belief(WorldTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         worlds, n_agents = observation_spec[keys.MESSAGE].shape[:-2], observation_spec[keys.MESSAGE].shape[-2]
-        cells = self.grid.first.shape[-1], self.grid.prior.shape[-1]
+        cells = self.grid.n_sources, self.grid.prior.shape[-1]
         for key, shape in ((keys.BELIEF, worlds), (keys.OWN_BELIEF, (*worlds, n_agents))):
             if key in self.out_keys:
                 size = torch.Size((*shape, *cells))

@@ -84,6 +84,11 @@ class SourceGrid(NamedTuple):
     """Index of the first region's tables for each source, at each level that may be drawn, [V, K]."""
 
     @property
+    def n_sources(self) -> int:
+        """Number of sources, K."""
+        return self.first.shape[-1]
+
+    @property
     def no_report(self) -> int:
         """The row of ``log_reports`` that stands for no report."""
         return len(self.log_reports) - 1
