@@ -38,7 +38,7 @@ class Adviser(Tracker):
         super().__init__(node, uavs, **more)
 
     def read(self, asking: Sequence[str]) -> TensorDictBase:
-        """What the policy reads, if these UAVs are ready to choose."""
+        """The observation that the policy gets in this step; the UAVs that ask are ready to choose."""
         read = self.observe().clone(False)
         if keys.ACTION_MASK in read.keys(True):
             read[keys.ACTION_MASK] = self.node.simulation.action_mask(self.state(asking))
@@ -48,7 +48,7 @@ class Adviser(Tracker):
 
     @torch.no_grad()
     def ask(self, asking: Sequence[str]) -> Tensor:
-        """Actions of all UAVs, [1, N, ...], of which those of who asks count."""
+        """The policy's actions of all UAVs, [1, N, ...]; use those of the UAVs that ask."""
         with set_exploration_type(self.kind):
             chosen = self.policy(self.read(asking))
         self._hidden_after = None if self.hidden is None else chosen[keys.HIDDEN].detach()

@@ -196,7 +196,7 @@ class Report(Row):
 
     @property
     def identity(self) -> Hashable:
-        """By what a report that comes in twice is known: its number and time, or else its whole content."""
+        """Two reports with equal identities are one: its number and time, or else its whole content."""
         if self.sequence is not None:
             return self.sequence, self.time if "time" in self.model_fields_set else None
         return self.model_dump_json(exclude_none=True)

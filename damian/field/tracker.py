@@ -38,8 +38,8 @@ class Tracker:
         uavs: their IDs.
         rows: reports that ``steps`` takes in the order in which they came in, whatever theirs is; others are
             given to ``add``, in the order in which they come in.
-        standing: number of the landing point where a UAV stands or is bound for, by its ID and whether it
-            asks; as its newest message says, if not given.
+        standing: called with the ID of a UAV and whether it asks for advice, returns the index of the landing
+            point where it stands or to which it flies; if not given, its newest message tells.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Tracker:
         """Whether every UAV has sent a report, and when step 0 began then [s]."""
         self.step = self.first_step = 0
         self.before: Memories | None = None
-        """What the node remembers after the step before; None in the first step."""
+        """The memories of the node after the step before; None in the first step."""
         self._standing = standing or (lambda uav, _: self.held[uav].target)
         self._outputs: TensorDictBase | None = None
         """Outputs of this step; None until they are needed."""
@@ -82,7 +82,7 @@ class Tracker:
         return UavLog(self.node.ground, stops, widths.readings, self.node.dt)
 
     def check(self, report: Report, log: UavLog | None = None) -> None:
-        """Refuse what no UAV of the fleet can say; ``log`` is that of a UAV that joins with this report."""
+        """Refuse a report that no UAV of the fleet can send; give ``log`` for one that is joining it."""
         if log is None and report.id not in self.logs:
             raise InputError(f"ID: {show(report.id)} is not a UAV of this fleet: {listed(self.uavs)}")
         for name, time in (("time", report.time), ("source time", report.source_time)):
@@ -143,7 +143,7 @@ class Tracker:
             self.next_step()
 
     def observe(self) -> TensorDictBase:
-        """The outputs of this step, from what has come in by now."""
+        """The outputs of this step, computed from the reports that have come in so far."""
         if self._outputs is None:
             if self.before is None:
                 self._after, self._outputs = self.node.begin(self._reported())

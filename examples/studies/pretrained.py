@@ -44,7 +44,7 @@ POLICIES = {
     "requests": (
         "scenario=requests aware=timeline delay.obs=1..7 seed=0",
         "Three UAVs that are at their targets at once, in regions of 0.3 to 0.6 km², with 30 requests a "
-        "minute, of which six can be open.",
+        "minute, at most six of them open at once.",
     ),
     "convoy": (
         "scenario=convoy frames=600000 observation.own=true model=gru delay.obs=1..7 seed=0",

@@ -24,5 +24,5 @@ async def part(name: str) -> FileResponse:
     """A module or the style of the replay page."""
     path = PAGE / (name if name.endswith(".css") else f"{name}.js")
     if path not in {*PAGE.iterdir()}:
-        raise HTTPException(404, "there is no such part of the map")
+        raise HTTPException(404, "the map has no file of this name")
     return FileResponse(path)
