@@ -221,7 +221,8 @@ def examples() -> list[str]:
 def example(path: str) -> str:
     """The page of an example."""
     language = "yaml" if path.endswith(".yaml") else "python"
-    return f"# {path}\n\n```{language}\n{(ROOT / 'examples' / path).read_text(encoding='utf-8')}```\n"
+    text = (ROOT / "examples" / path).read_text(encoding="utf-8")  # it may have fences of its own
+    return f"# {path}\n\n````{language}\n{text}````\n"
 
 
 def notebook(path: Path) -> dict[str, str | bytes]:

@@ -29,7 +29,7 @@ def test_the_site_is_built_without_a_warning_and_is_complete(tmp_path):
     assert "ActionHistory" in page("api/transforms")
     for example in {*(ROOT / "examples").rglob("*.py")} - {*(ROOT / "examples" / "fleet").rglob("*")}:
         assert example.stem in page(f"examples/{example.relative_to(ROOT / 'examples').as_posix()}")
-    for picture, page_name in (("images/flight.gif", "."), ("results/delaybench/curves.png", "RESULTS")):
+    for picture, page_name in (("images/flight.gif", "."), ("results/delaybench/curves.png", "report")):
         assert (tmp_path / picture).stat().st_size > 10_000
         assert picture in page(page_name)
     loaded = [each for each in (tmp_path / "index.html").read_text().split('"') if each.startswith("http")]
