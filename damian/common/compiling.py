@@ -4,6 +4,8 @@ from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
+from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -11,22 +13,59 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 class CompiledMethods:
     """The methods of an object, each compiled at its first call, with the options of ``compiled``.
 
-    A copy, and what a pickle is read as, has no graphs: these belong to the object of the methods.
+    With ``cuda_graph`` each becomes a ``CudaGraph``. A copy, and what a pickle is read as, has no graphs:
+    these belong to the object of the methods.
     """
 
-    def __init__(self, options: dict[str, Any]) -> None:
-        self._options = options
+    def __init__(self, options: dict[str, Any], cuda_graph: bool = False) -> None:
+        self._options, self._cuda_graph = options, cuda_graph
         self._graphs: dict[tuple[Hashable, ...], Callable[..., Any]] = {}
 
     def get(self, method: Callable[..., Any], *variant: Hashable) -> Callable[..., Any]:
         """The compiled method; each variant of what no guard checks has its own graph."""
         key = (method.__name__, *variant)
         if key not in self._graphs:
-            self._graphs[key] = compiled(method, **self._options)
+            function = compiled(method, **self._options)
+            self._graphs[key] = CudaGraph(function) if self._cuda_graph else function
         return self._graphs[key]
 
-    def __reduce__(self) -> tuple[type["CompiledMethods"], tuple[dict[str, Any]]]:
-        return CompiledMethods, (self._options,)
+    def __reduce__(self) -> tuple[type["CompiledMethods"], tuple[dict[str, Any], bool]]:
+        return CompiledMethods, (self._options, self._cuda_graph)
+
+
+class CudaGraph:
+    """A function of a state, as one CUDA graph from its third call on.
+
+    Its first two arguments are the state, its first two results the next one: trees of tensors. What a call
+    returns as the state is changed in place by the next one; everything else that it returns stays. (With
+    ``torch.compile(mode="reduce-overhead")`` both would be lost.)
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self._graph, self._calls = function, torch.cuda.CUDAGraph(), 0
+        self._inputs: list[Tensor] = []
+
+    def __call__(self, *args: Any) -> Any:
+        """Compute the function; arguments have the shapes of the first call."""
+        self._calls += 1
+        if self._calls < 3:  # which compile it, once for a new state and once for a computed one
+            return self._function(*args)
+        if self._calls == 3:
+            inputs, self._form = tree_flatten(args)
+            self._inputs = [x.clone() for x in inputs]
+            own = self._arguments()
+            with torch.cuda.graph(self._graph):
+                first, second, *self._others = self._function(*own)
+                computed = tree_map(Tensor.clone, (first, second))  # since one may be another's input
+                tree_map(Tensor.copy_, own[:2], computed)
+        for mine, given in zip(self._inputs, self._form.flatten_up_to(args), strict=True):
+            if mine is not given:
+                mine.copy_(given)
+        self._graph.replay()
+        return *self._arguments()[:2], *tree_map(Tensor.clone, self._others)
+
+    def _arguments(self) -> Any:
+        return tree_unflatten(self._inputs, self._form)
 
 
 def compiled(function: Function, **options: Any) -> Function:

@@ -78,9 +78,15 @@ class DelayedEnv(TransformedEnv):
     def _stateful_modules(self) -> list[StatefulTransform]:
         return [module for module in self.transform.modules() if isinstance(module, StatefulTransform)]
 
-    def compile(self, **options: Any) -> "DelayedEnv":
-        """Compile a step with its transforms as one graph; ``options`` are for ``torch.compile``."""
-        object.__setattr__(self, "_compiled", CompiledMethods(options))  # TransformedEnv's own is for specs
+    def compile(self, cuda_graph: bool = True, **options: Any) -> "DelayedEnv":
+        """Compile a step with its transforms as one graph, on a GPU as one CUDA graph.
+
+        Args:
+            cuda_graph: on a GPU, launch all kernels at once, for the memory of a state and a step.
+            options: of ``torch.compile``.
+        """
+        methods = CompiledMethods(options, cuda_graph and self.uav_env.device.type == "cuda")
+        object.__setattr__(self, "_compiled", methods)  # TransformedEnv's own is for specs
         return self
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:

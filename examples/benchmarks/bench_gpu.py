@@ -11,7 +11,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import torch
@@ -31,7 +31,9 @@ KINDS = {
     "whole chain": ("use case 2", WHOLE),
     "everything": ("everything", WHOLE),
 }
-MODES = {"compiled": {}, "CUDA graphs": {"mode": "reduce-overhead"}}
+MODES = {"CUDA graph": True, "compiled": False}
+RIVALS = {"simple_spread": 1 << 20, "navigation": 1 << 20, "discovery": 1 << 16}
+"""Tasks of VMAS, and the most worlds that are measured: with more, discovery takes half a second a step."""
 STEPS, REPEATS = 20, 3
 
 
@@ -41,9 +43,11 @@ def make(kind: str, worlds: int, device: str) -> DelayedEnv:
     return make_env(replace(scenarios()[scenario], **delays()[changes]), worlds, device=torch.device(device))
 
 
-def differences(kind: str, device: str, worlds: int = 64, steps: int = 50) -> tuple[str, ...]:
+def differences(kind: str, device: str, mode: str, worlds: int = 64, steps: int = 50) -> tuple[str, ...]:
     """Share of the numbers that differ from the CPU's, and the largest difference, after the same actions."""
     ours, theirs = make(kind, worlds, "cpu"), make(kind, worlds, device)
+    if mode != "eager":
+        theirs.compile()
     ours.set_seed(0), theirs.set_seed(0)
     rollout = ours.rollout(steps, break_when_any_done=False)
     actions = iter(rollout["agents", "action"].unbind(1))
@@ -59,7 +63,7 @@ def differences(kind: str, device: str, worlds: int = 64, steps: int = 50) -> tu
             n_different + int((apart > 1e-4).sum()),
             max(largest, float(apart.max())),
         )
-    return kind, f"{n_different / n:.2e}", f"{largest:.1e}"
+    return f"{kind}, {mode}", f"{n_different / n:.2e}", f"{largest:.1e}"
 
 
 def waits(kind: str, worlds: int) -> str:
@@ -88,15 +92,19 @@ def per_second(chunk: Callable[[], object], frames: int, device: str) -> str:
     return f"{frames / spent[len(spent) // 2] / 1e6:.3f}"
 
 
-def environments(worlds: int, device: str) -> Iterator[tuple[str, Callable[[], EnvBase]]]:
-    """What is measured with so many worlds."""
-    for kind in KINDS:
-        for mode, options in MODES.items():
-            if device != "cpu" or mode == "compiled":
-                yield f"{kind}, {mode}", lambda k=kind, o=options: make(k, worlds, device).compile(**o)
-    for task in ("discovery", "navigation", "simple_spread"):
-        options = {"num_envs": worlds, "n_agents": 3, "device": device, "continuous_actions": True}
-        yield f"VMAS {task}", lambda t=task, o=options: VmasEnv(t, **o)
+def environments(mode: str, worlds: int, device: str) -> dict[str, Callable[[], EnvBase]]:
+    """Ours, compiled, by kind."""
+    return {
+        f"{kind}, {mode}": lambda k=kind: make(k, worlds, device).compile(cuda_graph=MODES[mode])
+        for kind in KINDS
+    }
+
+
+def rivals(worlds: int, device: str) -> dict[str, Callable[[], EnvBase]]:
+    """Tasks of VMAS."""
+    options = {"num_envs": worlds, "n_agents": 3, "device": device, "continuous_actions": True}
+    tasks = [task for task, most in RIVALS.items() if worlds <= most]
+    return {f"VMAS {task}": partial(VmasEnv, task, **options) for task in tasks}
 
 
 def measured(name: str, make_env: Callable[[], EnvBase], worlds: int, device: str) -> tuple[str, ...]:
@@ -113,8 +121,27 @@ def trained(worlds: int, device: str) -> tuple[str, ...]:
     """A row: iterations of ``damian train`` with the words of the README, compiled."""
     words = ["scenario=delaybench/crowded", "delay.obs=1..7", "aware=timeline", "compile=true"]
     config = composed_config(*words, f"worlds={worlds}", f"device={device}")
-    frames = worlds * config.update_steps
-    return "a training", f"{worlds:,}", "-", per_second(damian(config).__next__, frames, device)
+    frames, iterations, begin = worlds * config.update_steps, damian(config), time.perf_counter()
+    next(iterations)
+    first = f"training, first update {time.perf_counter() - begin:.0f} s"
+    return first, f"{worlds:,}", "-", per_second(iterations.__next__, frames, device)
+
+
+def jobs(options: Namespace) -> Iterator[tuple[str, int, Callable[[], tuple[str, ...]]]]:
+    """What makes each row, the most important first: its name, its number of worlds, and a function."""
+    device, modes = options.device, list(MODES)[options.device == "cpu" :]
+    kinds: list[Callable[[int, str], dict[str, Callable[[], EnvBase]]]]
+    kinds = [partial(environments, modes[0]), rivals, *(partial(environments, mode) for mode in modes[1:])]
+    rows = [
+        [
+            (name, worlds, partial(measured, name, make_one, worlds, device))
+            for worlds in options.worlds
+            for name, make_one in kind(worlds, device).items()
+        ]
+        for kind in kinds
+    ]
+    trainings = [("training", worlds, partial(trained, worlds, device)) for worlds in options.trainings]
+    yield from [*rows[0], *trainings, *chain(*rows[1:])]
 
 
 def measure(options: Namespace) -> Iterator[str]:
@@ -122,27 +149,22 @@ def measure(options: Namespace) -> Iterator[str]:
     device, until = options.device, time.monotonic() + 60 * options.minutes
     name = torch.cuda.get_device_name() if device != "cpu" else f"CPU, {torch.get_num_threads()} threads"
     yield f"# {name}, torch {torch.__version__}\n"
+    n_modes = 1 if device == "cpu" else 2
     header = ("environment", "share of numbers apart by 1e-4", "largest difference")
-    yield table("The same as on the CPU?", header, [differences(kind, device) for kind in KINDS])
+    rows = [differences(kind, device, mode) for kind in KINDS for mode in ("eager", "CUDA graph")[:n_modes]]
+    yield table("The same as on the CPU?", header, rows)
     if device != "cpu":
         rows = [(kind, waits(kind, options.worlds[0])) for kind in KINDS]
         yield table("Does a step wait for the host?", ("environment", "waits"), rows)
     rows = []
-    for worlds in options.worlds:
-        jobs = {
-            name: partial(measured, name, make_one, worlds, device)
-            for name, make_one in environments(worlds, device)
-        }
-        jobs["a training"] = partial(trained, worlds, device)
-        for name, job in jobs.items():
-            if time.monotonic() > until:
-                rows.append((name, f"{worlds:,}", "no time left", ""))
-                continue
-            try:
-                rows.append(job())
-            except RuntimeError as error:  # of memory, or what CUDA graphs cannot do
-                rows.append((name, f"{worlds:,}", str(error).splitlines()[0][:80], ""))
-            print(*rows[-1], sep="  ", flush=True)
+    for name, worlds, job in jobs(options):
+        try:
+            row = job() if time.monotonic() < until else (name, f"{worlds:,}", "no time left", "")
+        except RuntimeError as error:  # of memory
+            row = (name, f"{worlds:,}", str(error).splitlines()[0][:80], "")
+        rows.append(row)
+        print(*row, sep="  ", flush=True)
+        torch.compiler.reset()  # frees what the row has compiled
     header = ("environment", "worlds", "random actions [million world steps/s]", "a policy in a collector")
     yield table("World steps a second", header, rows)
 
@@ -151,6 +173,7 @@ if __name__ == "__main__":
     parser = ArgumentParser(description="Compare a GPU with the CPU, and measure it.")
     parser.add_argument("--device", default="cuda", help="cuda, or cpu for a trial")
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384, 65536, 262144])
+    parser.add_argument("--trainings", type=int, nargs="+", default=[2048, 16384], help="worlds of trainings")
     parser.add_argument("--minutes", type=float, default=8.0, help="no row begins later")
     Path("runs").mkdir(exist_ok=True)
     with Path("runs/bench_gpu.md").open("w", encoding="utf-8") as report:

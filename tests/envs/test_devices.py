@@ -12,7 +12,7 @@ from torch import Tensor
 from torch._library.custom_ops import OPDEFS
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from damian.common import devices
+from damian.common import compiling, devices
 from damian.common.tensors import tree_map
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
@@ -91,6 +91,24 @@ class OnMeta(Watched):
             assert tensor.device.type == "meta" or not tensor.dim(), f"{func} on {tensor.device}"
 
 
+class Recording(TorchDispatchMode):
+    """Stands in for a CUDA graph: records operators, and runs them again on the same tensors, in place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[Any, Any, dict[str, Any], Any]] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.calls.append((func, args, kwargs or {}, func(*args, **kwargs or {})))
+        return self.calls[-1][-1]
+
+    def replay(self) -> None:
+        for func, args, kwargs, found in self.calls:
+            for old, new in zip(tensors([found]), tensors([func(*args, **kwargs)]), strict=True):
+                if old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+
 Inputs = tuple[DelayedEnv, PackedState, list[Memory], Entries, Tensor]
 
 
@@ -146,6 +164,17 @@ def test_a_step_and_a_reset_touch_no_tensor_of_another_device(scenario, no_data)
     moved = [{name: value.to(meta) for name, value in each.items()} for each in [*memories, entries]]
     with OnMeta():
         step_and_reset(env, worlds, moved[:-1], moved[-1], mask)
+
+
+@pytest.mark.parametrize("name", ["everything", "matrix", "continuous"])
+def test_steps_replayed_as_a_graph_equal_steps(name, no_data, monkeypatch):
+    monkeypatch.setattr(compiling, "compiled", lambda function, **options: function)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Recording)
+    monkeypatch.setattr(torch.cuda, "graph", lambda graph: graph)
+    plain, env = delayed(SCENARIOS[name]), delayed(SCENARIOS[name])
+    object.__setattr__(env, "_compiled", compiling.CompiledMethods({}, cuda_graph=True))
+    assert all_same(play(plain, choices(plain, 30)), play(env, choices(plain, 30)))
+    assert any(function._calls > 3 for function in env._compiled._graphs.values())
 
 
 @pytest.mark.parametrize("name", ["mixed", "everything", "matrix", "continuous", "belief"])
