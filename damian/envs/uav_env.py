@@ -280,7 +280,8 @@ class UavEnv(EnvBase):
 
     def _make_specs(self, features: Features) -> None:
         """Specs with the bounds that the features declare, and [-1, 1] for the offset to the source."""
-        low, high = (self.server.observations(limit) for limit in feature_bounds(features))
+        first = {name: values[:1] for name, values in features.items()}
+        low, high = (self.server.observations(limit) for limit in feature_bounds(first))
         actor, critic = ((lowest[0], highest[0]) for lowest, highest in zip(low, high, strict=True))
         privileged = pad(critic[0], [0, 2], value=-1.0), pad(critic[1], [0, 2], value=1.0)
         bounds: Bounds = {keys.OBSERVATION: actor, keys.GLOBAL_OBSERVATION: critic}

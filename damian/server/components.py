@@ -33,13 +33,13 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
         declared, key = feature_of(name), f"feature {name}"
         with naming_errors(key):
             found |= server.features(messages, steps, [name])
-            values = found[name].double()
+            values = found[name].float()
             within = (values >= declared.low - _ROUNDING) & (values <= declared.high + _ROUNDING)
             should = f"is not between {declared.low:g} and {declared.high:g}: scale it, or declare its bounds"
             checks.require(bool(within.all()), key, f"{[*values[~within], 0][0]:g}", should)
             if declared.scope == "local":
                 own = _among_others(server, name, some, elapsed)
-                same = own.double().allclose(values[:_WORLDS], atol=_ROUNDING)
+                same = own.float().allclose(values[:_WORLDS], atol=_ROUNDING)
                 should = "changes with the messages of other UAVs: make it global, or read only the UAV's own"
                 checks.require(same, key, "local", should)
     for term in server.terms.values():
