@@ -96,7 +96,7 @@ fleet-campaign: $(VENV)/fleet
 	cd examples/fleet && PYTHONPATH=. $(abspath $(PY)) -W ignore tests/campaign.py $(ARGS)
 
 bench-quick: $(VENV)/bench
-	$(PY) examples/benchmarks/bench.py --quick
+	$(PY) examples/benchmarks/bench.py quick
 
 # Algorithms of BenchMARL, in an environment of its own: it asks for another TorchRL than ours. Fails if one learns nothing.
 BENCHMARL := build/benchmarl-venv

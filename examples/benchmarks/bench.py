@@ -11,7 +11,7 @@ and written to runs/bench.md, with a figure in runs/bench.png.
 import importlib.util
 import subprocess
 from argparse import ArgumentParser
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -298,6 +298,22 @@ def growth(presets: Scenarios, sizes: Sizes, what: str, numbers: tuple[int, ...]
     return table(f"Growth with {what}: {fixed}, whole chain, eager", (what, *header), rows)
 
 
+def many_beside_few(presets: Scenarios, sizes: Sizes) -> str:
+    """Time of a step with 20 UAVs over that with 3, whole chain, in turns."""
+    envs = {
+        (name, mode, number): delayed(fleet(scenario, number), delays()[WHOLE], sizes.worlds, mode)
+        for name, scenario in presets.items()
+        for mode in sizes.modes
+        for number in (3, 20)
+    }
+    named = {" ".join(map(str, key)): env for key, env in envs.items()}
+    found = dict(zip(envs, rollout_times(named, sizes.growth_steps, sizes.repeats).values(), strict=True))
+    pairs = [(key[:2], found[key].median, found[*key[:2], 3].median) for key in envs if key[2] == 20]
+    rows = [(*key, f"{few:.2f}", f"{many:.2f}", f"{many / few:.2f}") for key, many, few in pairs]
+    header = ("scenario", "mode", "3 UAVs [ms/step]", "20 UAVs", "times")
+    return table(f"20 UAVs beside 3: {sizes.worlds} worlds, whole chain", header, rows)
+
+
 def memory(presets: Scenarios) -> str:
     """Bytes of the state and of a step's output for each world, and of the tables that all worlds share."""
     rows = []
@@ -362,26 +378,26 @@ def plot_ratios(ratios: Mapping[str, list[float]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def measure(quick: bool) -> None:
-    """Measure everything or, if quick, the whole chain; print the tables and write them to runs/bench.md."""
+def measure(names: Sequence[str]) -> None:
+    """Measure the parts of these names, print their tables, and write them to runs/bench.md."""
     torch.set_num_threads(1)
     Path("runs").mkdir(exist_ok=True)
     presets, sizes = scenarios(), Sizes()
     report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
-    parts = (
-        lambda: comparison(presets, sizes),
-        lambda: limit_of_speed(presets, sizes),
-        lambda: cost_of_delays(presets, sizes),
-        lambda: cost_of_belief(sizes),
-        lambda: growth(presets, sizes, "worlds", sizes.many_worlds),
-        lambda: growth(presets, sizes, "UAVs", sizes.many_uavs),
-        lambda: memory(presets),
-        lambda: training_speed(sizes),
-    )
-    if quick:
-        parts = (lambda: comparison(presets, replace(sizes, steps=25, repeats=3), (WHOLE,)),)
-    for part in parts:
-        report.append(part())
+    parts = {
+        "rivals": lambda: comparison(presets, sizes),
+        "quick": lambda: comparison(presets, replace(sizes, steps=25, repeats=3), (WHOLE,)),
+        "limit": lambda: limit_of_speed(presets, sizes),
+        "delays": lambda: cost_of_delays(presets, sizes),
+        "belief": lambda: cost_of_belief(sizes),
+        "worlds": lambda: growth(presets, sizes, "worlds", sizes.many_worlds),
+        "uavs": lambda: growth(presets, sizes, "UAVs", sizes.many_uavs),
+        "twenty": lambda: many_beside_few(presets, sizes),
+        "memory": lambda: memory(presets),
+        "training": lambda: training_speed(sizes),
+    }
+    for name in names or [name for name in parts if name != "quick"]:
+        report.append(parts[name]())
         print(report[-1])
     target = Path("runs/bench.md")
     target.write_text("\n".join(report), encoding="utf-8")
@@ -390,5 +406,5 @@ def measure(quick: bool) -> None:
 
 if __name__ == "__main__":
     options = ArgumentParser(description="Measure the speed of the environment and of training.")
-    options.add_argument("--quick", action="store_true", help="only the whole chain beside VMAS; a minute")
-    measure(options.parse_args().quick)
+    options.add_argument("parts", nargs="*", help="quick, rivals, limit, delays, ...: see measure")
+    measure(options.parse_args().parts)
