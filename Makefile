@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-gpu | fleet | fleet-campaign | benchmarl | upstream | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-training | bench-gpu | fleet | fleet-campaign | benchmarl | upstream | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -8,7 +8,7 @@ PY     := $(VENV)/bin/python
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-gpu fleet fleet-campaign benchmarl upstream pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-training bench-gpu fleet fleet-campaign benchmarl upstream pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
@@ -72,6 +72,10 @@ package: $(VENV)/package
 
 bench: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py $(ARGS)
+
+# How long trainings take to reach a return, beside TorchRL: ten minutes.
+bench-training: $(VENV)/bench
+	$(PY) examples/benchmarks/bench_training.py $(ARGS)
 
 # On a machine with a GPU; ARGS="--device cpu --worlds 64" tries it without.
 bench-gpu: $(VENV)/bench

@@ -2,17 +2,25 @@
 
 The training part of ``bench.py``. All methods have the same batch size, number of epochs and layer widths.
 They take turns, iteration by iteration, so that a busy machine slows all of them.
+
+    python examples/benchmarks/bench_training.py --seeds 3     (make bench-training)
+
+trains until a return is reached, on crowded ground, and beside it TorchRL's MAPPO on the same environment.
 """
 
 import importlib.util
+import math
 import statistics
 import time
+from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, cast
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torch.distributions import Categorical
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
@@ -23,12 +31,15 @@ from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 from tqdm import tqdm
 
+from damian import keys
+from damian.common.tables import markdown_table
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.schedule import SystemClock
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_collector, make_learner, replay_buffer, ticks
 
+OBSERVED = ("agents", "observation")
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
 """Is one value computed for all agents, as with our ``model.shared_value``?"""
@@ -95,6 +106,11 @@ def method_config(words: str, hidden: Sequence[int], worlds: int, steps: int) ->
 
 def damian(config: TrainConfig) -> Iterator[Seconds]:
     """Train as ``damian train`` does; yields the times of each iteration."""
+    return (seconds for seconds, _ in damian_batches(config))
+
+
+def damian_batches(config: TrainConfig) -> Iterator[tuple[Seconds, TensorDictBase]]:
+    """Train as ``damian train`` does; yields the times and the steps of each iteration."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     learner = cast(Mappo, make_learner(config, env, replay_buffer(config, env)))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
@@ -107,7 +123,7 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
         backupdated = time.perf_counter()
         add_advantages(batch, learner.critic, learner.config)
         learner.optimize(batch)
-        yield Seconds(collected - begin, backupdated - collected, time.perf_counter() - backupdated)
+        yield Seconds(collected - begin, backupdated - collected, time.perf_counter() - backupdated), batch
 
 
 def products(config: TrainConfig) -> Iterator[Seconds]:
@@ -136,15 +152,22 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
 
     ``together``: compute one value for all agents (MAPPO) instead of one for each (IPPO).
     """
+    options = {"n_agents": config.agents, "max_steps": 100, "continuous_actions": True}
+    env = VmasEnv("navigation", num_envs=config.worlds, **options)
+    actor = vmas_actor(env, config.agents, config.model.hidden)
+    return (seconds for seconds, _ in mappo_batches(config, env, actor, together))
+
+
+def mappo_batches(
+    config: TrainConfig, env: EnvBase, actor: ProbabilisticActor, together: bool
+) -> Iterator[tuple[Seconds, TensorDictBase]]:
+    """Train with TorchRL's MAPPO, buffer and collector; yields the times and the steps of each iteration."""
     worlds, steps, learner = config.worlds, config.update_steps, cast(MappoConfig, config.learner)
-    env = VmasEnv(
-        "navigation", num_envs=worlds, n_agents=config.agents, max_steps=100, continuous_actions=True
-    )
-    actor, observed = vmas_actor(env, config.agents, config.model.hidden), ("agents", "observation")
-    network = vmas_network(env, config.agents, config.model.hidden, 1, together)
+    network, observed = agent_network(env, config.agents, config.model.hidden, 1, together), OBSERVED
     critic = TensorDictModule(network, in_keys=[observed], out_keys=[("agents", "state_value")])
     loss = MAPPOLoss(actor, critic, clip_epsilon=learner.clip_epsilon, entropy_coeff=learner.entropy_coeff)
-    loss.set_keys(reward=("agents", "reward"), value=("agents", "state_value"))
+    loss.set_keys(reward=("agents", "reward"), value=("agents", "state_value"), action=("agents", "action"))
+    loss.set_keys(sample_log_prob=("agents", "action_log_prob"))
     loss.make_value_estimator(ValueEstimators.MAGAE, gamma=learner.gamma, lmbda=learner.lmbda)
     optimizer = torch.optim.Adam(loss.parameters(), lr=learner.lr)
     collector = Collector(env, actor, frames_per_batch=worlds * steps, total_frames=-1)
@@ -166,16 +189,16 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
                 nn.utils.clip_grad_norm_(loss.parameters(), learner.max_grad_norm)
                 optimizer.step()
         collector.update_policy_weights_()
-        yield Seconds(collected - begin, 0.0, time.perf_counter() - collected)
+        yield Seconds(collected - begin, 0.0, time.perf_counter() - collected), batch
 
 
 def vmas_actor(env: EnvBase, agents: int, hidden: Sequence[int]) -> ProbabilisticActor:
     """A policy with tanh-normal actions of each agent, from its own observation."""
     n_out = 2 * env.full_action_spec_unbatched["agents", "action"].shape[-1]
-    network = nn.Sequential(vmas_network(env, agents, hidden, n_out, False), NormalParamExtractor())
+    network = nn.Sequential(agent_network(env, agents, hidden, n_out, False), NormalParamExtractor())
     normal = [("agents", "loc"), ("agents", "scale")]
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=[("agents", "observation")], out_keys=normal),
+        TensorDictModule(network, in_keys=[OBSERVED], out_keys=normal),
         in_keys=normal,
         out_keys=[("agents", "action")],
         distribution_class=TanhNormal,
@@ -185,10 +208,85 @@ def vmas_actor(env: EnvBase, agents: int, hidden: Sequence[int]) -> Probabilisti
     )
 
 
-def vmas_network(
+def agent_network(
     env: EnvBase, agents: int, hidden: Sequence[int], n_out: int, centralised: bool
 ) -> MultiAgentMLP:
     """One network for all agents."""
     n_in = env.observation_spec["agents", "observation"].shape[-1]
     options = {"share_params": True, "num_cells": list(hidden), "activation_class": nn.Tanh}
     return MultiAgentMLP(n_in, n_out, agents, centralized=centralised, **options)
+
+
+# Until a return is reached.
+
+TASK = "scenario=delaybench/crowded"
+OURS = {"damian train": "compile=false", "damian train, compiled": "compile=true"}
+THEIRS = "TorchRL's MAPPO on our environment"
+
+
+def discrete_actor(env: EnvBase, config: TrainConfig) -> ProbabilisticActor:
+    """A policy with discrete actions of each agent, from its own observation."""
+    n_out = config.actions.n_actions
+    network, logits = (
+        agent_network(env, config.agents, config.model.hidden, n_out, False),
+        ("agents", "logits"),
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=[OBSERVED], out_keys=[logits]),
+        in_keys={"logits": logits},
+        out_keys=[("agents", "action")],
+        distribution_class=Categorical,
+        return_log_prob=True,
+        log_prob_key=("agents", "action_log_prob"),
+    )
+
+
+def until(
+    iterations: Iterator[tuple[Seconds, TensorDictBase]], goal: float, frames: int
+) -> tuple[float, int]:
+    """Processor time [s] and steps until the mean return of the episodes that a batch ends reaches ``goal``.
+
+    Infinite if it does not within ``frames`` steps.
+    """
+    begin, steps = time.process_time(), 0
+    for _, batch in iterations:
+        steps += batch.numel()
+        over = batch["next", "done"].squeeze(-1)
+        if over.any() and batch[keys.next_key(keys.EPISODE_REWARD)][over].mean() >= goal:
+            return time.process_time() - begin, steps
+        if steps >= frames:
+            return math.inf, steps
+    raise AssertionError("iterations never end")
+
+
+def to_a_return(goal: float, seeds: int, frames: int) -> str:
+    """Processor time and steps until trainings without delay reach a return, median (least, most)."""
+    found: dict[str, list[tuple[float, int]]] = {name: [] for name in (*OURS, THEIRS)}
+    for seed in tqdm(range(seeds), "seeds"):
+        for name, words in OURS.items():
+            torch.manual_seed(seed)
+            config = composed_config(*TASK.split(), words, f"seed={seed}")
+            found[name].append(until(damian_batches(config), goal, frames))
+        torch.manual_seed(seed)
+        config = composed_config(*TASK.split(), f"seed={seed}")
+        env = learning_env(config)
+        found[THEIRS].append(
+            until(mappo_batches(config, env, discrete_actor(env, config), True), goal, frames)
+        )
+    rows = []
+    for name, runs in found.items():
+        cells = [(statistics.median(x), min(x), max(x)) for x in zip(*runs, strict=True)]
+        rows.append((name, *(f"{middle:,.0f} ({least:,.0f}, {most:,.0f})" for middle, least, most in cells)))
+    header = ("training", "processor time [s]", "steps")
+    return f"Until a mean return of {goal:g}, {seeds} seeds\n\n" + markdown_table(header, rows)
+
+
+if __name__ == "__main__":
+    options = ArgumentParser(description="Time until trainings reach a return, on one core.")
+    options.add_argument("--goal", type=float, default=28.0, help="mean return of episodes, undelayed")
+    options.add_argument("--seeds", type=int, default=3)
+    options.add_argument(
+        "--frames", type=int, default=2_000_000, help="steps after which a training has failed"
+    )
+    torch.set_num_threads(1)
+    print(to_a_return(**vars(options.parse_args())))
