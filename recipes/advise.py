@@ -7,7 +7,6 @@ damian advise fit=journals/north.jsonl                    (only the delays, as a
 import time
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
 from damian.baselines.script import script_policy
@@ -92,7 +91,6 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
     plot_fit(fitted, laws[0], config.clock.dt, folder / "fit.png")
 
 
-@cli.one_line_errors("advise")
-@hydra.main(config_path="../conf", config_name="advise", version_base=None)
+@cli.program("advise")
 def main(given: DictConfig) -> None:
     start(advise, given, "advise")

@@ -1,6 +1,6 @@
 """What the programs share: schemas, options of the user's own, checked settings, and errors in one line.
 
-Nothing here imports torch. A program is a function that takes what Hydra has composed (``hydra.main``);
+Nothing here imports torch. A program is a function that takes what Hydra has composed (``program``);
 ``shared/runs.py`` starts its work in the run folder.
 """
 
@@ -17,6 +17,7 @@ from typing import Any
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``one_line_errors`` prints them
 
+import hydra
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
@@ -192,6 +193,12 @@ def one_line_errors(program: str = "train") -> Iterator[None]:
         if HydraConfig.initialized() and not OmegaConf.is_missing(HydraConfig.get().runtime, "output_dir"):
             with suppress(OSError):  # a refused run has nothing in the folder that Hydra has made for it
                 Path(HydraConfig.get().runtime.output_dir).rmdir()
+
+
+def program(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Decorator of a program's ``main``: Hydra composes its argument from ``conf/NAME.yaml`` and words."""
+    composes = hydra.main(config_path="../conf", config_name=name, version_base=None)
+    return lambda main: one_line_errors(name)(composes(main))
 
 
 def _sweep_name(sweep: Sequence[str]) -> str:

@@ -14,7 +14,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-import hydra
 import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -57,11 +56,8 @@ def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
     """Which rows of results are of a task, a delay, a method and a seed that are asked for."""
     tasks, first = [*config.chosen("tasks")], config.experiment.first_seed
     tasks += [f"{task}{HELD_OUT_MARK}{name}" for task in tasks for name in config.experiment.held_out]
-    asked = {
-        "task": tasks,
-        "delay": [NOT_LATE, *config.chosen("delays")],
-        "method": [*config.chosen("methods")],
-    }
+    delays, methods = [NOT_LATE, *config.chosen("delays")], [*config.chosen("methods")]
+    asked = {"task": tasks, "delay": delays, "method": methods}
     last = math.inf if config.seeds is None else config.every_seed[-1]
     return rows[[*asked]].isin(asked).all(axis=1) & rows["seed"].between(first, last)
 
@@ -147,8 +143,7 @@ def _not_kept(runs: list[Run], kept: Results) -> list[Run]:
     return [run for run in runs if run in todo or run.folder in needed]
 
 
-@cli.one_line_errors("compare")
-@hydra.main(config_path="../conf", config_name="compare", version_base=None)
+@cli.program("compare")
 @cli.one_line_errors("compare")
 def main(given: DictConfig) -> None:
     running = HydraConfig.get()

@@ -135,9 +135,7 @@ class FlyConfig(FlownPolicyConfig):
         choices=(*STORED, "script", "random"),
     )
     keep: str = setting(
-        "all",
-        "Episodes to keep: all, or the best, the median and the worst (extremes).",
-        choices=("all", "extremes"),
+        "all", "Keep all, or the best, median and worst episode (extremes).", choices=("all", "extremes")
     )
     formats: list[str] = setting(
         ["gif", "png"],
@@ -192,9 +190,7 @@ class ResultsConfig(Settings):
     """All settings of ``damian results``."""
 
     folders: list[str] = setting([], "Folder of a run, a sweep or a comparison; or two folders to compare.")
-    score: str = setting(
-        "return", "The measure whose differences the table of two folders has.", choices=SCORES
-    )
+    score: str = setting("return", "Measure whose differences the table of two folders has.", choices=SCORES)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,7 +9,6 @@ Words change settings of the run; what is not mentioned stays.
 from pathlib import Path
 from typing import NamedTuple
 
-import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import InteractionType
@@ -137,7 +136,6 @@ def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
         return config.learner.make_actor(env, config.model)
 
 
-@cli.one_line_errors("evaluate")
-@hydra.main(config_path="../conf", config_name="evaluate", version_base=None)
+@cli.program("evaluate")
 def main(given: DictConfig) -> None:
     start(fly, given, "evaluate")

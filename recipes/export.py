@@ -12,7 +12,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
@@ -124,15 +123,12 @@ def actions(config: ActionConfig, spec: TensorSpec) -> dict[str, Any]:
         meaning = "the bounds low and high of an action stand for these; a value beyond counts as the bound"
         ends = {"distance": [0.0, max(config.distances)], "heading": [0.0, 360.0]}
         return {"units": units, "columns": [*ends], "low": low, "high": high, **ends, "meaning": meaning}
-    table = [
-        [distance, math.degrees(heading)]
-        for distance, heading in action_table(config, torch.float64).tolist()
-    ]
+    rows = action_table(config, torch.float64).tolist()
+    table = [[distance, math.degrees(heading)] for distance, heading in rows]
     return {"meaning": "index of a row", "units": units, "columns": ["distance", "heading"], "table": table}
 
 
-@cli.one_line_errors("export")
-@hydra.main(config_path="../conf", config_name="export", version_base=None)
+@cli.program("export")
 @cli.one_line_errors("export")
 def main(given: DictConfig) -> None:
     config = cli.checked(given, [], "export")

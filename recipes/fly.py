@@ -10,7 +10,6 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 
-import hydra
 import numpy as np
 from matplotlib.animation import FFMpegWriter
 from omegaconf import DictConfig
@@ -112,7 +111,6 @@ def summary(name: str, episode: Episode) -> str:
     )
 
 
-@cli.one_line_errors("fly")
-@hydra.main(config_path="../conf", config_name="fly", version_base=None)
+@cli.program("fly")
 def main(given: DictConfig) -> None:
     start(show, given, "fly")

@@ -69,11 +69,6 @@ class Setting(NamedTuple):
     """What the setting means, with its unit."""
     is_section: bool
 
-    @property
-    def shown(self) -> str:
-        """The default value as text; empty of a section."""
-        return "" if self.is_section or self.default is MISSING else repr(self.default)
-
 
 @functools.cache
 def known_settings(program: str) -> dict[str, Setting]:
@@ -200,6 +195,6 @@ def _meaning(program: str, *keys: str) -> list[str]:
     lines = []
     for name, each in known_settings(program).items():
         if any(name == key or name.startswith(f"{key}.") for key in keys):
-            default = f" = {each.shown}" if each.shown else ""
+            default = "" if each.is_section or each.default is MISSING else f" = {each.default!r}"
             lines += [f"{name}: {each.kind}{default}", *([f"    {each.text}"] if each.text else [])]
     return lines

@@ -7,7 +7,6 @@ damian.results("runs/FOLDER")   # in Python
 
 from pathlib import Path
 
-import hydra
 import pandas as pd
 from omegaconf import DictConfig
 
@@ -47,8 +46,7 @@ def table(folders: list[Path], score: str) -> str:
     return f"{report(folder)}\n\nresults: {folder}"
 
 
-@cli.one_line_errors("results")
-@hydra.main(config_path="../conf", config_name="results", version_base=None)
+@cli.program("results")
 @cli.one_line_errors("results")
 def main(given: DictConfig) -> None:
     config = cli.checked(given, [], "results")

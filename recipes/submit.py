@@ -8,7 +8,6 @@ The runs come from `damian compare` with the experiment delaybench, or one of yo
 
 from pathlib import Path
 
-import hydra
 import pandas as pd
 from omegaconf import DictConfig
 from torch import Tensor
@@ -50,9 +49,8 @@ def submission(folder: Path, method: str, authors: str) -> pd.DataFrame:
         if (run / CHECKPOINT).exists():  # flights elsewhere have no networks
             trained[task, delay] = run  # those of all seeds have the same sizes
     known = rows.drop(columns=["return"]).join(pd.DataFrame(facts))
-    return known.assign(authors=authors, parameters=max(map(parameters, trained.values()), default=0))[
-        COLUMNS
-    ]
+    size = max(map(parameters, trained.values()), default=0)
+    return known.assign(authors=authors, parameters=size)[COLUMNS]
 
 
 def parameters(run: Path) -> int:
@@ -76,8 +74,7 @@ def submit(config: SubmitConfig) -> None:
     print(f"{path}: {len(rows)} runs; add it to docs/results/leaderboard in a pull request")
 
 
-@cli.one_line_errors("submit")
-@hydra.main(config_path="../conf", config_name="submit", version_base=None)
+@cli.program("submit")
 @cli.one_line_errors("submit")
 def main(given: DictConfig) -> None:
     submit(cli.checked(given, [], "submit"))

@@ -18,7 +18,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import cast
 
-import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -200,8 +199,7 @@ def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, int
     return finished or asked
 
 
-@cli.one_line_errors("train")
-@hydra.main(config_path="../conf", config_name="train", version_base=None)
+@cli.program("train")
 def main(given: DictConfig) -> None:
     start(train, given, "train")
 

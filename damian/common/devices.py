@@ -20,6 +20,5 @@ def free_memory(device: torch.device) -> float:
         return torch.cuda.mem_get_info(device)[0] / 2**30
     table = Path("/proc/meminfo")  # of Linux: the memory that is free, or would be if it were asked for [KiB]
     lines = table.read_text(encoding="ascii").splitlines() if table.exists() else []
-    return next(
-        (int(line.split()[1]) / 2**20 for line in lines if line.startswith("MemAvailable:")), math.inf
-    )
+    free = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    return free[0] / 2**20 if free else math.inf

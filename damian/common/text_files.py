@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from damian.common.errors import InputError
 
@@ -79,9 +79,8 @@ def one_line(text: str) -> str:
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in line)
 
 
-def show(value: Any) -> str:
-    """Shorten a value to an abbreviated Python literal."""
-    return reprlib.repr(value)
+show = reprlib.repr
+"""Shortens a value to an abbreviated Python literal."""
 
 
 def listed(items: Iterable[str]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from damian.compare.config import LESS_IS_BETTER, Method
+from damian.compare.config import LESS_IS_BETTER, SCORES, Method
 from damian.compare.statistics import (
     Floats,
     bootstrap,
@@ -27,15 +27,7 @@ HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed method."""
-MEASURED = (
-    "return",
-    "success_rate",
-    "steps",
-    "perceived_return",
-    "perceived_success_rate",
-    "perceived_steps",
-)
-MEASURED += ("age", "late", "lost", "backupdated")
+MEASURED = (*SCORES, "age", "late", "lost", "backupdated")
 """Measures whose means over seeds are shown: most are of an ``Evaluation``."""
 SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
 """Measures whose intervals end at 0 and at 1."""

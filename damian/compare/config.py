@@ -32,12 +32,8 @@ class Method(Settings):
     delayed: bool = setting(True, "Whether it has delays; exactly one method, the reference, has none.")
     naive: bool = setting(False, "Whether it ignores the delay; the best such method has recovery 0.")
     policy_of: str | None = setting(None, "Method whose policies it flies, without any training of its own.")
-    starts_from: str | None = setting(
-        None, "Method from whose policies, of the same seed, its training starts."
-    )
-    teacher: str | None = setting(
-        None, "Method whose policies its learner imitates: its ``learner.teacher``."
-    )
+    starts_from: str | None = setting(None, "Method from whose policies, of the same seed, training starts.")
+    teacher: str | None = setting(None, "Method whose policies its learner imitates: ``learner.teacher``.")
     untrained: bool = setting(False, "Whether the networks fly as they are before the first update.")
     tasks: list[str] | None = setting(None, "Tasks that the method does; all of them if not given.")
     simulator: bool | None = setting(
@@ -117,14 +113,10 @@ class CompareConfig(Settings):
     methods: list[str] | None = setting(None, "Methods to run; all of the experiment's if not given.")
     overrides: list[str] = setting([], "Further overrides of ``damian train`` for every run.")
     score: str = setting(
-        "return",
-        "The measure that counts, of what truly happened, or as the server perceived it.",
-        choices=SCORES,
+        "return", "Measure that counts, as it truly was, or as the server perceived it.", choices=SCORES
     )
     report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
-    keep: bool = setting(
-        False, "Keep the stored results of runs whose folders are gone, and run only the others."
-    )
+    keep: bool = setting(False, "Keep the results of runs whose folders are gone, and run only the others.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -109,9 +109,8 @@ def plot_profiles(comparison: Comparison, path: Path) -> None:
     def panel(axis: Axes, _: str) -> None:
         places = np.linspace(-0.1, 1.1, _POINTS)
         for name in names:
-            columns: list[Any] = [
-                found[[name, *found.columns[:2]]] for found in scores
-            ]  # undelayed and random
+            # A method, and what comes first in each table: undelayed and random.
+            columns: list[Any] = [found[[name, *found.columns[:2]]] for found in scores]
             runs = [normalised(found.iloc[:, 0], *found.iloc[:, 1:].mean()) for found in columns]
             values = np.concatenate(runs)
             share = (values[~np.isnan(values), None] > places).mean(0)

@@ -60,10 +60,8 @@ def leaderboard(submissions: Sequence[pd.DataFrame], delays: Collection[str]) ->
             of_task = rows[~away & (rows["regime"] == regime) & (rows["task"] == task)]
             parts += [f"## {task}, {regime}", _methods(of_task, [*delays])]
     for method in rows.loc[away, "method"].unique():
-        parts += [
-            f"## {method}, flown where it was not trained",
-            _flights(rows[away & (rows["method"] == method)]),
-        ]
+        flights = _flights(rows[away & (rows["method"] == method)])
+        parts += [f"## {method}, flown where it was not trained", flights]
     return "\n\n".join(parts) + "\n"
 
 

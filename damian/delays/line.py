@@ -93,12 +93,11 @@ class DelayLine:
         clock, generated_at = memory["clock"] + 1, memory["generated_at"]
         n_slots, n_senders = self.sampler.lost, len(generated_at)
         n_places = n_slots * n_senders
-        row_now = advance_slot(memory["place"], n_senders, n_places)
+        row_now = (memory["place"] + n_senders) % n_places
         delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
-        if self._always_longest:  # K - 1 steps ahead in a ring of K slots is the slot of the step before
-            row_sent = memory["place"]
-        else:
-            row_sent = advance_slot(row_now, delay * n_senders, n_places)
+        row_sent = memory["place"]  # K - 1 steps ahead in a ring of K slots is the slot of the step before
+        if not self._always_longest:
+            row_sent = (row_now + delay * n_senders) % n_places
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
         if sent is not None or not self._always_longest:
@@ -119,11 +118,6 @@ class DelayLine:
             held.append(torch.where(expand_mask(fresh, old), flat.index_select(0, row_now), old))
             memory[f"held_{i}"] = held[i]
         return memory, Delivery(held, clock - generated_at, fresh, delay)
-
-
-def advance_slot(slot: Tensor, steps: Tensor | int, n_slots: int) -> Tensor:
-    """Slot that is ``steps`` later in the ring."""
-    return (slot + steps) % n_slots
 
 
 def slot_rows(slot: Tensor) -> Tensor:

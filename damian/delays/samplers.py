@@ -33,6 +33,12 @@ class MessageContext(NamedTuple):
     """The entries that the law reads, by name, [M, ...] each; ``position`` is east and north [m], [M, 2]."""
 
 
+Context = MessageContext | None
+"""None if the sampler sees no context."""
+Drawn = tuple[Tensor, Tensor]
+"""The delays of M messages, [M] long, from 0 to ``longest``, or ``lost``; and the next states, [M, ...]."""
+
+
 class Sampler(nn.Module, ABC):
     """Draws a delay for each message; derive from it to draw by a rule, or with a state, of your own.
 
@@ -77,14 +83,8 @@ class Sampler(nn.Module, ABC):
         return state
 
     @abstractmethod
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Draw the delays of the messages sent at ``clock``, and the next states; pure.
-
-        Returns:
-            the delays [M] long, from 0 to ``longest``, or ``lost``; and the states [M, ...].
-        """
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+        """Draw the delays of the messages sent at ``clock``, and the next states; pure."""
 
     def lose(self, delay: Tensor, streams: Tensor, clock: Tensor) -> Tensor:
         """The delays [M], of which a share ``loss`` is lost, by a draw of its own."""
@@ -133,9 +133,7 @@ class TableSampler(Sampler):
     def initial_state(self, streams: Tensor) -> Tensor:
         return (counter_rng.uniform(streams) < self._bad_share).long()
 
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
         if self.constant_delay is not None:
             return torch.full_like(streams, self.constant_delay), state
         draw = counter_rng.bits(streams, clock)
@@ -165,9 +163,7 @@ class Recorded(Sampler):
     def initial_state(self, streams: Tensor) -> Tensor:
         return counter_rng.bits(streams) % len(self._delays)
 
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
         delay = self._delays[state]
         if self.loss:
             delay = torch.where(counter_rng.uniform(streams, clock) < self.loss, self.lost, delay)
@@ -192,9 +188,7 @@ class HeldSampler(Sampler):
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
         return self.drawn.begin_episode(state, mask)
 
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
         return torch.where(delay < self.lost, self.longest, self.lost), state
 
@@ -207,9 +201,7 @@ class LossSampler(HeldSampler):
         self.loses, self.constant_delay, self.sees_context = True, None, True
         self.reads = (*drawn.reads, "loss")
 
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
         draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
         chance = cast(MessageContext, context).entries["loss"].view_as(draw)
@@ -237,9 +229,7 @@ class LagSampler(Sampler):
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
         return torch.where(mask.unsqueeze(-1), self.initial_state(state[:, 0]), state)
 
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
         if self.constant_delay is not None:
             return torch.full_like(streams, self.constant_delay), state
         lag, wait = state.unbind(-1)
@@ -291,9 +281,7 @@ class ContextSampler(Sampler):
         self.sees_context, self.reads = True, tuple(reads)
         self._delay_fn, self._lost_if_negative = delay_fn, loses
 
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
         delay = self._delay_fn(cast(MessageContext, context)).view_as(streams)
         arrives = delay >= 0  # false for nan too
         steps = torch.where(arrives, delay, 0)
@@ -337,9 +325,7 @@ class LinkSampler(Sampler):
         pairs = zip(self.samplers, self._split(state), strict=True)
         return _packed([sampler.begin_episode(part, mask) for sampler, part in pairs])
 
-    def forward(
-        self, streams: Tensor, clock: Tensor, state: Tensor, context: MessageContext | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
         n_links = len(self._law_index)
         n_worlds, delay, states = len(streams) // n_links, torch.zeros_like(streams), []
         index = self._law_index.repeat(n_worlds)

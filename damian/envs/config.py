@@ -24,9 +24,7 @@ class ClockConfig(Settings):
     simulation: str = setting("1s", "Length of a simulation step, ``dt``.")
     agents: str | None = setting(None, "Period at which an agent decides; ``simulation`` if not given.")
     server: str | None = setting(None, "Period at which the server broadcasts; ``simulation`` if not given.")
-    system: str | None = setting(
-        None, "Period at which the learner gets a batch; from learner.steps if not given."
-    )
+    system: str | None = setting(None, "Period of the learner's batches; from learner.steps if not given.")
     trigger: str | None = setting(
         None, "Change of that period at each tick: shorter if a UAV of half the worlds spots, else longer."
     )

@@ -153,10 +153,8 @@ class Belief(WorldTransform):
         messages = self.server.messages(self.to_rows(entries[keys.MESSAGE]))
         region, level = self.server.region_of(messages), self.server.level(messages)
         rows, place = report_rows(self.grid, messages, level), places(self.grid, region, level)
-        beliefs = begin_beliefs(
-            self.grid, Window(**memory), rows.flatten(0, 1), place.flatten(), self._of_each(mask)
-        )
-        return memory, self._written(beliefs)
+        told = rows.flatten(0, 1), place.flatten(), self._of_each(mask)
+        return memory, self._written(begin_beliefs(self.grid, Window(**memory), *told))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         rows = {key: self.to_rows(entries[key]) for key in self.in_keys}

@@ -129,14 +129,8 @@ def plot_fit(messages: pd.DataFrame, law: LawFit, dt: float, path: Path) -> None
     def panel(axis: Any, _: str) -> None:
         axis.step([0, *delays], recorded, where="post", color=COLOURS[0], label="recorded")
         name = law.written["law"] if isinstance(law.written, dict) else "constant"
-        axis.plot(
-            np.arange(len(later))[shown] * dt,
-            later[shown],
-            "o",
-            ms=4,
-            color=COLOURS[1],
-            label=f"best law: {name}",
-        )
+        style: Any = {"markersize": 4, "color": COLOURS[1], "label": f"best law: {name}"}
+        axis.plot(np.arange(len(later))[shown] * dt, later[shown], "o", **style)
         axis.set(xlabel="delay [s]", ylabel="share of messages later, or lost", yscale="log")
         if lost:
             axis.axhline(lost, color="0.5", linestyle=":", label="lost")

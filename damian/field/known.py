@@ -186,9 +186,7 @@ class UavLog:
         if report.landed is not None:
             ago = (round((report.time - time) / self.dt) for time in report.landed[: len(stops)])
             landed = [filled.step - n_steps for n_steps in ago]
-            stops = [(point, step) for (point, _), step in zip(stops, landed, strict=False)] + stops[
-                len(landed) :
-            ]
+            stops[: len(landed)] = [(point, step) for (point, _), step in zip(stops, landed, strict=False)]
         return tuple([*stops, *[(stops[-1][0], -1)] * self.n_stops][: self.n_stops])
 
 

@@ -61,13 +61,10 @@ class ReportedEnv(UavEnv):
     """A single world that is known only by its messages; ``Node`` takes its steps."""
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
-        for key, number in (
-            ("source.count", scenario.source.count - 1),
-            ("requests.rate", scenario.requests.slots),
-        ):
-            checks.require(
-                not number, key, "it", "is not told by reports, which know one source and no requests"
-            )
+        told = {"source.count": scenario.source.count == 1, "requests.rate": not scenario.requests.slots}
+        for key, is_told in told.items():
+            problem = "is not told by reports, which know one source and no requests"
+            checks.require(is_told, key, "it", problem)
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
         super().__init__(scenario, 1, seed, extras=extras, messages_only=True)
 

@@ -130,9 +130,8 @@ def _messages(
     sent, number = np.zeros((len(steps), len(reports)), bool), {uav: i for i, uav in enumerate(reports)}
     delay, found = np.zeros(sent.shape, int), fit(report for own in reports.values() for report in own)
     # Of those of one step, the first that has arrived counts.
-    for uav, time, received in found.sort_values("delay", ascending=False, na_position="first")[
-        ["uav", "time", "received"]
-    ].itertuples(index=False):
+    found = found.sort_values("delay", ascending=False, na_position="first")
+    for uav, time, received in found[["uav", "time", "received"]].itertuples(index=False):
         step = tracker.step_of(time) - steps[0]
         if 0 < step < len(steps):
             lag = -1 if math.isnan(received) else max(tracker.step_of(received) - steps[0] - step, 0)

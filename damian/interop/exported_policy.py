@@ -90,9 +90,8 @@ def exported(
     policy = ExportedPolicy(actor, env.full_action_spec_unbatched[keys.ACTION]).eval()
     steps = env.rollout(16, break_when_any_done=False).flatten()
     missing = [str(each) for each in policy.in_keys if each not in steps.keys(True)]
-    checks.require(
-        not missing, key, ", ".join(missing), "is what its actor reads, and not in the environment"
-    )
+    should = "is what its actor reads, and not in the environment"
+    checks.require(not missing, key, ", ".join(missing), should)
     inputs = [steps[each] for each in policy.in_keys]
     examples = tuple(each[:2].clone() for each in inputs)
     sizes = {0: torch.export.Dim("worlds", min=1)}

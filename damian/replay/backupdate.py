@@ -18,7 +18,7 @@ from damian.replay.time_storage import TimeStorage
 from damian.transforms.base import Correction, StatefulTransform, leaf_transforms
 from damian.transforms.entries import Entries, sibling_key
 
-Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
+Recompute = Callable[[TensorDictBase, Tensor], Entries]
 """Function from steps [T, B], and the newest message that the receiver can hold after each of them, to new
 values of entries by key, as ``{("next", "reward"): reward}``; the flags that end an episode: all, or none."""
 
@@ -183,9 +183,7 @@ class BackupdateStorage(TimeStorage):
         hindsight = {self._hindsight: latest, self._hindsight_age: age}
         return latest, cast(Entries, hindsight if self._hindsight else {})
 
-    def _recomputed(
-        self, steps: TensorDictBase, messages: Tensor | None, n_right: int
-    ) -> dict[NestedKey, Tensor]:
+    def _recomputed(self, steps: TensorDictBase, messages: Tensor | None, n_right: int) -> Entries:
         """The corrected entries of steps [T, B]; the first ``n_right`` are stored as they should be."""
         begins = steps[self._count].squeeze(-1) == 0
         entries = self.recompute(steps, messages) if self.recompute and messages is not None else {}
@@ -237,13 +235,11 @@ def _rewards_changed(after: Entries, steps: TensorDictBase, changed: Tensor) -> 
     return changed
 
 
-def _before(
-    steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor, n_right: int
-) -> dict[NestedKey, Tensor]:
+def _before(steps: TensorDictBase, after: Entries, begins: Tensor, n_right: int) -> Entries:
     """Entries before the steps [T, B] that follow the right ones: those after the step before each."""
     keep = begins[n_right:].clone()
     keep[0] |= n_right == 0  # the step before the first one is not among these steps
-    before: dict[NestedKey, Tensor] = {}
+    before: Entries = {}
     for next_, value in after.items():
         key = unravel_key(next_[1:])
         stored = None if next_ in ENDS else steps.get(key, None)

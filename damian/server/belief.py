@@ -152,10 +152,8 @@ def build_source_grid(
         staying = (prior > 0).float() @ moves.T
         if len(polygons) == 1:
             moves, staying = moves * (prior > 0) / staying.T, torch.ones_like(prior)
-    shares = [
-        _detected_shares(*each, columns * edge, edge, radius)
-        for each in zip(polygons, airspace.points, strict=True)
-    ]
+    pairs = zip(polygons, airspace.points, strict=True)
+    shares = [_detected_shares(*each, columns * edge, edge, radius) for each in pairs]
     covered = LEAST_REPORT_PROBABILITY + (1 - 2 * LEAST_REPORT_PROBABILITY) * torch.cat(shares)
     log_reports = _log_reports(covered, source, _renewed(centres, moves, edge))
     reports = source.false_alarm + covered * (1 - source.miss - source.false_alarm)

@@ -31,9 +31,7 @@ class ObservationConfig(Settings):
         None, "Divides times; the time limit of episodes, or else an hour, if not given.", unit="s", above=0
     )
     age: bool = setting(False, "Whether each actor observes the age of its UAV's message on the server.")
-    age_scale: float = constant(
-        10.0, "Divides ages; a policy scales them by its first layer.", unit="s", above=0
-    )
+    age_scale: float = constant(10.0, "Divides ages; a policy's first layer scales them.", unit="s", above=0)
     own: bool = setting(
         False,
         "Whether each UAV knows its own messages at once, not when the server has them, as in the paper.",

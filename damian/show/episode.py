@@ -182,16 +182,8 @@ class Episode:
 COLUMNS = {f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")}  # type: ignore[union-attr]
 """What each column means, by its name."""
 
-OUTPUTS = (
-    keys.STATE,
-    keys.MESSAGE,
-    keys.MESSAGE_SENT,
-    keys.RECEIVED,
-    keys.DELAY,
-    keys.BELIEF,
-    keys.REWARD_TERMS,
-    keys.SUCCESS,
-)
+OUTPUTS = (keys.STATE, keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY)
+OUTPUTS += (keys.BELIEF, keys.REWARD_TERMS, keys.SUCCESS)
 """Entries from which an episode is made, beside the reward; some settings lack some of them."""
 
 
@@ -217,7 +209,9 @@ def at_instant(outputs: TensorDictBase) -> TensorDictBase:
 
 def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> Episode:
     """The episode of one world from ``at_instant`` of the reset and of each step, stacked, [T + 1]."""
-    message, truth = cast(Tensor, instants[keys.MESSAGE]), _truth(env, instants)
+    message, vehicles = cast(Tensor, instants[keys.MESSAGE]), env.simulation.vehicles
+    state, n_drawn = cast(Tensor, instants[keys.STATE]), len(vehicles.values.choices)
+    truth = Truth.unpack(state, env.simulation.widths, n_drawn)
     sent = cast(Tensor, instants[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on
     delay = instants.get(keys.DELAY, torch.zeros_like(sent[..., None], dtype=torch.long))
@@ -229,7 +223,7 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
     about, over = {**about, **_drawn(env, truth.drawn[:1])}, airspace.regions[region]
     points = np.asarray(airspace.points[region, : airspace.n_points[region]].cpu())
     if env.scenario.battery.charging_points:  # else UAVs charge wherever they land
-        charges = env.simulation.vehicles.chargers.view(airspace.points.shape[:2])[region].cpu()
+        charges = vehicles.chargers.view(airspace.points.shape[:2])[region].cpu()
         about["charging_points"] = _listed(points[charges[: len(points)].numpy()])
     level, source = about.get("drawn", {}).get("source.level_db"), env.scenario.source
     return Episode(
@@ -238,7 +232,7 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         origin=over.origin,
         landing_points=points,
         radius=footprint_radius(replace(source, level_db=level) if level else source),
-        instant=env.simulation.vehicles.instant,
+        instant=vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
         time=np.asarray(time),
         position=np.asarray(truth.position),
@@ -258,13 +252,6 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         belief=None if belief is None else np.asarray(belief),
         requests=np.asarray(truth.requests) if env.simulation.widths.requests else None,
     )
-
-
-def _truth(env: UavEnv, instants: TensorDictBase) -> Truth:
-    """What the environment's entry ``state`` tells."""
-    simulation = env.simulation
-    rows = cast(Tensor, instants[keys.STATE])
-    return Truth.unpack(rows, simulation.widths, len(simulation.vehicles.values.choices))
 
 
 def _drawn(env: UavEnv, drawn: Tensor) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
-from torchrl.envs import EnvBase
 
 from damian.common.errors import InputError
 from damian.delays.laws import sampler_of
@@ -30,23 +29,6 @@ class ActionSpecs(NamedTuple):
     """Upper minus lower bound, [*rows, ...] float32; 1 without bounds, with one value only, or one-hot."""
     bounded: bool
     """Whether (action - low) / width lies in [0, 1] for every number of an action."""
-
-
-def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs:
-    """Read the action spec of an environment; ``default`` is that of ``ActionDelay``."""
-    specs = env.full_action_spec
-    spec, rows = specs[key], spec_rows(specs, key)
-    if isinstance(spec, OneHot):
-        indices = spec.to_categorical_spec()
-        initial = indices.to_one_hot(_default_action(_range(indices), default)).to(spec.dtype)
-        low = torch.zeros_like(initial, dtype=torch.float32)
-        return ActionSpecs(rows, initial, low, torch.ones_like(low), True)
-    space = _range(spec)
-    low, high = (bound.float() for bound in space)
-    width = high - low
-    bounded = isinstance(spec, Categorical | Bounded) & width.isfinite()
-    low, width = torch.where(bounded, low, 0), torch.where(bounded & (width > 0), width, 1)
-    return ActionSpecs(rows, _default_action(space, default), low, width, bool(bounded.all()))
 
 
 def _range(spec: TensorSpec) -> tuple[Tensor, Tensor]:
@@ -92,7 +74,19 @@ class ActionTransform(StatefulTransform):
     @property
     def actions(self) -> ActionSpecs:
         """Shape, range and default of the actions, by the environment's specs."""
-        return read_action_specs(self.env, self.action_key, self.default)
+        specs = self.env.full_action_spec
+        spec, rows = specs[self.action_key], spec_rows(specs, self.action_key)
+        if isinstance(spec, OneHot):
+            indices = spec.to_categorical_spec()
+            initial = indices.to_one_hot(_default_action(_range(indices), self.default)).to(spec.dtype)
+            low = torch.zeros_like(initial, dtype=torch.float32)
+            return ActionSpecs(rows, initial, low, torch.ones_like(low), True)
+        space = _range(spec)
+        low, high = (bound.float() for bound in space)
+        width = high - low
+        bounded = isinstance(spec, Categorical | Bounded) & width.isfinite()
+        low, width = torch.where(bounded, low, 0), torch.where(bounded & (width > 0), width, 1)
+        return ActionSpecs(rows, _default_action(space, self.default), low, width, bool(bounded.all()))
 
 
 class ActionDelay(ActionTransform):

@@ -447,20 +447,14 @@ def check_order(transforms: Sequence[Transform]) -> None:
     transit would be lost at an end of the episode.
     """
     for first, second in itertools.combinations(transforms, 2):
-        problem = None
+        problem, limits = None, isinstance(second, StepCounter) and second.max_steps is not None
+        ends = limits or isinstance(second, RandomTruncationTransform | TerminateTransform)
         if isinstance(first, StatefulTransform) and isinstance(second, StatefulTransform):
             read = {*first.in_keys, *first.in_keys_inv}
             shared = read.intersection([*second.out_keys, *second.out_keys_inv])
             if shared and STAGES.index(first.stage) > STAGES.index(second.stage):
                 problem = f"it reads {shared.pop()}, which the other one changes"
-        elif (
-            isinstance(first, StatefulTransform)
-            and first.flushes_at_end
-            and (
-                isinstance(second, RandomTruncationTransform | TerminateTransform)
-                or (isinstance(second, StepCounter) and second.max_steps is not None)
-            )
-        ):
+        elif isinstance(first, StatefulTransform) and first.flushes_at_end and ends:
             problem = "what is in transit at the end of an episode would be lost"
         if problem:
             names = type(first).__name__, type(second).__name__

@@ -8,7 +8,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.delays.samplers import MessageContext, Sampler
+from damian.delays.samplers import Context, MessageContext, Sampler
 from damian.transforms.base import Memory
 from damian.transforms.entries import Entries, as_rows, sibling_key
 
@@ -47,9 +47,7 @@ class ContextReader:
         n_agents = rows.numel() // tensordict.batch_size.numel()
         return memory | {"agents": torch.arange(n_agents, device=memory["streams"].device)}
 
-    def read(
-        self, memory: Memory, entries: Entries, sent: Tensor | None, rows: torch.Size
-    ) -> MessageContext | None:
+    def read(self, memory: Memory, entries: Entries, sent: Tensor | None, rows: torch.Size) -> Context:
         """The context of the messages ``sent`` [M] (None: all) in this step; None if the law sees none."""
         if not self._sees_context:
             return None

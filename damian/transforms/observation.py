@@ -97,10 +97,8 @@ class ObservationDelay(StatefulTransform):
 
     def _outputs(self, delivery: Delivery) -> Entries:
         # A copy, because the line keeps what it holds; the other ``out_keys`` follow.
-        entries = {
-            key: self.from_rows(value.clone())
-            for key, value in zip(self.out_keys, delivery.held, strict=False)
-        }
+        pairs = zip(self.out_keys, delivery.held, strict=False)
+        entries = {key: self.from_rows(value.clone()) for key, value in pairs}
         if self.age_key:
             entries[self.age_key] = delivery.age.to(torch.float32).view(*self.rows, 1)
         if self.delay_key:

@@ -14,7 +14,7 @@ from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask, next_true
 from damian.delays.laws import LOSES, sampler_of
-from damian.delays.line import advance_slot, slot_rows
+from damian.delays.line import slot_rows
 from damian.keys import next_key
 from damian.transforms.base import Change, Correction, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
@@ -107,7 +107,7 @@ class RewardDelay(StatefulTransform):
         reward = self.to_rows(entries[self.reward_key])
         context = self.contexts.read(memory, entries, None, self.rows)
         delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
-        slot = advance_slot(memory["slot"], 1, self.n_slots)
+        slot = (memory["slot"] + 1) % self.n_slots
         memory = memory | {"clock": clock, "slot": slot, "state": state, "time": memory["time"] + 1}
         memory["past"] = self._send(memory, reward, delay, self.sending_rows(entries))
         row = slot_rows(slot)
@@ -129,7 +129,7 @@ class RewardDelay(StatefulTransform):
         """The slots [K, M, ...] with rewards [M, ...] that arrive after delays [M], in rows that step."""
         past, arrival = memory["past"], memory["time"] + delay
         flat, due = past.flatten(0, 1), memory["due"].view(-1)
-        row = slot_rows(advance_slot(memory["slot"], delay, self.n_slots))
+        row = slot_rows((memory["slot"] + delay) % self.n_slots)
         there, old = flat.index_select(0, row), due.index_select(0, row)
         added = torch.where(expand_mask(old == arrival, there), there, 0) + reward
         # ``old`` is never later; a compiler that sees that it is read before writes the new times in place.

@@ -114,11 +114,7 @@ class ObservationTimeline(StatefulTransform):
     def _by_row(self, sent: dict[str, Tensor]) -> Memory:
         """The messages of ``_sent`` by rows, [M, ...] each; several rows in order may share a position."""
         n_rows, lead = sent["sent"].numel(), sent["sent"].dim()
-        rows = {
-            name: value.reshape(n_rows, *value.shape[lead:])
-            for name, value in sent.items()
-            if name != "position"
-        }
+        rows = {n: each.reshape(n_rows, *each.shape[lead:]) for n, each in sent.items() if n != "position"}
         if "position" in sent:
             position = sent["position"].reshape(-1, sent["position"].shape[-1])
             rows["position"] = position.repeat_interleave(n_rows // len(position), 0)

@@ -15,18 +15,9 @@ IN_REACH = "in_reach"
 """The sensor that tells the truth about detections, for ``reward.detection=truth``."""
 FOOTPRINT = "footprint"
 """The sensor that tells the radius of a UAV's footprint, if it is drawn."""
-RANDOMISED = (
-    "motion.max_speed",
-    "motion.max_acceleration",
-    "battery.capacity_kwh",
-    "wind.speed",
-    "wind.direction",
-    "wind.gusts",
-    "source.level_db",
-    "source.miss",
-    "source.false_alarm",
-    "delay.loss",
-)
+RANDOMISED = ("motion.max_speed", "motion.max_acceleration", "battery.capacity_kwh")
+RANDOMISED += ("wind.speed", "wind.direction", "wind.gusts")
+RANDOMISED += ("source.level_db", "source.miss", "source.false_alarm", "delay.loss")
 """Settings that may be drawn for each world and episode."""
 
 
@@ -97,13 +88,11 @@ class RegionConfig(Settings):
         self.refuse(not good, "where", problem)
         both = self.index is not None and self.where is not None
         self.refuse(both, "where", "and region.index both choose; give one of them")
-        drawn, listed = checks.is_number(self.zones), isinstance(self.zones, list)
-        wrong = (
-            self.zones % 1 or not 0 <= self.zones <= 100 if drawn else not isinstance(self.zones, list | str)
-        )
+        zones, drawn = self.zones, checks.is_number(self.zones)
+        wrong = zones % 1 or not 0 <= zones <= 100 if drawn else not isinstance(zones, list | str)
         problem = "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100"
         self.refuse(wrong, "zones", problem)
-        for zone in self.zones if listed else []:
+        for zone in zones if isinstance(zones, list) else []:
             good = isinstance(zone, list) and len(zone) > 2
             problem = (
                 "has a zone that is not a list of three or more corners: region.zones=[[[0,0],[50,0],[0,50]]]"
@@ -168,11 +157,7 @@ class WindConfig(Settings):
         high=360,
     )
     gusts: float = setting(
-        0.0,
-        "Standard deviation, east and north, of the wind of a flight from the mean.",
-        unit="m/s",
-        low=0,
-        high=30,
+        0.0, "Standard deviation of a flight's wind, east and north.", unit="m/s", low=0, high=30
     )
 
 
@@ -269,10 +254,7 @@ class RequestConfig(Settings):
     )
     most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
     range: float | None = setting(
-        None,
-        "A UAV on the ground hears of those within it; everybody at once if not given.",
-        unit="m",
-        above=0,
+        None, "UAVs on the ground hear of those within it; everybody at once if not given.", unit="m", above=0
     )
 
     @property

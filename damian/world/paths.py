@@ -59,12 +59,7 @@ class Detours(NamedTuple):
         way = self._along(row, origin, goal, points)
         straight = torch.linalg.vector_norm(way[..., -1, :] - way[..., 0, :], dim=-1)
         leads = gather_rows(self.reached, row) & (straight <= self.longest)
-        return way_length(way).where(leads, torch.inf)
-
-
-def way_length(way: Tensor) -> Tensor:
-    """Lengths of ways over places, [*, W, 2] metres to [*] metres."""
-    return torch.linalg.vector_norm(way.diff(dim=-2), dim=-1).sum(-1)
+        return torch.linalg.vector_norm(way.diff(dim=-2), dim=-1).sum(-1).where(leads, torch.inf)
 
 
 def detours(polygons: list[Polygon | MultiPolygon], points: list[Floats], longest: float) -> Detours | None:
@@ -86,7 +81,10 @@ def detours(polygons: list[Polygon | MultiPolygon], points: list[Floats], longes
     if not found:
         return None
     widest, n_points = max(corners.shape[1] for _, corners, _ in found), most * len(points)
-    padded = [_with_corners(corners, widest) for _, corners, _ in found]
+    padded = [
+        np.pad(each, ((0, 0), (0, widest - each.shape[1]), (0, 0)), constant_values=np.nan)
+        for _, each, _ in found
+    ]
     pairs, reached = (np.concatenate([each[i] for each in found]) for i in (0, 2))
     return Detours(
         torch.as_tensor(pairs[:, 0] * n_points + pairs[:, 1]),
@@ -95,11 +93,6 @@ def detours(polygons: list[Polygon | MultiPolygon], points: list[Floats], longes
         n_points,
         longest,
     )
-
-
-def _with_corners(corners: Floats, n: int) -> Floats:
-    """Corners [P, C, 2] filled up with NaN, [P, n, 2]."""
-    return np.pad(corners, ((0, 0), (0, n - corners.shape[1]), (0, 0)), constant_values=np.nan)
 
 
 def _shortest(polygon: shapely.Geometry, points: Floats, pairs: NDArray[np.int64]) -> tuple[Floats, NDArray]:

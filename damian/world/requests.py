@@ -50,9 +50,8 @@ def appear(
     seed, episode, step, region = counters
     appears = counter_rng.uniform(seed, torch.full_like(step, _APPEARS), episode, step) < probability
     number = counter_rng.bits(seed, torch.full_like(step, _PLACE), episode, step) % places.shape[1]
-    new = torch.cat(
-        [gather_rows(places.flatten(0, 1), region * places.shape[1] + number), now.unsqueeze(-1)], -1
-    )
+    place = gather_rows(places.flatten(0, 1), region * places.shape[1] + number)
+    new = torch.cat([place, now.unsqueeze(-1)], -1)
     age = requests[..., 2].masked_fill(is_open(requests, served), torch.inf)
     taken = torch.arange(age.shape[-1], device=age.device) == age.argmin(-1, keepdim=True)
     taken = taken & age.isfinite() & appears.unsqueeze(-1)

@@ -147,8 +147,7 @@ class InstantMotion(MotionModel):
     def ready(self, state: State) -> Tensor:
         return torch.ones_like(state.message_sent)
 
-    def on_ground(self, state: State) -> Tensor:
-        return torch.ones_like(state.message_sent)
+    on_ground = ready
 
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
         return state._replace(origin=state.goal, goal=goal)
@@ -161,9 +160,8 @@ class InstantMotion(MotionModel):
         length = self.airspace.length(state.origin, state.goal)
         battery = battery_of(self.values, state.drawn)
         drain = flight_drain(self.vertical(state), length, battery) * (length > 0)
-        return state._replace(
-            battery=self.battery_after(state, state.battery, drain, length == 0, state.goal)
-        )
+        level = self.battery_after(state, state.battery, drain, length == 0, state.goal)
+        return state._replace(battery=level)
 
     def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
         return on_ground, messages

@@ -157,8 +157,7 @@ BATCHED = {name: case for name, case in CASES.items() if case.env is not cartpol
 
 
 def test_the_cases_cover_every_exported_transform():
-    exported = {name: getattr(damian.transforms, name) for name in damian.transforms.__all__}
-    exported |= {"Belief": Belief, "ServerNode": ServerNode}
+    exported = vars(damian.transforms) | {"Belief": Belief, "ServerNode": ServerNode}
     concrete = {
         name
         for name, value in exported.items()
