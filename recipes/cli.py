@@ -191,8 +191,10 @@ def one_line_errors(program: str = "train") -> Iterator[None]:
         end_interrupted()
     finally:
         if HydraConfig.initialized() and not OmegaConf.is_missing(HydraConfig.get().runtime, "output_dir"):
+            folder = Path(HydraConfig.get().runtime.output_dir)
             with suppress(OSError):  # a refused run has nothing in the folder that Hydra has made for it
-                Path(HydraConfig.get().runtime.output_dir).rmdir()
+                if folder.resolve() != Path.cwd():
+                    folder.rmdir()
 
 
 def program(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
