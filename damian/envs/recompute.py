@@ -25,19 +25,20 @@ def server_recompute(
 
     ``corrected``: names in ``CORRECTED``; the ends of episodes always are.
     """
-    observes = not {"critic", "actor"}.isdisjoint(corrected)
-    believes = server.grid is not None and (observes or server.rewards_belief)
+    own = "actor" in corrected and server.observation.own
+    observers = {"critic", "actor"}.intersection(corrected) - ({"actor"} if own else set())
+    believes = server.grid is not None and (own or bool(observers) or server.rewards_belief)
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
         elapsed = steps[next_key(keys.STEP_COUNT)].squeeze(-1)
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
         belief = beliefs_in_hindsight(server, steps) if believes else None
         held = server.messages(messages)
-        outputs = server(held, elapsed, source_over, belief=belief, observes=observes)
+        outputs = server(held, elapsed, source_over, belief=belief, observers=observers)
         entries = outputs.entries(reward_terms)
         if belief is not None:
             entries[keys.BELIEF] = belief
-        if "actor" in corrected and server.observation.own:
+        if own:
             sent, own_belief = steps[next_key(keys.MESSAGE)], steps.get(next_key(keys.OWN_BELIEF), None)
             entries[keys.OBSERVATION] = server.observe_with_own_messages(messages, sent, elapsed, own_belief)
         kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}

@@ -5,6 +5,7 @@ replay storage with those that have arrived by the time of learning.
 """
 
 import itertools
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -49,8 +50,8 @@ class ServerOutputs(NamedTuple):
     def entries(self, reward_terms: bool = False) -> dict[NestedKey, Tensor]:
         """The outputs by their keys in a TensorDict, ``reward_terms`` only if they are wanted."""
         found: dict[NestedKey, Tensor] = {keys.REWARD: self.reward.unsqueeze(-1), **self.status.entries()}
-        if self.observation is not None and self.global_observation is not None:
-            found |= {keys.OBSERVATION: self.observation, keys.GLOBAL_OBSERVATION: self.global_observation}
+        seen = {keys.OBSERVATION: self.observation, keys.GLOBAL_OBSERVATION: self.global_observation}
+        found |= {key: value for key, value in seen.items() if value is not None}
         terms = self.terms if reward_terms else {}
         return found | {(*keys.REWARD_TERMS, name): term for name, term in terms.items()}
 
@@ -183,13 +184,14 @@ class Server:
         source_over: Tensor | None = None,
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
-        observes: bool = True,
+        observers: Collection[str] = ("actor", "critic"),
     ) -> ServerOutputs:
-        """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and, if wanted, observations.
+        """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and what ``observers`` observe.
 
         Without ``source_over`` the source never ends.
         """
-        names = self.names if observes else self.reads
+        seen = {observer: getattr(self.observation, observer) for observer in observers}
+        names = sorted({*self.reads, *itertools.chain(*seen.values())})
         features = self.features(messages, steps, names, coverage, belief)
         if self.reward.detection == "truth":
             first, _ = self._context.readings[IN_REACH]
@@ -202,11 +204,11 @@ class Server:
         ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
         terms = reward(judged, counters, self.terms)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
-        seen = self.observations(features) if observes else (None, None)
+        actor, critic = (stack(features, seen[x]) if x in seen else None for x in ("actor", "critic"))
         known = None
-        if self.remembers_coverage and observes:
+        if self.remembers_coverage and "coverage" in features:
             known = KnownCoverage(self.counted(messages), features["coverage"])
-        return ServerOutputs(*seen, sum(terms.values(), start=final), terms, ended, known)
+        return ServerOutputs(actor, critic, sum(terms.values(), start=final), terms, ended, known)
 
     def features(
         self,
@@ -218,7 +220,7 @@ class Server:
     ) -> Features:
         """The features of these names, or all that an observation or a reward term needs (paper, Table 2)."""
         context = self._known(messages, steps)._replace(coverage=coverage, belief=belief)
-        return observe(messages, context, names or self.names)
+        return observe(messages, context, self.names if names is None else names)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
         """Observations of the actors [*, N, F] and of the critic [*, N, G]."""

@@ -33,7 +33,7 @@ _OLDEST = 0.5
 def ring_places(radius: float | Tensor, device: torch.device | None = None) -> Tensor:
     """Offsets of the places of ``coverage_map`` from a UAV [m], [24, 2]; the inner ring first.
 
-    For radii [*, 1, 1, 1], [*, 1, 24, 2].
+    For radii [*, 1, 1], [*, 24, 2].
     """
     angle = torch.arange(SECTORS, device=device) * (2 * math.pi / SECTORS)
     ring = torch.stack([angle.sin(), angle.cos()], -1)
@@ -198,11 +198,13 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     assert context.places_inside is not None
     standing, radius = v.wanted(trail[..., 0]), context.radius
     if isinstance(radius, Tensor):
-        radius = radius[..., None, None, None]
-    places = gather_rows(context.points, standing).unsqueeze(-2) + ring_places(radius, standing.device)
-    landed = gather_rows(context.points, trail)  # [*, N, n, 2]
-    distance = distances(places.flatten(-3, -2), landed.flatten(-3, -2))
-    nearest = distance.view(*places.shape[:-1], *trail.shape[-2:]).amin(-2)  # of all UAVs
-    age = torch.arange(trail.shape[-1], device=trail.device) / trail.shape[-1]
-    new = (nearest / (2 * radius) + _OLDEST * age).amin(-1)
+        radius = radius[..., None, None]
+    offsets = ring_places(radius, standing.device).unsqueeze(-3)
+    places = gather_rows(context.points, standing).unsqueeze(-2) + offsets
+    n_agents, window = trail.shape[-2:]
+    landed = gather_rows(context.points, trail.transpose(-2, -1)).flatten(-3, -2)  # [*, n N, 2]
+    distance = distances(landed, places.flatten(-3, -2))  # places last, over which minima are fast
+    nearest = distance.unflatten(-2, (window, n_agents)).amin(-2)  # of all UAVs, [*, n, N 24]
+    age = torch.arange(window, device=trail.device).unsqueeze(-1) / window
+    new = (nearest / (2 * radius) + _OLDEST * age).amin(-2).view(places.shape[:-1])
     return new.clamp(max=1) * gather_rows(context.places_inside, v.tabled(standing))
