@@ -110,7 +110,7 @@ class Mappo:
         n_minibatches = min(self.config.minibatches, n_samples)
         for _ in range(self.config.epochs):
             order = torch.randperm(n_samples, device=device)
-            parts = {key: value[order].tensor_split(n_minibatches) for key, value in samples.items()}
+            parts = {k: v.index_select(0, order).tensor_split(n_minibatches) for k, v in samples.items()}
             for i in range(n_minibatches):
                 yield {key: part[i] for key, part in parts.items()}
 
