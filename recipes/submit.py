@@ -6,6 +6,9 @@ The runs come from `damian compare` with the experiment delaybench, or one of yo
 (docs/delaybench.md). What is submitted is the true return that damian's own evaluation has found.
 """
 
+import shlex
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -13,6 +16,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from damian.common import checks
+from damian.common.fields import leaves, value_at
 from damian.common.tables import write_csv
 from damian.compare.comparison import RUN, TRAINED
 from damian.compare.config import Experiment
@@ -23,10 +27,19 @@ from damian.runs.run_record import read_record
 
 from . import cli
 from .config import SubmitConfig
+from .known import key_of
 from .shared.comparison_runs import stored_results
+from .shared.runs import stored_values
 
-RECORDED = ("damian", "commit", "command")
-"""Words of a submission that the records of its runs tell."""
+OF_TASKS = ["agents", "region", "motion", "wind", "source", "requests", "battery", "reward", "episode"]
+OF_TASKS += [
+    "clock",
+    "links",
+    "randomise",
+    "frames",
+    *(f"delay.{of}" for of in ("obs", "act", "rew", "loss")),
+]
+"""Settings that a task and its delay state, and no method changes."""
 
 
 def delaybench() -> Experiment:
@@ -39,18 +52,40 @@ def submission(folder: Path, method: str, authors: str) -> pd.DataFrame:
     rows = stored_results(folder).rows
     checks.one_of("method", method, [*rows["method"].unique()])
     rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
-    facts, trained = list[dict[str, object]](), dict[tuple[str, str], Path]()
+    words, facts, trained = words_of_tasks(), list[dict[str, object]](), dict[tuple[str, str], Path]()
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
         run = folder / task / delay / method / f"seed_{seed}"
         record, should = read_record(run), "is not the folder of a finished run: keep those of all runs"
         checks.require((run / RESULTS).exists() and bool(record), "folder", run, should)
         found = read_results(run / RESULTS).set_index("policy")["return"]  # of damian's own evaluation
-        facts.append({"return": found[TRAINED], **{name: record.get(name) for name in RECORDED}})
+        settings = [word for word in record.get("overrides", []) if key_of(word) not in ("logger", "seed")]
+        told = {name: record.get(name) for name in ("damian", "commit")}
+        facts.append({"return": found[TRAINED], "settings": shlex.join(settings), **told})
+        if (task, delay) in words:
+            check_task(run, words[task, delay])
         if (run / CHECKPOINT).exists():  # flights elsewhere have no networks
             trained[task, delay] = run  # those of all seeds have the same sizes
     known = rows.drop(columns=["return"]).join(pd.DataFrame(facts))
     size = max(map(parameters, trained.values()), default=0)
     return known.assign(authors=authors, parameters=size)[COLUMNS]
+
+
+def words_of_tasks() -> dict[tuple[str, str], list[str]]:
+    """The settings of each task of delaybench under each delay."""
+    tasks, delays = delaybench().tasks, delaybench().delays
+    return {(task, delay): [*tasks[task], *delays[delay]] for task in tasks for delay in delays}
+
+
+def check_task(run: Path, words: Sequence[str]) -> None:
+    """Require that a run was in the task, under the delay, and for the steps that these settings state."""
+    stored = stored_values(run, "folder")
+    for key, asked in leaves(_composed(*words)):
+        if f"{key}.".startswith(tuple(f"{name}." for name in OF_TASKS)):
+            found = value_at(stored, key)
+            checks.require(found == asked, f"{run}: {key}", found, f"is not {asked}, as the task has it")
+
+
+_composed = cache(cli.settings)  # the same for all runs of a task
 
 
 def parameters(run: Path) -> int:
@@ -71,7 +106,9 @@ def submit(config: SubmitConfig) -> None:
     check_submission(rows, delaybench(), config.folder)
     path = Path(f"{config.method}.csv")
     write_csv(path, rows)
-    print(f"{path}: {len(rows)} runs; add it to docs/results/leaderboard in a pull request")
+    print(
+        f"{path}: {len(rows)} runs; add it to docs/results/leaderboard, and your files to examples/extending"
+    )
 
 
 @cli.program("submit")

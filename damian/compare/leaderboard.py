@@ -11,9 +11,9 @@ from damian.compare.comparison import HELD_OUT_MARK, LATE_DATA, RUN, SIMULATOR, 
 from damian.compare.config import EPISODES, Experiment
 
 NUMBERS = ["frames", "episodes", "return"]
-WORDS = ["task", "delay", "method", "authors", "regime", "damian", "commit", "command"]
+WORDS = ["task", "delay", "method", "authors", "regime", "damian", "commit", "settings"]
 COLUMNS = [*RUN, *NUMBERS, "parameters", *WORDS[3:]]
-"""Columns of a submission, which has a row for each run; those that are words."""
+"""Columns of a submission, which has a row for each run; ``settings`` are those of ``damian train``."""
 FEWEST_SEEDS = 5
 
 
@@ -28,7 +28,12 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
     checks.require(len(rows) > 0, path, "it", "has no rows")
     places = [*experiment.tasks]
     places += [f"{task}{HELD_OUT_MARK}{name}" for task in experiment.tasks for name in experiment.held_out]
-    for name, known in (("task", places), ("delay", experiment.delays), ("regime", (LATE_DATA, SIMULATOR))):
+    for task in rows["task"].unique():
+        should = (
+            f'is not of the leaderboard: train in one that is, by experiment=delaybench "tasks=[{places[0]}]"'
+        )
+        checks.require(task in places, f"{path}: task", task, should)
+    for name, known in (("delay", experiment.delays), ("regime", (LATE_DATA, SIMULATOR))):
         for value in rows[name].unique():
             checks.one_of(f"{path}: {name}", value, [*known])
     for name in ("method", "regime", "damian"):
@@ -45,8 +50,8 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         where, seeds = f"{path}: {'/'.join(map(str, place))}", runs["seed"]
         checks.require(not seeds.duplicated().any(), f"{where}: seed", [*seeds], "are not all different")
         enough = len(seeds) >= FEWEST_SEEDS and seeds.min() >= experiment.first_seed
-        should = f"are not {FEWEST_SEEDS} or more from {experiment.first_seed} on"
-        checks.require(bool(enough), f"{where}: seed", [*seeds], should)
+        few = f"are too few, or too small: run compare again with keep=true seeds={FEWEST_SEEDS}"
+        checks.require(bool(enough), f"{where}: seed", [*seeds], f"{few}, from {experiment.first_seed} on")
         checks.in_range(f"{where}: episodes", int(runs["episodes"].min()), EPISODES)
 
 

@@ -87,7 +87,7 @@ def _others(v: FeatureCache) -> Tensor:
     """The nearest other UAVs, the nearest first, [*, N, 20]; zeros stand for those that do not exist.
 
     Of each: the way to its place and to its target, east and north, over half the largest vertex distance of
-    the region, and 1.
+    the region, clamped to [-1, 1], and 1.
     """
     messages = v.messages
     places = torch.stack([messages.position, messages.target], -2)

@@ -6,11 +6,14 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
+import yaml
 
 from damian.common.errors import InputError
 from damian.common.tables import read_csv, write_csv
 from damian.compare.leaderboard import WORDS, check_submission, leaderboard
+from damian.recipes.cli import settings
 from damian.recipes.command import main
+from damian.recipes.shared.runs import save_config
 from damian.recipes.submit import delaybench
 from damian.runs.checkpoint import write_checkpoint
 
@@ -23,11 +26,14 @@ SUBMIT = ["submit", "folder=runs", "method=mine", "authors=A. Author"]
 def folder(tmp_path, monkeypatch):
     """The folder of a comparison in which ``mine`` has five runs."""
     monkeypatch.chdir(tmp_path)
-    rows = []
+    words = ["scenario=delaybench/crowded", "delay.obs={law: uniform, low: 1, high: 7}", "aware=timeline"]
+    config, rows = settings(*words), []
     for seed in range(8, 13):
         run = tmp_path / "runs" / "crowded" / "1-7" / "mine" / f"seed_{seed}"
         run.mkdir(parents=True)
-        record = {"damian": "0.18.0", "commit": "abc", "command": "damian compare", "wall_time_s": 1.0}
+        save_config(config, run)
+        overrides = ["logger=csv", *words, f"seed={seed}"]
+        record = {"damian": "0.18.0", "commit": "abc", "overrides": overrides, "wall_time_s": 1.0}
         (run / "run.json").write_text(json.dumps(record))
         evaluated = {"policy": "trained", "return": 20.0 + seed, "episodes": 200.0}
         write_csv(run / "result.csv", pd.DataFrame([evaluated]))
@@ -46,6 +52,8 @@ def test_a_submission_holds_what_the_evaluations_of_the_runs_found(folder, capsy
     rows = read_csv(Path("mine.csv"), text=WORDS)
     assert rows["return"].tolist() == [28, 29, 30, 31, 32]
     assert set(rows["parameters"]) == {12}
+    one = "scenario=delaybench/crowded 'delay.obs={law: uniform, low: 1, high: 7}' aware=timeline"
+    assert set(rows["settings"]) == {one}
     table = leaderboard([rows], ["1-7", "4"])
     assert "## crowded, late data" in table
     assert "| mine | 30.0 [" in table
@@ -60,11 +68,28 @@ def test_a_submission_without_the_folders_of_its_runs_is_refused(folder, capsys)
 
 
 @pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("frames", 20000, "seed_8: frames: 20000 is not 1000000, as the task has it"),
+        ("source", {"level_db": 120.0}, "seed_8: source.level_db: 120.0 is not 145"),
+    ],
+)
+def test_a_submission_of_another_task_is_refused(folder, capsys, key, value, told):
+    path = folder / "crowded/1-7/mine/seed_8/config.yaml"
+    config = yaml.safe_load(path.read_text())
+    config[key] = config[key] | value if isinstance(value, dict) else value
+    path.write_text(yaml.safe_dump(config))
+    with pytest.raises(SystemExit):
+        main(SUBMIT)
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("column", "value", "told"),
     [
-        ("seed", range(5), "seed: [0, 1, 2, 3, 4] are not 5 or more from 8 on"),
+        ("seed", range(5), "seed: [0, 1, 2, 3, 4] are too few, or too small: run compare again"),
         ("seed", 8, "are not all different"),
-        ("task", "mine", "mine.csv: task: mine"),
+        ("task", "crowded_mini", "task: crowded_mini is not of the leaderboard: train in one that is"),
         ("regime", "R0", "mine.csv: regime: R0"),
         ("commit", "abc+changes", "has changes: commit them"),
         ("commit", "", "commit: it is empty"),
@@ -86,13 +111,13 @@ def test_every_submission_of_the_leaderboard_is_whole():
 
 
 @pytest.mark.slow
-def test_a_comparison_is_submitted(tmp_path, monkeypatch):
+def test_a_comparison_of_few_steps_is_refused(tmp_path, monkeypatch, capsys):
     """As docs/delaybench.md tells it, with a few steps."""
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("damian.runs.run_record.commit", lambda: "abc")  # files may change meanwhile
-    small = "['frames=64','worlds=2','learner.steps=8','eval_episodes=100','episode.max_steps=2']"
-    what = ["tasks=[crowded]", "delays=['1-7']", "methods=[undelayed,timeline]", f"overrides={small}"]
-    main(["compare", "experiment=delaybench", "seeds=5", *what, f"hydra.run.dir={tmp_path}/runs"])
+    small = "['frames=64','worlds=2','learner.steps=8','eval_episodes=100']"
+    what = ["tasks=[crowded]", "delays=['1-7']", "methods=[timeline]", f"overrides={small}", "seeds=5"]
+    main(["compare", "experiment=delaybench", *what, f"hydra.run.dir={tmp_path}/runs"])
     monkeypatch.chdir(tmp_path)
-    main(["submit", "folder=runs", "method=timeline", "authors=A. Author"])
-    assert len(read_csv(Path("timeline.csv"), text=WORDS)) == 10  # of three UAVs, and flown with four
+    with pytest.raises(SystemExit):
+        main(["submit", "folder=runs", "method=timeline", "authors=A. Author"])
+    assert "frames: 64 is not 1000000, as the task has it" in capsys.readouterr().err
