@@ -72,7 +72,7 @@ def test_a_mistake_is_one_line_and_leaves_no_folder(capsys, tmp_path, monkeypatc
     assert (stop.value.code, printed.out) == (2, "")
     assert printed.err.count("\n") == 1
     assert printed.err.startswith(f"error: {message}")
-    assert [*tmp_path.glob("*/*")] == []
+    assert (tmp_path.exists(), [*tmp_path.glob("*/*")]) == (True, [])
 
 
 def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, monkeypatch):

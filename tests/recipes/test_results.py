@@ -27,13 +27,6 @@ def test_results_are_utf_8_whatever_the_locale_and_shown_also_where_it_lacks_a_l
     assert "| \\u0141\\u0105ka |" in done.stdout
 
 
-@pytest.mark.slow
-def test_a_refusal_leaves_the_empty_folder_that_it_was_told_in(tmp_path):
-    command = [sys.executable, "-c", "from damian.recipes.command import main; main()", "results", "nowhere"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, tmp_path.exists()) == (2, True), done.stderr
-
-
 def test_results_of_a_comparison_are_rows():
     folder = Path(__file__).parents[2] / "docs" / "results" / "delaybench"
     assert {*damian.results(folder)["method"]} >= {"undelayed", "backupdate"}
