@@ -12,7 +12,7 @@ until its effect is seen or its acknowledgement has come.
 | accept | nothing | the service confirms: *guided*; or refuses: *ground* | 30 s: *ground* |
 | guided | mode GUIDED | the vehicle says so: *arm* | 15 s: *landing* |
 | arm | motors on | the vehicle says so: *climb* | 15 s: *landing* |
-| climb | takeoff | it is as high as told: *cruise* | 20 s without a metre more: *landing* |
+| climb | takeoff | it is as high as told: *cruise* | 30 s, and 2 s for each metre: *landing* |
 | cruise | reposition, then speed | it is slow at its goal: *landing* | twice as told, and 60 s: *landing* |
 | landing | land; or motors off | it is on the ground, its motors off: *ground* | 30 s there: *watch* |
 | watch | nothing; reports on the ground | the pilot hands over: *join* | |
@@ -22,8 +22,7 @@ until its effect is seen or its acknowledgement has come.
 the vehicle, and before the flight a refusal or a failsafe, lead to *watch* from every state; so does what has
 changed while the bridge was off. **To hand over again**, the pilot switches the vehicle from another mode to
 GUIDED, on the ground with its motors off. An operator's hold leads from each state of a flight to *landing*;
-a missing answer of the service ends none. In a state that lasts, the log says after 30 s what is waited for,
-then after twice as long, and so on.
+a missing answer of the service ends none. In a state that lasts, the log says every 30 s what is waited for.
 """
 
 import logging
@@ -31,9 +30,11 @@ import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel
+
+from damian_fleet.rows import Advice
 
 os.environ.setdefault("MAVLINK20", "1")
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -53,7 +54,9 @@ STEADY = 10.0  # ... counts after so long there [s]
 FALL = 3.0  # descent above which a vehicle whose motors go off has fallen, not landed [m/s]
 GRACE = 3.0  # what was refused may have been done before: its effect counts for so long [s]
 QUIET = 10.0  # a command does not come later than this [s]
-LIMITS = {"accept": 30.0, "guided": 15.0, "arm": 15.0, "climb": 20.0, "landing": 30.0}
+RETRY = 2.0  # after which a command that nobody has acknowledged is sent again [s]
+WORD = 30.0  # how often the log says what a state waits for [s]
+LIMITS = {"accept": 30.0, "guided": 15.0, "arm": 15.0, "landing": 30.0}
 """Longest times in states [s], as the table of states says."""
 MOTORS = dict.fromkeys(("join", "ground", "accept", "guided"), False) | {"climb": True, "cruise": True}
 """Whether the motors are on in a state, unless somebody else has a hand in it."""
@@ -62,18 +65,21 @@ FAILSAFES = (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
 INTERVALS = {"GLOBAL_POSITION_INT": (33, 0.25), "EXTENDED_SYS_STATE": (245, 0.5), "SYS_STATUS": (1, 1.0)}
 INTERVALS |= {"GPS_RAW_INT": (24, 1.0), "BATTERY_STATUS": (147, 2.0)}
 """Messages that it asks for while they do not come: their numbers, and the time between two [s]."""
-Take = Callable[[int | None, Any], None]
-"""Takes the status and the content of an answer; None and {} of a missing one."""
 _LOG = logging.getLogger("damian_mavlink")
 
 
 class Request(NamedTuple):
-    """A request to the service; its answer has the same ``number``."""
+    """A request to the service; its answer has the same ``number``.
+
+    ``take`` gets the status and the content of an answer that came at all; it was asked ``at`` a time [s].
+    """
 
     method: str
     path: str
-    body: Any
-    number: int
+    body: Any = None
+    take: Callable[[int, Any], None] = lambda status, body: None
+    number: int = 0
+    at: float = 0.0
 
 
 class Answer(NamedTuple):
@@ -84,26 +90,6 @@ class Answer(NamedTuple):
     number: int
 
 
-class Told(BaseModel):
-    """What the service tells the UAV; what does not fit counts as a missing answer."""
-
-    model_config = ConfigDict(allow_inf_nan=False)
-    answer: str | None
-    state: Literal["fly", "hold", "return", "bound", "none"]
-    reason: str | None = None
-    lat: float | None = Field(None, ge=-90, le=90)
-    lon: float | None = Field(None, ge=-180, le=180)
-    altitude: float | None = Field(None, gt=0, le=1000)
-    speed: float | None = Field(None, gt=0)
-    duration: float | None = Field(None, ge=0)
-
-    @model_validator(mode="after")
-    def _leads_somewhere(self) -> "Told":
-        if self.state not in ("hold", "none") and None in (self.answer, self.lat, self.lon, self.altitude):
-            raise ValueError("a flight needs answer, lat, lon and altitude")
-        return self
-
-
 class Memory(BaseModel):
     """What a bridge that is started again must know."""
 
@@ -111,30 +97,12 @@ class Memory(BaseModel):
     number: int = 0  # of the next report
     state: str = ""  # of the bridge
     mode: int = -1  # in which the vehicle was in this state, by command of the bridge or before
-    goal: Told | None = None  # what it has accepted and not ended
+    goal: Advice | None = None  # what it has accepted and not ended
     taken_off: bool = False  # to that goal
     stops: list[tuple[float, float]] = []  # where it landed, or held, newest first [deg] ...
     landed: list[float] = []  # ... and when [s since 1970]
     motions: int = 0  # decisions since it last detected the source before
-
-
-class Offset:
-    """How far another clock is ahead of one's own [s], by questions and answers.
-
-    Worked timeline: asked at 10.0 s, answered 1000.2 s, came in at 10.4 s: the other clock is 990 s ahead,
-    give or take 0.2 s. A later answer counts if it came as fast, contradicts the one that counts (a clock was
-    set), or if that is older than 5 minutes (clocks drift).
-    """
-
-    def __init__(self) -> None:
-        self.ahead, self.trip, self._at = math.nan, math.inf, -math.inf
-
-    def note(self, other: float, sent: float, now: float) -> None:
-        """Note what the other clock said to a question sent then and answered now [s]."""
-        trip, ahead = now - sent, other - (sent + now) / 2
-        contradicts = abs(ahead - self.ahead) > (trip + self.trip) / 2 + 0.1
-        if trip <= self.trip or contradicts or now > self._at + 300:
-            self.ahead, self.trip, self._at = ahead, trip, now
+    outbox: list[tuple[str, dict[str, Any]]] = []  # what the service must be told: paths and bodies
 
 
 def way(origin: Sequence[float], goal: Sequence[float]) -> tuple[float, float]:
@@ -157,7 +125,6 @@ class Bridge:
         uav: ID of the UAV at the service.
         fleet: name of its fleet there.
         uavs: the UAVs with which the fleet is created if there is none.
-        period: time between two reports of a vehicle on the ground [s]; a step of the service if not given.
         listen: how long a landed vehicle listens before it reports [s].
         system: MAVLink system of the vehicle; the first copter that is heard if not given.
         memory: that of an earlier bridge of this vehicle.
@@ -168,13 +135,13 @@ class Bridge:
         uav: str,
         fleet: str,
         uavs: Sequence[str] = (),
-        period: float | None = None,
         listen: float = 0.0,
         system: int | None = None,
         memory: Memory | None = None,
     ) -> None:
         self.uav, self.path, self.uavs = uav, f"/fleets/{fleet}", [*uavs] or [uav]
-        self._period, self.period, self.listen = period, period or 5.0, listen
+        self.period, self.listen = 5.0, listen
+        """``period``: between two reports of a vehicle on the ground [s]; a step of the service."""
         self.memory = memory or Memory()
         self.memory.system = system or self.memory.system
         self.state, self.leaving = "connect", False
@@ -184,31 +151,29 @@ class Bridge:
         self.mode, self.height, self.battery, self.time = -1, 0.0, None, math.nan
         self.armed = self.on_ground = self.in_air = self.is_linked = False
         self.is_ready = True
-        self.service, self.vehicle = Offset(), Offset()
-        """Clocks: [s since 1970] of the service, and [s] since the boot of the vehicle."""
+        self.ahead, self._trip, self._timed = math.nan, math.inf, -math.inf
+        """How far the clock of the service is ahead [s]; how long that answer took [s], and when it came."""
         self.seen: dict[str, Any] = {}
         """The newest messages of the vehicle by their types."""
         self.here: tuple[float, float] | None = None
         """Where the vehicle was at last [deg]."""
-        self.now = self._since = self._placed = self._place_at = self._steady = -math.inf
+        self.now = self._since = self._place_at = self._steady = self._reported = -math.inf
         self._retry = self._asked_at = self._landed_at = self._commanded = -math.inf
-        self._patience, self._top, self._down, self._number, self._uptime = 30.0, -math.inf, math.inf, 0, 0
+        self._down, self._number, self._uptime = math.inf, 0, 0
         self._came: dict[str, float] = {}
         self._due: dict[str, float] = {}
         self._raw: tuple[tuple[float, float], float] = ((0.0, 0.0), -math.inf)
         self._falls: deque[tuple[float, float]] = deque()
         self._levels: dict[int, tuple[float, int]] = {}
-        self._questions: deque[int] = deque(maxlen=32)
         self._sent: dict[int, float] = {}
         self._results: dict[int, tuple[bool, float]] = {}
         self._is_flying = not self.memory.stops or self.memory.taken_off
         self._was_linked = self._has_booted = self._has_joined = self._is_other = False
         self._spotted = self._was_spotted = False
-        self._track = self._turned = self._boot = self._reported = self._held = None
-        self._offer: Told | None = None
-        self._pending: tuple[Request, Take, float] | None = None
-        self._wish: tuple[str, str, Any, Take] | None = None
-        self._outbox: deque[tuple[str, dict[str, Any]]] = deque()
+        self._track = self._turned = self._held = None
+        self._offer: Advice | None = None
+        self._pending: Request | None = None
+        self._wish: Request | None = None
         self._fresh_from = self.memory.number
         self._out: list[Any] = []
 
@@ -218,7 +183,8 @@ class Bridge:
         """Take what has come, and return the messages and requests to send; ``now`` [s] never goes back."""
         if self.state == "left":
             return [], []
-        self._since = now if self._since == -math.inf else self._since
+        if self._since == -math.inf:
+            self._since, self._due["word"] = now, now + WORD
         self.now, self._out, self._wish = now, [], None
         for message in messages:
             self._hear(message)
@@ -226,7 +192,6 @@ class Bridge:
         if self.is_linked != self._was_linked:
             self._was_linked = self.is_linked
             self._say("the vehicle is heard" if self.is_linked else "the vehicle is not heard any more")
-            self._since = now if self.state == "climb" else self._since
             self._need_fresh()
         if self.is_linked:
             self._is_flying = self._is_flying or self.in_air
@@ -238,14 +203,13 @@ class Bridge:
         if self.state in ("connect", "join") or (self.is_linked and self.state != "left"):
             getattr(self, f"_{self.state}")()
         self._keep_in_touch()
-        if self.now >= self._since + self._patience:
+        if self._is_due("word", WORD):
             lost = "" if self.is_linked else "the vehicle is not heard; "
             self._say(f"{self.state} for {self.now - self._since:.0f} s: {lost}{self.why}")
-            self._patience *= 2
         return self._out, self._talk()
 
-    def _say(self, text: str, level: int = logging.INFO) -> None:
-        _LOG.log(level, "%s: %s", self.uav, text)
+    def _say(self, text: str) -> None:
+        _LOG.info("%s: %s", self.uav, text)
 
     def _is_due(self, what: str, period: float) -> bool:
         """Whether something is due, which then is so again after a period [s]."""
@@ -259,7 +223,7 @@ class Bridge:
     def _look(self) -> None:
         """What the newest messages say."""
         seen, low = self.seen, mavlink.MAV_LANDED_STATE_ON_GROUND
-        self.time = self.now + self.service.ahead
+        self.time = self.now + self.ahead
         levels = [left for at, left in self._levels.values() if left >= 0 and self.now < at + 30]
         self.battery = min(levels, default=None)
         is_heard = self.now < self._came.get("HEARTBEAT", -math.inf) + SILENCE  # else the mode is of long ago
@@ -273,9 +237,8 @@ class Bridge:
             self.in_air = not self.on_ground and (said > low or (self.armed and self.height > 1))
         if "SYS_STATUS" in seen:  # which may tell of the checks before arming
             status, bit = seen["SYS_STATUS"], mavlink.MAV_SYS_STATUS_PREARM_CHECK
-            self.is_ready = bool(
-                (~status.onboard_control_sensors_present | status.onboard_control_sensors_health) & bit
-            )
+            passed = ~status.onboard_control_sensors_present | status.onboard_control_sensors_health
+            self.is_ready = bool(passed & bit)
 
     def _hear(self, message: Any) -> None:
         """Take a message, if it is one of the vehicle."""
@@ -302,17 +265,10 @@ class Bridge:
         elif kind == "COMMAND_ACK":
             self._hear_result(message)
         elif kind in ("SYS_STATUS", "BATTERY_STATUS"):
-            self._levels[getattr(message, "id", -1)] = self.now, message.battery_remaining
-        elif kind == "TIMESYNC" and message.tc1 and message.ts1 in self._questions:  # and none of others
-            self._hear_uptime(message.tc1 / 1e9, message.ts1 / 1e9)
+            battery = message.id if kind == "BATTERY_STATUS" else -1  # ``id`` of another message is its own
+            self._levels[battery] = self.now, message.battery_remaining
         elif kind == "STATUSTEXT":
             self._say(f"the vehicle says (severity {message.severity}): {message.text}")
-
-    def _hear_uptime(self, uptime: float, asked: float) -> None:
-        if uptime < self._uptime - 10:  # and no older message
-            self._has_booted, self.vehicle = True, Offset()
-        self._uptime = uptime
-        self.vehicle.note(uptime, asked, self.now)
 
     def _is_copter(self, heartbeat: Any) -> bool:
         if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and heartbeat.type in COPTERS:
@@ -320,17 +276,19 @@ class Bridge:
         names = name_of("MAV_AUTOPILOT", heartbeat.autopilot), name_of("MAV_TYPE", heartbeat.type)
         self.why = f"{', '.join(names)} is no copter with ArduPilot, and is refused"
         if self._is_due("refused", 60):
-            self._say(self.why, logging.ERROR)
+            self._say(self.why)
         return False
 
     def _hear_position(self, message: Any) -> None:
         """Take a position if it is one: no sentinel, after a fix, no jump."""
         place, fix = (message.lat / 1e7, message.lon / 1e7), self.seen.get("GPS_RAW_INT")
+        self._has_booted |= message.time_boot_ms < self._uptime - 2000
+        self._uptime = message.time_boot_ms
         self._falls.append((self.now, message.vz / 100))
         while self._falls[0][0] < self.now - 3:
             self._falls.popleft()
         is_none = max(map(abs, place)) < 1e-3 or abs(place[0]) > 90 or abs(place[1]) > 180
-        if is_none or (fix is not None and fix.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX):
+        if is_none or fix is None or fix.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self.why = "no position of the vehicle" if self.here is None else self.why
             return
         (before, at), self._raw = self._raw, (place, self.now)
@@ -341,8 +299,7 @@ class Bridge:
             if self._is_due("jump", 10):
                 self._say(f"a position is {away:.0f} m away at once, and not taken")
             return
-        self._placed = self.now if self.here is None else self._placed
-        self.here, self._place_at, self._boot = place, self.now, message.time_boot_ms
+        self.here, self._place_at = place, self.now
 
     # Commands.
 
@@ -359,7 +316,7 @@ class Bridge:
         """Send a command, and again until there is a result; returns whether it was accepted."""
         if command in self._results:
             return self._results[command][0]
-        if self.now < self._sent.get(command, -math.inf) + 1.0 + 1.5 * min(self.vehicle.trip, 2.0):
+        if self.now < self._sent.get(command, -math.inf) + RETRY:
             return False
         self._sent[command] = self._commanded = self.now
         own, target = (*params, *[0.0] * 7)[:7], (self.memory.system, AUTOPILOT)
@@ -377,12 +334,10 @@ class Bridge:
         return not is_accepted and self.now > at + GRACE
 
     def _keep_in_touch(self) -> None:
-        """Heartbeats, the clock of the vehicle, and the messages that do not come."""
+        """Heartbeats, and the messages that do not come."""
         if self._is_due("heartbeat", 1.0):
             kind, none = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
             self._out.append(mavlink.MAVLink_heartbeat_message(kind, none, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
-            self._questions.append(int(self.now * 1e9))
-            self._out.append(mavlink.MAVLink_timesync_message(0, self._questions[-1]))
         if self.memory.system is None or not self._is_due("intervals", SILENCE):
             return
         for kind, (number, interval) in INTERVALS.items():
@@ -394,54 +349,60 @@ class Bridge:
 
     def _talk(self) -> list[Request]:
         """The next request, one at a time: the time, what has happened, then what the state wants."""
-        if self._pending is not None and self.now > self._pending[2] + TIMEOUT:
-            self._hear_answer(Answer(None, None, self._pending[0].number))
+        if self._pending is not None and self.now > self._pending.at + TIMEOUT:
+            self._hear_answer(Answer(None, None, self._pending.number))
         if self._pending is not None or self.now < self._retry:
             return []
-        if self._is_due("time", 1.0 if math.isnan(self.service.ahead) else 10.0):
-            self._wish = "GET", "/time", None, self._hear_time
-        elif self._outbox:
-            self._wish = "POST", self.path + self._outbox[0][0], self._outbox[0][1], self._hear_delivery
+        if self._is_due("time", 1.0 if math.isnan(self.ahead) else 10.0):
+            self._wish = Request("GET", "/time", None, self._hear_time)
+        elif self.memory.outbox:
+            path, body = self.memory.outbox[0]
+            self._wish = Request("POST", self.path + path, body, self._hear_delivery)
         if self._wish is None:
             return []
         self._number += 1
-        self._pending = Request(*self._wish[:3], self._number), self._wish[3], self.now
-        return [self._pending[0]]
+        self._pending = self._wish._replace(number=self._number, at=self.now)
+        return [self._pending]
 
     def _hear_answer(self, answer: Answer) -> None:
         """Take an answer; an error of the service, or what is not as it should be, is a missing one."""
-        if self._pending is None or answer.number != self._pending[0].number:
+        request = self._pending
+        if request is None or answer.number != request.number:
             return
-        request, take, self._asked_at = self._pending
-        self._pending = None
+        self._pending, self._asked_at = None, request.at
         known = (200, 201, 400, 409, 413, 422, 404 if request.method == "GET" else 200)
-        is_said, problem = answer.status in known and isinstance(answer.body, dict), f"status {answer.status}"
         try:
-            take(*((answer.status, answer.body) if is_said else (None, {})))
+            if answer.status not in known or not isinstance(answer.body, dict):
+                raise ValueError(f"status {answer.status}")
+            request.take(answer.status, answer.body)
         except (LookupError, TypeError, ValueError, AttributeError) as error:
-            is_said, problem = False, " ".join(str(error).split())[:200]
-            take(None, {})
-        if not is_said:
             self._retry = self.now + 1.0
             if self._is_due("no service", 10):
-                said = f"no answer of the service to {request.method} {request.path} ({problem})"
-                self._say(said, logging.WARNING)
+                problem = " ".join(str(error).split())[:200]
+                self._say(f"no answer of the service to {request.method} {request.path} ({problem})")
 
-    def _hear_time(self, status: int | None, body: dict[str, Any]) -> None:
-        if status is not None:
-            if not 0 < (said := float(body["time"])) < 4e9:
-                raise ValueError
-            self.service.note(said, self._asked_at, self.now)
+    def _hear_time(self, _: int, body: dict[str, Any]) -> None:
+        """Note how far the clock of the service is ahead, as of the middle of the trip.
 
-    def _hear_delivery(self, status: int | None, body: dict[str, Any]) -> None:
-        if status is not None:
-            path, _ = self._outbox.popleft()
-            if status >= 400:
-                self._say(f"the service refuses {path}: {body.get('error')}", logging.WARNING)
+        Worked timeline: asked at 10.0 s, answered 1000.2 s, came in at 10.4 s: it is 990 s ahead, give or
+        take 0.2 s. A later answer counts if it came as fast, contradicts the one that counts (a clock was
+        set), or if that is older than 5 minutes (clocks drift).
+        """
+        if not 0 < (said := float(body["time"])) < 4e9:
+            raise ValueError(f"{said} is no time [s since 1970]")
+        trip, ahead = self.now - self._asked_at, said - (self._asked_at + self.now) / 2
+        contradicts = abs(ahead - self.ahead) > (trip + self._trip) / 2 + 0.1
+        if trip <= self._trip or contradicts or self.now > self._timed + 300:
+            self.ahead, self._trip, self._timed = ahead, trip, self.now
+
+    def _hear_delivery(self, status: int, body: dict[str, Any]) -> None:
+        path, _ = self.memory.outbox.pop(0)
+        if status >= 400:
+            self._say(f"the service refuses {path}: {body.get('error')}")
 
     def _say_fact(self, answer: str | None, status: str) -> None:
         """Tell the service, as soon as it is reached, what has happened."""
-        self._outbox.append(("/acknowledgements", {"ID": self.uav, "answer": answer, "status": status}))
+        self.memory.outbox.append(("/acknowledgements", {"ID": self.uav, "answer": answer, "status": status}))
 
     def _need_fresh(self) -> None:
         """Before it asks again, it reports."""
@@ -451,29 +412,27 @@ class Bridge:
     def _report(self) -> None:
         """Report what the newest telemetry says, unless that has been reported."""
         memory, flies = self.memory, self.in_air
-        if math.isnan(self.time) or self.here is None or self._boot is None or self._boot == self._reported:
+        if math.isnan(self.time) or self.here is None or self._place_at <= self._reported:
             return
-        measured = self._boot / 1e3 - self.vehicle.ahead
-        at = self._place_at if math.isnan(measured) else min(measured, self.now)
         memory.number = memory.number or int(self.time)  # larger than that of a bridge whose memory is lost
-        row = {"ID": self.uav, "number": memory.number, "time": at + self.service.ahead}
+        row = {"ID": self.uav, "number": memory.number, "time": self._place_at + self.ahead}
         row |= {"lat": self.here[0], "lon": self.here[1], "FLA": self.height, "on ground": int(not flies)}
         row |= {"battery": self.battery, "source spotted": int(self._spotted and not flies)}
         row |= {"track": self._track, "takeoff-landing time": self._turned}
         row |= {"previous": memory.stops[1:], "landed": memory.landed, "motions": memory.motions}
-        self._was_spotted, self._reported = self._spotted and not flies, self._boot
+        self._was_spotted, self._reported = self._spotted and not flies, self._place_at
         memory.number += 1
-        self._outbox.append(("/reports", row))
+        memory.outbox.append(("/reports", row))
 
     def _report_in_turn(self) -> None:
-        if self._boot != self._reported and not self._outbox and self._is_due("report", self.period):
+        if self._place_at > self._reported and not self.memory.outbox and self._is_due("report", self.period):
             self._report()
 
-    def _want(self, period: float, take: Take, method: str, path: str, body: Any = None) -> None:
+    def _want(self, period: float, take: Any, method: str, path: str, body: Any = None) -> None:
         """Request something once in a period, if nothing else is under way."""
-        is_free = self._pending is None is self._wish and self.now >= self._retry and not self._outbox
+        is_free = self._pending is None is self._wish and self.now >= self._retry and not self.memory.outbox
         if is_free and self._is_due("want", period):
-            self._wish = method, self.path + path, body, take
+            self._wish = Request(method, self.path + path, body, take)
 
     def _ask(self) -> None:
         """Ask for advice, after a fresh report."""
@@ -483,11 +442,13 @@ class Bridge:
             period = min(self.period / 4, 1.0) if self.state == "ground" else min(self.period, 2.0)
             self._want(period, self._hear_advice, "POST", "/advice", {"uavs": [self.uav]})
 
-    def _hear_advice(self, status: int | None, body: dict[str, Any]) -> None:
-        if status is None or status >= 400:
-            self.why = f"the service says {body.get('error')}" if status else self.why
+    def _hear_advice(self, status: int, body: dict[str, Any]) -> None:
+        if status >= 400:
+            self.why = f"the service says {body.get('error')}"
             return
-        told, goal = Told.model_validate(body["advice"][0]), self.memory.goal
+        told, goal = Advice.model_validate(body["advice"][0]), self.memory.goal
+        if told.state not in ("hold", "none") and None in (told.answer, told.lat, told.lon, told.altitude):
+            raise ValueError("a flight needs answer, lat, lon and altitude")
         is_new = told.answer not in (None, self._held, goal and goal.answer)
         if self.state == "ground":
             self.why = f"it is told {told.state}" + (f" because {told.reason}" if told.reason else "")
@@ -496,11 +457,10 @@ class Bridge:
                 self._turn("accept", f"the service to confirm {told.state} {told.answer}")
         elif goal is not None and is_new and told.state == "hold":
             self._say_fact(told.answer, "accepted")
-            self._end("aborted")
             self._turn("landing", f"it is told to hold because {told.reason}")
 
-    def _hear_confirmation(self, status: int | None, body: dict[str, Any]) -> None:
-        if status is None or self._offer is None or self.here is None:
+    def _hear_confirmation(self, status: int, body: dict[str, Any]) -> None:
+        if self._offer is None or self.here is None:
             return
         told, come = self._offer, body["status"][0] if status < 400 else "refused"
         self._offer = None
@@ -523,10 +483,10 @@ class Bridge:
     def _turn(self, state: str, why: str) -> None:
         """Go over to another state, which waits for something."""
         self._say(f"{self.state} -> {state}: {why}")
-        self.state, self.why, self._since, self._patience = state, why, self.now, 30.0
+        self.state, self.why, self._since, self._due["word"] = state, why, self.now, self.now + WORD
         self.memory.state, self.memory.mode = state, self.mode
         self._sent, self._results = {}, {}
-        self._top, self._down, self._is_other = -math.inf, math.inf, False
+        self._down, self._is_other = math.inf, False
         self._due.pop("want", None)
 
     def _act_of_pilot(self) -> str:
@@ -552,18 +512,19 @@ class Bridge:
 
     def _hands_off(self, reason: str) -> None:
         """The pilot has it."""
-        self._say(f"the pilot has it: {reason}", logging.WARNING)
         if self._offer is not None:
             self._say_fact(self._offer.answer, "aborted")
             self._offer = None
         self._end()
-        self._turn("watch", f"a pilot to land it, and to hand over by GUIDED with its motors off ({reason})")
+        self._turn("watch", f"{reason}: a pilot to land it, and to hand over by GUIDED with its motors off")
 
     def _check_limit(self) -> None:
         """End what has taken too long."""
         goal, lasting, limit = self.memory.goal, self.now - self._since, LIMITS.get(self.state, math.inf)
-        if self.state == "cruise" and goal is not None:
-            limit = 2 * (goal.duration or 60.0) + 60
+        if self.state == "climb":
+            limit = 30 + 2 * goal.altitude
+        elif self.state == "cruise":
+            limit = 60 + 2 * (goal.duration or 60.0)
         if self.state == "landing":
             if self.now > self._down + limit:
                 self._hands_off(f"motors on, on the ground for {limit:.0f} s")
@@ -572,14 +533,14 @@ class Bridge:
             state = "ground" if self.state == "accept" else "landing"
             self._turn(state, f"not within {limit:.0f} s: {self.why}")
 
-    def _end(self, how: str = "") -> None:
-        """End the flight in hand and say how: by where the vehicle stands, if not given."""
+    def _end(self) -> None:
+        """End the flight in hand, and say how by where the vehicle stands."""
         goal, memory = self.memory.goal, self.memory
         if goal is None or self.here is None:
             return
         away = way(self.here, (goal.lat, goal.lon))[0]
         is_there = memory.taken_off and self.on_ground and away <= THERE
-        how = how or ("landed" if is_there else "aborted")
+        how = "landed" if is_there else "aborted"
         self._say(f"{goal.answer} {how}, {away:.0f} m from its goal")
         self._say_fact(goal.answer, how)
         memory.goal, memory.taken_off = None, False
@@ -604,9 +565,7 @@ class Bridge:
         if "HEARTBEAT" not in self.seen or self.here is None or not (self.on_ground or self.in_air):
             return
         state, mode, is_told = self.memory.state, self.memory.mode, self.memory.goal is not None
-        if self.battery is None and self.now < self._placed + 10:
-            self.why = "no battery tells its level"
-        elif state in ("watch", "cruise", "landing") or (is_told and self.in_air):
+        if state in ("watch", "cruise", "landing") or (is_told and self.in_air):
             self._turn(state, "on as before")
             self.memory.mode = mode  # what has changed since, somebody else has done
         elif state == "climb" and self.on_ground and not self.armed:
@@ -622,23 +581,24 @@ class Bridge:
     def _join(self) -> None:
         self._want(1.0, self._hear_fleet, "GET", "")
 
-    def _hear_fleet(self, status: int | None, body: dict[str, Any]) -> None:
+    def _hear_fleet(self, status: int, body: dict[str, Any]) -> None:
         """Create the fleet, join it, or go on as its member."""
         if status == 404:
-            self._wish = "PUT", self.path, {"uavs": self.uavs}, self._hear_change
+            self._wish = Request("PUT", self.path, {"uavs": self.uavs}, self._hear_change)
         elif status == 200 and not self._has_joined and self.uav not in [row["ID"] for row in body["uavs"]]:
-            self._wish = "POST", f"{self.path}/uavs", {"join": [self.uav]}, self._hear_change
+            self._wish = Request("POST", f"{self.path}/uavs", {"join": [self.uav]}, self._hear_change)
         elif status == 200 and self.state == "join" and self.is_linked:
-            self._has_joined, self.period = True, self._period or float(body["dt"])
+            self._has_joined, self.period = True, float(body["dt"])
             self._turn("ground", "a report to be taken")
 
     def _leave(self) -> None:
         self._want(1.0, self._hear_change, "POST", "/uavs", {"leave": [self.uav]})
 
-    def _hear_change(self, status: int | None, body: dict[str, Any]) -> None:
-        if status is not None:
-            self._has_joined, self.why = True, f"the service says {body.get('error', 'welcome')}"
-            self._turn("join" if self.state == "join" else "left", self.why)
+    def _hear_change(self, _: int, body: dict[str, Any]) -> None:
+        self._has_joined = True
+        self._turn(
+            "join" if self.state == "join" else "left", f"the service says {body.get('error', 'welcome')}"
+        )
 
     def _ground(self) -> None:
         if self.in_air:
@@ -662,9 +622,7 @@ class Bridge:
         """Command something before the flight; what is refused gives the vehicle back."""
         if self._is_refused(command):
             self._hands_off(f"{name_of('MAV_CMD', command)} is refused")
-        elif (
-            self.now < self._came["GLOBAL_POSITION_INT"] + 1
-        ):  # it tells of itself, so that its acts are seen
+        elif self.now < self._came["GLOBAL_POSITION_INT"] + 1:  # so that acts of others are seen
             self._command(command, *params)
             self._ask()
 
@@ -678,8 +636,6 @@ class Bridge:
 
     def _climb(self) -> None:
         goal, memory = self.memory.goal, self.memory
-        if self.height > self._top + 1:
-            self._top, self._since = self.height, self.now
         if not self.in_air:
             self._change(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, goal.altitude)
         elif not memory.taken_off:

@@ -9,6 +9,7 @@ Worked timeline, an answer that holds for 10 s: at 100 s the UAV asks and is off
 service takes it to fly to that landing point. Without an acceptance by 110 s, it is taken to stay.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -26,20 +27,30 @@ from damian.field.node import Node
 from damian.field.rows import Report, Rows, validated, written
 from damian.world.battery import flight_drain
 from damian.world.vehicles import check_levels
-from damian_fleet.rows import MOST_UAVS, Acknowledgement, Advice, Change, Command, UavStatus, said_by
-from damian_fleet.rules import FieldRules
+from damian_fleet.rows import (
+    MOST_UAVS,
+    Acknowledgement,
+    Advice,
+    Asking,
+    Change,
+    Command,
+    FleetStatus,
+    UavStatus,
+    said_by,
+)
+from damian_fleet.settings import FleetConfig
 
 GRACE = 60.0
 """A UAV that stands elsewhere so long after twice the duration of its flight has ended that [s]."""
-SILENT_STEPS, REPLAYED_STEPS = 1000, 3600
-"""Steps without any report, and steps before a restart, after and before which beliefs begin anew."""
+MOST_STEPS = 3600
+"""Steps that are taken at once, or again after a restart; beliefs begin anew after earlier ones."""
 KEPT_REPORTS, KEPT_ANSWERS = 512, 64
 """Of a UAV: a late report changes what newer ones left open, and may be of a flight that is over."""
 REASONS = ("silent", "battery", "held", "returning", "aborted", "airborne", "conflict", "detour")
-"""Why a UAV is not told what the policy chooses: its newest report is too old; its battery is below the
-reserve, would be after the flight, or was never reported; a person holds it, or sends it home; it has aborted
-a flight without a report since, or flies without an answer; another UAV is in its way; the straight way there
-leaves the region, or crosses a zone."""
+"""Why a UAV is not told what the policy chooses: it stands, and its newest report is too old; its battery is
+below the reserve, would be after the flight, or was never reported; a person holds it, or sends it home; it
+has aborted a flight without a report since, or flies without an answer; another UAV is in its way; the
+straight way there leaves the region, or crosses a zone."""
 OFFERED, ACCEPTED, TAKEN_OFF, LANDED = "offered", "accepted", "taken off", "landed"
 """How far an answer has come; it never goes back."""
 REFUSED, ABORTED, LAPSED = "refused", "aborted", "lapsed"
@@ -65,9 +76,10 @@ class Waiting(InputError):
 class Decision:
     """What a UAV was told: to fly from a landing point, ``origin``, to ``goal``, or to hold if both are one.
 
-    Times and durations in seconds. ``action`` is a number, or distance and heading in [0, 1]; None if the
-    policy has not chosen it, but one of ``REASONS``. ``until`` is the end of the time in which it may be
-    accepted. ``since`` is the step up to which reports are older than what is known of it.
+    ``start`` is where it stood, east and north [m], maybe beside the landing point. Times and durations in
+    seconds. ``action`` is a number, or distance and heading in [0, 1]; None if the policy has not chosen it,
+    but one of ``REASONS``. ``until`` is the end of the time in which it may be accepted. ``since`` is the
+    step up to which reports are older than what is known of it.
     """
 
     step: int
@@ -75,7 +87,7 @@ class Decision:
     action: Any
     origin: int
     goal: int
-    level: float
+    start: tuple[float, float]
     duration: float
     until: float
     reason: str | None = None
@@ -121,11 +133,10 @@ class Uav:
 
     id: str
     level: float
-    home: int = 0
+    home: int | None = None
     command: str = ""
     answers: list[Decision] = field(default_factory=list)
     received: int = 0
-    late: int = 0
     duplicates: int = 0
 
     @property
@@ -159,8 +170,7 @@ class Fleet:
     Args:
         parts: gives the node and the policy for a number of UAVs; fleets may share them.
         uavs: the IDs of the UAVs, which book landing points in this order.
-        rules: what it holds to, whatever the policy chooses.
-        drawn: whether actions are drawn by ``seed``; if not, the most likely ones are taken.
+        config: what it holds to, whatever the policy chooses.
         mark: begins the IDs of answers.
         computed_from: time before which no step is computed [s], because the fleet is restored.
     """
@@ -169,32 +179,28 @@ class Fleet:
         self,
         parts: Callable[[int], tuple[Node, Policy]],
         uavs: Sequence[str],
-        rules: FieldRules,
-        drawn: bool = False,
-        seed: int = 0,
+        config: FleetConfig,
         mark: str = "",
         computed_from: float = 0.0,
     ) -> None:
-        self.parts, self.rules, self.drawn, self.seed, self.mark = parts, rules, drawn, seed, mark
-        self.computed_from, self.clock, self.n_answers, self.last_arrival = computed_from, 0.0, 0, 0
+        self.parts, self.config, self.mark = parts, config, mark
+        self.computed_from, self.clock, self.n_answers = computed_from, 0.0, 0
         self.uavs: dict[str, Uav] = {}
         self.joining: dict[str, UavLog] = {}
         """UAVs that join with their first report."""
-        self.left: set[str] = set()
         self._take_in(uavs)
         self.ground = self.node.ground
-        check_levels(self.rules.levels[: len(uavs)], self.node.simulation.airspace)
+        check_levels(self.config.levels[: len(uavs)], self.node.simulation.airspace)
 
     def _take_in(self, uavs: Sequence[str]) -> None:
         """Go on with these UAVs: the node, the policy and the tracker for so many."""
-        known, self.uavs = self.uavs, {}
-        self.uavs = {uav: known[uav] for uav in uavs if uav in known}
+        self.uavs = {uav: self.uavs[uav] for uav in uavs if uav in self.uavs}
         for uav in uavs:
             used = [each.level for each in self.uavs.values()]
-            level = min(self.rules.levels, key=lambda level: (used.count(level), level))
+            level = min(self.config.levels, key=lambda level: (used.count(level), level))
             self.uavs.setdefault(uav, Uav(uav, level))
         self.node, policy = self.parts(len(uavs))
-        self.tracker = Adviser(self.node, uavs, policy, self.drawn, standing=self._standing)
+        self.tracker = Adviser(self.node, uavs, policy, standing=self._standing)
 
     def members(self, uavs: Iterable[str] | None, key: str) -> list[Uav]:
         """UAVs of these IDs, or all, in the order of the fleet."""
@@ -205,22 +211,14 @@ class Fleet:
 
     # Time.
 
-    @property
-    def _is_computed(self) -> bool:
-        """Whether somebody may need what is known in this step."""
-        step = self.tracker.step
-        return self.tracker.step_of(self.computed_from) <= step <= self.last_arrival + SILENT_STEPS
-
     def advance(self, now: float) -> None:
-        """Take all steps up to an instant [s]."""
+        """Take all steps up to an instant [s], or skip them if they are too many or of before a restart."""
         self.clock, tracker = max(self.clock, now), self.tracker
-        while tracker.has_begun and tracker.step < (last := tracker.step_of(self.clock)):
-            if self._is_computed:
-                tracker.next_step()
-                continue
-            known_from = max(tracker.step_of(self.computed_from), tracker.step)
-            due = [each[0] for each in tracker.pending]
-            tracker.begin_anew(min([last, *due, *[known_from] * (known_from > tracker.step)]))
+        last = tracker.step_of(self.clock) if tracker.has_begun else tracker.step
+        if last > tracker.step and (self.clock < self.computed_from or last > tracker.step + MOST_STEPS):
+            tracker.begin_anew(last)
+        while tracker.step < last:
+            tracker.next_step()
 
     def _at(self, now: float) -> float:
         """The time of an event: that of the fleet never goes back."""
@@ -256,30 +254,29 @@ class Fleet:
             said.append({"ID": row.id, "answer": row.answer, "said": row.status, "status": status})
         return {"received": at, "acknowledged": said}
 
-    def commanded(self, command: Command, now: float) -> Event:
+    def commanded(self, said: Command, now: float) -> Event:
         """A person lets UAVs hold or return until they ``resume``."""
-        uavs = [uav.id for uav in self.members(command.uavs, "uavs")]
-        return {"received": self._at(now), "command": command.command, "uavs": uavs}
+        uavs = [uav.id for uav in self.members(said.uavs, "uavs")]
+        return {"received": self._at(now), "command": said.command, "uavs": uavs}
 
-    def changed(self, change: Change, now: float) -> Event:
-        """UAVs join with their first reports, and leave now; what is so already stays so."""
-        known = {*self.uavs, *self.joining}
-        join = [uav for uav in dict.fromkeys(change.join) if uav not in known]
-        leave = [uav for uav in dict.fromkeys(change.leave) if uav in known]
-        self.members({*change.leave} - known - self.left, "leave")
+    def changed(self, said: Change, now: float) -> Event:
+        """UAVs join with their first reports, and leave now."""
+        known = [*self.uavs, *self.joining]
+        join = [uav for uav in dict.fromkeys(said.join) if uav not in known]
+        leave = [uav for uav in known if uav in said.leave]
         n_uavs = len(known) - len(leave) + len(join)
-        if not {*self.uavs} - {*leave} or n_uavs > MOST_UAVS:
+        if {*self.uavs} <= {*leave} or n_uavs > MOST_UAVS:
             raise InputError(f"uavs: a fleet has 1 to {MOST_UAVS} UAVs: end it instead")
         self.parts(n_uavs)  # refuses another number of UAVs if the policy does
         return {"received": self._at(now), "join": join, "leave": leave}
 
-    def advised(self, asking: Sequence[str] | None, now: float) -> Event | None:
+    def advised(self, said: Asking, now: float) -> Event | None:
         """What UAVs are told that ask; None if that is what they have been told already.
 
         A UAV that is in danger is told to hold or to return instead; one that has an answer which still
         holds, or follows one, does not choose.
         """
-        asked, at = self.members(asking, "uavs"), self._at(now)
+        asked, at = self.members(said.uavs, "uavs"), self._at(now)
         self.advance(at)
         if not self.tracker.has_begun:
             waits = listed([uav for uav, log in self.tracker.logs.items() if log.newest is None])
@@ -289,29 +286,27 @@ class Fleet:
             if reason := self.danger(uav):
                 if not self._is_told(uav, reason):
                     found[uav.id] = self._instead(uav, reason)
-            elif not self._is_busy(uav, asking is None):
+            elif not self._is_busy(uav):
                 choosing.append(uav.id)
         if choosing:
             ready = zip(self.uavs, self.tracker.observe()[keys.READY][0].tolist(), strict=True)
             choosing = [uav for uav, is_ready in ready if is_ready and uav in choosing]
             found |= self._chosen(choosing) if choosing else {}
-        cleared = self._cleared([(uav, found[uav.id]) for uav in asked if uav.id in found])
-        return {"asked": at, "told": cleared} if cleared else None
+        told = self._cleared([(uav, found[uav.id]) for uav in asked if uav.id in found])
+        return {"received": at, "told": told} if told else None
 
     def _chosen(self, choosing: Sequence[str]) -> dict[str, Decision]:
         """What the policy chooses."""
-        action, before = self._ask(choosing), self.tracker.state(choosing)
-        mask = torch.tensor([[uav in choosing for uav in self.uavs]])
-        after = self.node.simulation.decide(before, action, mask)
-        columns = (each[0].tolist() for each in (action, before.goal, after.goal))
-        rows = zip(self.uavs.values(), *columns, strict=True)
-        return {uav.id: self._decision(uav, *row, None) for uav, *row in rows if uav.id in choosing}
+        action, mask = self.tracker.ask(choosing), torch.tensor([[uav in choosing for uav in self.uavs]])
+        goal = self.node.simulation.decide(self.tracker.state(choosing), action, mask).goal
+        rows = zip(self.uavs.values(), action[0].tolist(), goal[0].tolist(), strict=True)
+        return {uav.id: self._decision(uav, *row) for uav, *row in rows if uav.id in choosing}
 
     # Events.
 
     def apply(self, event: Event) -> list[str]:
-        """Take an event into account; returns what became of its reports or acknowledgements."""
-        self.advance(event["asked"] if "asked" in event else event["received"])
+        """Take an event into account; returns what became of its rows, or to which UAVs it applies."""
+        self.advance(event["received"])
         if "reports" in event:
             return [self._report(validated(Report, row), event["received"]) for row in event["reports"]]
         if "acknowledged" in event:
@@ -322,16 +317,17 @@ class Fleet:
             for uav in self.members(event["uavs"], "uavs"):
                 uav.command = "" if event["command"] == "resume" else event["command"]
                 uav.lapse()
+            return event["uavs"]
         else:
             self._change(event["join"], event["leave"])
-        return []
+        return [*self.uavs]
 
     def _report(self, report: Report, received: float) -> str:
         """Add a report; it is ``new``, ``late``, ``duplicate``, or ``old`` (before the start)."""
         report.stamp(received)
         if report.id in self.joining:
             self._regroup([*self.uavs, report.id], report)
-            self.uavs[report.id].received, self.last_arrival = 1, self.tracker.step
+            self.uavs[report.id].received = 1
             return "new"
         uav, log = self.uavs[report.id], self.tracker.logs[report.id]
         uav.received += 1
@@ -339,9 +335,6 @@ class Fleet:
             uav.duplicates += 1
             return "duplicate"
         late = log.newest is not None and report.time < log.newest.report.time
-        uav.late += late
-        if len(log.reports) >= KEPT_REPORTS and report.time < log.reports[0].report.time:
-            return "old"
         sent = None
         if report.flies:
             told = (each for each in reversed(uav.answers) if each.is_followed and each.time < report.time)
@@ -349,21 +342,13 @@ class Fleet:
         if sent and report.place("target_") is None:
             for column, value in zip(self.ground.columns, self.ground.place(sent.goal), strict=True):
                 setattr(report, f"target_{column}", value)
-        has_begun = self.tracker.has_begun
         filled = self.tracker.add(report, sent and sent.origin)
         if filled is None:
             return "old"
         del log.reports[:-KEPT_REPORTS]
-        self.last_arrival = self.tracker.step
-        if not has_begun:
-            self._settle()
+        uav.home = filled.point if uav.home is None else uav.home
         self._note(uav, filled)
         return "late" if late else "new"
-
-    def _settle(self) -> None:
-        """Note where UAVs begin, once all have reported."""
-        for uav, held in self.tracker.held.items():
-            self.uavs[uav].home = held.point
 
     def _note(self, uav: Uav, filled: FilledReport) -> None:
         """Note what a report says of the order that its UAV follows."""
@@ -378,8 +363,8 @@ class Fleet:
             order.since = max(order.since, filled.step - 1)
 
     def _tell(self, decisions: Sequence[Decision]) -> None:
-        if self.tracker.hidden is not None and self._is_computed:  # they change as when it was asked
-            self._ask([each.advice["ID"] for each in decisions])
+        if self.tracker.hidden is not None and self.clock >= self.computed_from:
+            self.tracker.ask([each.advice["ID"] for each in decisions])  # they change as when it was asked
         for decision in decisions:
             uav = self.uavs[decision.advice["ID"]]
             uav.lapse()
@@ -393,13 +378,11 @@ class Fleet:
             if status in (LANDED, ABORTED):
                 decision.since = self.tracker.step
             if not was and decision.is_followed and decision.action is not None:
-                self.last_arrival = self.tracker.step
                 self.tracker.choose(ID, decision.action)
         return status
 
     def _change(self, join: Sequence[str], leave: Sequence[str]) -> None:
         self.joining = {uav: log for uav, log in self.joining.items() if uav not in leave}
-        self.left = (self.left | {*leave}) - {*join}
         now = () if self.tracker.has_begun else join
         if now or {*leave} & {*self.uavs}:
             self._regroup([*(uav for uav in self.uavs if uav not in leave), *now])
@@ -418,7 +401,6 @@ class Fleet:
         if not old.has_begun:
             if all(log.newest for log in new.logs.values()):
                 new.begin(self.clock)
-                self._settle()
             return
         new.has_begun, new.start, new.step = True, old.start, old.step
         new.pending = [each for each in old.pending if each[1] in new.logs]
@@ -428,13 +410,6 @@ class Fleet:
             new.held[first.id] = new.put(first)
             self.uavs[first.id].home = new.held[first.id].point
         new.begin_anew(old.step)
-
-    def _ask(self, asking: Sequence[str]) -> torch.Tensor:
-        """Actions of all UAVs, [1, N, ...]; the same whenever it is asked."""
-        with torch.random.fork_rng(devices=[]):
-            numbers = [self.tracker.uavs.index(uav) for uav in asking]
-            torch.default_generator.manual_seed(hash((self.seed, self.tracker.step, *numbers)) % 2**62)
-            return self.tracker.ask(asking)
 
     def _standing(self, uav: str, asks: bool) -> int:
         """Landing point on which a UAV stands, or for which it is bound."""
@@ -453,12 +428,9 @@ class Fleet:
     def danger(self, uav: Uav) -> str | None:
         """Why a UAV must not do what the policy chooses, one of ``REASONS``, or None; the fleet has begun."""
         order, newest = uav.open_order, self._newest(uav)
-        heard = newest.report.time
-        if order is not None:  # in flight it is silent
-            heard = max(heard, min(order.time + order.duration, self.clock))
-        if self.clock - heard > self.rules.oldest_report:
-            return "silent"
-        if self.rules.reserve > 0 and not (newest.battery_known and newest.battery >= self.rules.reserve):
+        if order is None and self.clock - newest.report.time > self.config.oldest_report:
+            return "silent"  # in flight it may be: its goal is safer than a landing where it is
+        if self.config.reserve > 0 and not (newest.battery_known and newest.battery >= self.config.reserve):
             return "battery"
         if self._is_nowhere(uav):
             return "aborted"
@@ -471,12 +443,10 @@ class Fleet:
         order = uav.order
         return order is not None and order.status == ABORTED and self._newest(uav).step <= order.since
 
-    def _is_busy(self, uav: Uav, unasked: bool) -> bool:
-        """Whether a UAV has nothing to choose now; ``unasked``: if it flies, neither."""
+    def _is_busy(self, uav: Uav) -> bool:
+        """Whether a UAV has nothing to choose now."""
         offer, number = uav.offer, self.tracker.uavs.index(uav.id)
         if self.tracker.chosen[0, number] or uav.open_order:
-            return True
-        if unasked and self.tracker.held[uav.id].report.flies:
             return True
         if offer is None or (offer.action is None and offer.reason not in ("conflict", "battery", "detour")):
             return False
@@ -490,7 +460,8 @@ class Fleet:
                 return offer.status not in (REFUSED, ABORTED) and (may_fly or not offer.moves)
             if offer.reason in ("conflict", "detour") and offer.step == self.tracker.step:
                 return True
-        return order is not None and (order.kind, order.reason) == ("return", reason) and may_fly
+        is_bound_home = order is not None and (order.kind == "return" or order.goal == self._home(uav))
+        return is_bound_home and may_fly and reason in ("battery", "returning")
 
     def _is_outdated(self, uav: Uav, decision: Decision) -> bool:
         """Whether a flight is not safe any more that a UAV accepts now."""
@@ -498,13 +469,18 @@ class Fleet:
             return False
         return self.danger(uav) not in (None, decision.reason) or self._meets(uav, decision, {})
 
-    def _flight(self, level: float, origin: int, goal: int) -> tuple[float, float]:
+    def _start(self, uav: Uav, point: int) -> tuple[float, float]:
+        """Where a UAV stands, by its newest report if that tells of this landing point [m]."""
+        newest = self._newest(uav)
+        if newest.point != point or newest.report.flies:
+            return tuple(self.ground.points[point].tolist())
+        return self.ground.local(newest.report.place() or (0.0, 0.0))
+
+    def _flight(self, uav: Uav, start: tuple[float, float], goal: int) -> tuple[float, float]:
         """Expected duration of a flight [s], and the battery that it takes [%]."""
-        if origin == goal:
-            return 0.0, 0.0
         vehicles, battery = self.node.simulation.vehicles, self.node.scenario.battery
-        length = torch.linalg.vector_norm(self.tracker.points[goal] - self.tracker.points[origin])
-        vertical = vehicles.shortest_time(torch.tensor(level))
+        length = torch.linalg.vector_norm(self.tracker.points[goal] - torch.tensor(start))
+        vertical = vehicles.shortest_time(torch.tensor(uav.level))
         duration = float(2 * vertical + vehicles.shortest_time(length))
         return duration, float(flight_drain(vertical, length, battery)) if battery.enabled else 0.0
 
@@ -512,7 +488,7 @@ class Fleet:
         """The free landing point nearest to where a UAV began."""
         taken = {point for other in self._others(uav) for point in self.booked(other)}
         free = [point for point in range(len(self.ground.points)) if point not in taken]
-        return min(free, key=lambda point: self.ground.way(uav.home, point)[0])
+        return min(free, key=lambda point: self.ground.way(uav.home or 0, point)[0])
 
     def _instead(self, uav: Uav, reason: str) -> Decision:
         """What a UAV in danger is told: to return if it is sent home or can still get there, else to hold."""
@@ -521,46 +497,51 @@ class Fleet:
             goal = self._home(uav)
         elif reason == "battery" and self.node.scenario.battery.enabled:
             home = self._home(uav)
-            reaches = self._flight(uav.level, here, home)[1] <= self._newest(uav).battery
+            reaches = self._flight(uav, self._start(uav, here), home)[1] <= self._newest(uav).battery
             stands = not uav.open_order  # in flight nobody knows how far it is
             goal = home if reaches and stands and uav.command != "hold" else here
-        return self._decision(uav, None, here, goal, reason)
+        return self._decision(uav, None, goal, reason)
 
-    def _decision(self, uav: Uav, action: Any, origin: int, goal: int, reason: str | None) -> Decision:
-        duration, until = self._flight(uav.level, origin, goal)[0], self.clock + self.rules.answer_time
-        step = self.tracker.step
-        return Decision(step, self.clock, action, origin, goal, uav.level, duration, until, reason, step)
+    def _decision(self, uav: Uav, action: Any, goal: int, reason: str | None = None) -> Decision:
+        """A decision for a UAV where it stands, or is bound for."""
+        origin, step = self._standing(uav.id, True), self.tracker.step
+        start, until = self._start(uav, origin), self.clock + self.config.answer_time
+        duration = self._flight(uav, start, goal)[0] if goal != origin else 0.0
+        return Decision(step, self.clock, action, origin, goal, start, duration, until, reason, step)
 
     def _others(self, uav: Uav) -> list[Uav]:
         return [other for other in self.uavs.values() if other is not uav]
 
-    def booked(self, uav: Uav) -> set[int]:
+    def _flights(self, uav: Uav, found: dict[str, Decision]) -> list[Decision]:
+        """Flights on which a UAV may be, or for which it may set out; ``found`` have not been told yet."""
+        told = filter(None, (uav.open_order, uav.offer, found.get(uav.id)))
+        return [each for each in told if each.is_open or (each.moves and each.is_live(self.clock))]
+
+    def booked(self, uav: Uav, found: dict[str, Decision] | None = None) -> set[int]:
         """Landing points where a UAV may stand or land."""
-        offer, order, booked = uav.offer, uav.order, {self._standing(uav.id, False)}
-        if offer is not None and offer.is_live(self.clock):
-            booked.add(offer.goal)
+        order, booked = uav.order, {each.goal for each in self._flights(uav, found or {})}
         if order is not None and (order.status == ACCEPTED or self._is_nowhere(uav)):
             booked |= {order.origin, order.goal}
-        return booked
+        return booked | {self._standing(uav.id, False)}
 
     def _meets(self, uav: Uav, decision: Decision, found: dict[str, Decision]) -> bool:
         """Whether a flight leads to where another UAV may be, or comes near its way at the same level.
 
-        ``found`` are decisions that count already, though they have not been told yet.
+        A UAV may have to land anywhere on its way: so nobody is sent under the way of another one, nor over
+        where another one may stand or land, whatever their levels are.
         """
-        way = self._path(decision)
+        way, points = self._path(decision), self.ground.points
         for other in self._others(uav):
-            told = filter(None, (other.offer, other.open_order, found.get(other.id)))
-            flights = [each for each in told if each.is_open or (each.moves and each.is_live(self.clock))]
-            same_level = [self._path(each) for each in flights if each.level == decision.level]
-            if any(shapely.distance(path, way) < self.rules.clearance for path in same_level):
-                return True
-            if decision.goal in self.booked(other) | {each.goal for each in flights}:
+            places = self.booked(other, found)
+            near = [way.distance(shapely.Point(points[place])) for place in places]
+            mine = way if other.level == uav.level else shapely.Point(points[decision.goal])
+            near += [self._path(each).distance(mine) for each in self._flights(other, found)]
+            if decision.goal in places or min(near) < self.config.clearance:
                 return True
         return False
 
     def _path(self, decision: Decision) -> shapely.LineString:
-        return shapely.LineString(self.ground.points[[decision.origin, decision.goal]])
+        return shapely.LineString([decision.start, self.ground.points[decision.goal]])
 
     def _bends(self, decision: Decision) -> bool:
         """Whether the way of a flight is not straight; a UAV is told straight ones only."""
@@ -577,17 +558,20 @@ class Fleet:
             elif decision.moves and self._bends(decision):
                 reason = "detour"
             elif decision.kind == "fly" and self.node.scenario.battery.enabled:
-                left = self._newest(uav).battery - self._flight(uav.level, here, decision.goal)[1]
-                reason = "battery" if left < self.rules.reserve else None
-            told = self._decision(uav, None, here, here, reason) if reason else decision
+                left = self._newest(uav).battery - self._flight(uav, decision.start, decision.goal)[1]
+                reason = "battery" if left < self.config.reserve else None
+            told = self._decision(uav, None, here, reason) if reason else decision
             told.advice = self._told(uav, told, f"{self.mark}-{number}".lstrip("-"))
             cleared[uav.id] = told
         return [asdict(each) for each in cleared.values()]
 
     # Answers.
 
-    def shown(self, uav: Uav, now: float) -> Advice:
-        """What a UAV is told for now."""
+    def advice(self, asking: Asking) -> list[Advice]:
+        """What UAVs are told for now."""
+        return [self._shown(uav, self.clock) for uav in self.members(asking.uavs, "uavs")]
+
+    def _shown(self, uav: Uav, now: float) -> Advice:
         offer, decision, told = uav.offer, uav.open_order, dict[str, Any]()
         if offer is not None and offer.is_live(now):
             decision, told = offer, {"state": offer.kind}
@@ -608,29 +592,38 @@ class Fleet:
         place = self.ground.place(decision.goal) if shows_place else (None, None)
         told |= zip(self.ground.columns, place, strict=True)
         told |= dict.fromkeys(("altitude", "speed", "heading", "distance", "duration", "arrival"))
-        distance, heading = self.ground.way(decision.origin, decision.goal)
         if decision.moves:
-            told["altitude"] = decision.level
+            told["altitude"] = uav.level
         if not uav.open_order:  # else nobody knows where it is
-            arrival = written(decision.time + decision.duration)
-            told |= {"distance": distance, "duration": round(decision.duration, 2), "arrival": arrival}
+            way = self._path(decision)
+            distance, arrival = way.length * decision.moves, written(decision.time + decision.duration)
+            told |= {
+                "distance": round(distance, 2),
+                "duration": round(decision.duration, 2),
+                "arrival": arrival,
+            }
             if decision.moves:
+                (x, y), (x_goal, y_goal) = way.coords
                 cruise = self.node.simulation.vehicles.shortest_time(torch.tensor(distance))
-                told |= {"speed": round(distance / float(cruise), 2), "heading": heading}
+                heading = math.degrees(math.atan2(x_goal - x, y_goal - y)) % 360
+                told |= {"speed": round(distance / float(cruise), 2), "heading": round(heading, 2)}
         return told | {"until": written(decision.until), "step": decision.step}
 
-    def status(self, uav: Uav, now: float) -> UavStatus:
-        """What is known of a UAV at an instant [s]."""
+    def status(self, now: float) -> FleetStatus:
+        """What is known of the fleet at an instant [s]."""
+        tracker, now = self.tracker, max(now, self.clock)
+        uavs = [self._status(uav, now) for uav in self.uavs.values()]
+        start = written(tracker.start) if tracker.has_begun else None
+        return FleetStatus(start=start, step=tracker.step, dt=self.node.dt, uavs=uavs)
+
+    def _status(self, uav: Uav, now: float) -> UavStatus:
         newest, told = self.tracker.logs[uav.id].newest, {"ID": uav.id, "age": self._age(uav, now)}
         if newest is not None:
             told |= zip(self.ground.columns, newest.report.place() or (), strict=True)
-            told |= {
-                "flies": newest.report.flies,
-                "battery": newest.battery if newest.battery_known else None,
-            }
-        told |= {"reports": uav.received, "late": uav.late, "duplicates": uav.duplicates}
-        order, advice = uav.offer and uav.offer.status, self.shown(uav, now)
-        return UavStatus(**told, command=uav.command, order=order, advice=advice)
+            battery = newest.battery if newest.battery_known else None
+            told |= {"flies": newest.report.flies, "battery": battery}
+        told |= {"reports": uav.received, "duplicates": uav.duplicates, "command": uav.command}
+        return UavStatus(**told, order=uav.offer and uav.offer.status, advice=self._shown(uav, now))
 
     def _age(self, uav: Uav, now: float) -> float | None:
         newest = self.tracker.logs[uav.id].newest

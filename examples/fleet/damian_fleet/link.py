@@ -9,6 +9,7 @@ its requests, so that a slow service stops nothing. What must outlive a restart 
 """
 
 import argparse
+import contextlib
 import json
 import logging
 import math
@@ -39,20 +40,16 @@ def ask(url: str, token: str, request: Request) -> Answer:
     data = None if request.body is None else json.dumps(request.body).encode()
     headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
     made = urllib.request.Request(url.rstrip("/") + request.path, data, headers, method=request.method)
-    try:
+    status = content = None
+    with contextlib.suppress(Exception):  # whatever a proxy or a broken line sends
         try:
             answer = urllib.request.urlopen(made, timeout=PATIENCE)
         except urllib.error.HTTPError as error:
             answer = error
         with answer:
-            status, content = answer.status, answer.read(1_000_000)
-    except Exception as error:  # whatever a proxy or a broken line sends
-        _LOG.debug("%s: %r", request.path, error)
-        return Answer(None, None, request.number)
-    try:
-        return Answer(status, json.loads(content or b"{}"), request.number)
-    except ValueError:
-        return Answer(status, None, request.number)
+            status, text = answer.status, answer.read(1_000_000)
+        content = json.loads(text or b"{}")
+    return Answer(status, content, request.number)
 
 
 def requester(url: str, token: str, asked: "queue.Queue[Request]", answers: "queue.Queue[Answer]") -> None:
@@ -101,7 +98,6 @@ def main() -> None:
     parser.add_argument("--fleet", required=True)
     each = "ID=CONNECTION or ID=CONNECTION#SYSTEM, for each UAV"
     parser.add_argument("--vehicle", action="append", required=True, help=each)
-    parser.add_argument("--period", type=float, help="between two reports [s]; a step of the service")
     parser.add_argument("--listen", type=float, default=0.0, help="before it reports, after landing [s]")
     parser.add_argument(
         "--memory", type=Path, default=Path("mavlink"), help="what outlives a restart: a folder"
@@ -120,7 +116,7 @@ def main() -> None:
             memory = Memory.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None
         except ValueError as error:
             parser.error(f"{path}: it is not the memory of a bridge; remove it to begin anew: {error}")
-        own = given.period, given.listen, int(system) if system else None, memory
+        own = given.listen, int(system) if system else None, memory
         bridges.append(Bridge(uav, given.fleet, [*named], *own))
         work = bridges[-1], address, given.service, given.token, path
         threads.append(threading.Thread(target=serve, args=work, daemon=True))

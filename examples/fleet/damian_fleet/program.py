@@ -6,14 +6,11 @@ region=llanbedr), or change that of the checkpoint.
 
 import gc
 import os
-import secrets
 import socket
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,47 +20,16 @@ import yaml
 import damian
 from damian import keys
 from damian.baselines.script import script_policy
-from damian.common import checks
 from damian.common.errors import InputError, RunError
-from damian.common.fields import rules, setting
+from damian.common.fields import rules
 from damian.field.node import Node, for_uavs, scenario_of_reports
-from damian_fleet.fleet import REPLAYED_STEPS, Fleet
-from damian_fleet.rules import FieldRules
+from damian_fleet.fleet import MOST_STEPS, Fleet
 from damian_fleet.service import make_app
+from damian_fleet.settings import FleetConfig
 from damian_fleet.store import Fleets
 
 LIMITS = {"backlog": 64, "limit_concurrency": 500, "timeout_keep_alive": 30, "timeout_graceful_shutdown": 2}
 """Connections that wait, and those that are served at a time (others are answered 503); times [s]."""
-
-
-@dataclass
-class FleetConfig(FieldRules):
-    """All settings of the service, beside those of the scenario."""
-
-    checkpoint: str | None = setting(None, "Run folder, or the best.pt in it, of the policy that advises.")
-    policy: str | None = setting(
-        None,
-        "deterministic (default with checkpoint), sampled, or script (default without).",
-        choices=("deterministic", "sampled", "script"),
-    )
-    port: int = setting(8000, "Port of the service over HTTP; 0: a free one.", low=0, high=65535)
-    host: str = setting("127.0.0.1", "Address of the service; other machines do not reach the default one.")
-    token: str | None = setting(
-        None, "Password; DAMIAN_TOKEN of the environment, or made and printed, if not given."
-    )
-    database: str = setting("fleets.db", "File of the database with all fleets.")
-    seed: int = setting(0, "Seed of sampled actions and of random regions.", low=0)
-    trust: bool = setting(False, "Import the components package.module:Name that the checkpoint's run names.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.policy = self.policy or ("deterministic" if self.checkpoint else "script")
-        problem = "needs checkpoint: the run folder with the policy"
-        self.refuse(self.policy != "script" and not self.checkpoint, "policy", problem)
-        self.is_made = not (token := self.token or os.environ.get("DAMIAN_TOKEN"))
-        self.token = token or secrets.token_urlsafe(24)
-        good = len(self.token) >= 16 and self.token.isascii() and self.token.isprintable()
-        checks.require(good, "token", "it", "is not a password of at least 16 printable ASCII characters")
 
 
 def config_of(words: Sequence[str]) -> tuple[FleetConfig, list[str]]:
@@ -82,12 +48,12 @@ def config_of(words: Sequence[str]) -> tuple[FleetConfig, list[str]]:
 def make_parts(config: FleetConfig, words: Sequence[str]) -> Callable[[int], tuple[Node, torch.nn.Module]]:
     """The node and the policy for a number of UAVs."""
     loaded = None
-    if config.policy == "script":
+    if config.checkpoint is None:
         scenario = scenario_of_reports(damian.compose_scenario(*words))
     else:
-        loaded = damian.load(str(config.checkpoint), *words, trust=config.trust)
+        loaded = damian.load(config.checkpoint, *words, trust=config.trust)
         scenario = scenario_of_reports(loaded.env.uav_env.scenario)
-        trained = damian.load(str(config.checkpoint), trust=config.trust)
+        trained = damian.load(config.checkpoint, trust=config.trust)
         instant = any(each.env.uav_env.simulation.vehicles.instant for each in (trained, loaded))
         if instant and not config.instant:
             problem = "the policy's UAVs were at their targets at once: train one with motion=polynomial"
@@ -115,12 +81,13 @@ def make_fleets(config: FleetConfig, words: Sequence[str]) -> Fleets:
     parts = make_parts(config, words)
 
     def make(uavs: list[str], mark: str, latest: float) -> Fleet:
-        seconds = REPLAYED_STEPS * parts(len(uavs))[0].dt
-        return Fleet(parts, uavs, config, config.policy == "sampled", config.seed, mark, latest - seconds)
+        seconds = MOST_STEPS * parts(len(uavs))[0].dt
+        return Fleet(parts, uavs, config, mark, latest - seconds)
 
     scenario = dict(word.lstrip("+").partition("=")[::2] for word in words)
-    about = {"policy": config.policy, "checkpoint": config.checkpoint, "seed": config.seed, **scenario}
-    return Fleets(make, Path(config.database), about)
+    policy = "deterministic" if config.checkpoint else "script"
+    about = {"policy": policy, "checkpoint": config.checkpoint, "seed": config.seed, **scenario}
+    return Fleets(make, config.database, about)
 
 
 def main() -> None:
@@ -139,9 +106,8 @@ def main() -> None:
         except (OSError, UnicodeError) as error:
             raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
         with listener, closing(make_fleets(config, words)) as fleets:
-            listener.setsockopt(
-                socket.IPPROTO_TCP, socket.TCP_NODELAY, 1
-            )  # or an answer in two parts takes 40 ms
+            no_delay = socket.IPPROTO_TCP, socket.TCP_NODELAY, 1  # or an answer in two parts takes 40 ms
+            listener.setsockopt(*no_delay)
             print(*[f"token: {config.token}\n"] * config.is_made, end="")
             print("listening on http://{}:{}".format(*listener.getsockname()[:2]), flush=True)
             app, quiet = make_app(fleets, str(config.token)), {"log_level": "warning", "access_log": False}

@@ -4,8 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from damian.common.errors import InputError
-from damian.field.rows import Found, Row, UavId, column_of, validated
+from damian.field.rows import Latitude, Longitude, Row, UavId, column_of
 
 MOST_UAVS = 100
 """Most UAVs of a fleet."""
@@ -23,8 +22,9 @@ class Acknowledgement(Row):
 class Place(BaseModel):
     """A place [deg], or over a region without a place on Earth [m]."""
 
-    lat: float | None = None
-    lon: float | None = None
+    model_config = ConfigDict(allow_inf_nan=False)
+    lat: Latitude | None = None
+    lon: Longitude | None = None
     x: float | None = None
     y: float | None = None
 
@@ -42,28 +42,27 @@ class Advice(Place):
     answer: str | None
     ID: str
     state: Literal["fly", "hold", "return", "bound", "none"]
-    reason: str | None
-    altitude: float | None = None
-    speed: float | None = None
+    reason: str | None = None
+    altitude: float | None = Field(None, gt=0, le=1000)
+    speed: float | None = Field(None, gt=0)
     heading: float | None = None
     distance: float | None = None
-    duration: float | None = None
+    duration: float | None = Field(None, ge=0)
     arrival: float | str | None = None
     until: float | str | None = None
     step: int | None = None
-    age: float | None
+    age: float | None = None
 
 
 class UavStatus(Place):
-    """Where a UAV was by its newest report, the age of that [s], its battery [%], how many reports came, late
-    or twice, what a person has told it, how far its latest answer has come, and what it is told now."""
+    """Where a UAV was by its newest report, the age of that [s], its battery [%], how many reports came, and
+    how many twice, what a person has told it, how far its latest answer has come, and what it is told now."""
 
     ID: str
     age: float | None
     flies: bool | None = None
     battery: float | None = None
     reports: int
-    late: int
     duplicates: int
     command: Literal["", "hold", "return"]
     order: str | None
@@ -73,7 +72,6 @@ class UavStatus(Place):
 class FleetStatus(BaseModel):
     """What is known of a fleet; its steps have a length of ``dt`` [s]; ``start`` is None until it begins."""
 
-    fleet: str
     start: float | str | None
     step: int
     dt: float
@@ -99,9 +97,9 @@ class Members(Body):
 
 
 class Asking(Body):
-    """The UAVs that ask for advice; all that are not known to be in flight, if not given."""
+    """The UAVs that ask for advice."""
 
-    uavs: list[UavId] | None = None
+    uavs: list[UavId]
 
 
 class Command(Body):
@@ -112,17 +110,10 @@ class Command(Body):
 
 
 class Change(Body):
-    """UAVs that join with their first reports, and UAVs that leave now."""
+    """UAVs that join with their first reports, and UAVs that leave now; what is so already stays so."""
 
     join: list[UavId] = []
     leave: list[UavId] = []
-
-
-def acknowledgements_of(found: Found) -> list[Acknowledgement]:
-    """Rows as acknowledgements."""
-    if not found:
-        raise InputError("there are no rows")
-    return [validated(Acknowledgement, row, where) for where, row in found]
 
 
 def said_by(row: Row) -> dict[str, Any]:

@@ -1,38 +1,43 @@
 """The service over HTTP: reports in, advice out, several fleets at once. ``GET`` changes nothing.
 
 Requests carry ``Authorization: Bearer TOKEN``; whoever has the wrong one learns nothing, not even which
-fleets there are. Only the time, the health and the description of the service need none.
+fleets there are. Only the time, the health and the description of the service, and the page of the map
+without its data, need none.
 """
 
 import asyncio
 import contextlib
 import hmac
+import json
 import logging
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import shapely
 from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
-from fastapi.responses import JSONResponse, PlainTextResponse
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 import damian
 from damian.common.errors import InputError, RunError
-from damian.common.text_files import one_line
-from damian.field.rows import Found, Report, parsed_json, rows_of_csv, rows_of_json, validated, written
+from damian.common.plotting import UAV_COLOURS
+from damian.common.text_files import one_line, show
+from damian.field.rows import Found, Report, reports_of, rows_of_csv, rows_of_json, validated, written
 from damian.show.geojson import on_earth
-from damian_fleet.fleet import Waiting
-from damian_fleet.map import router as map_router
+from damian.show.replay_page import PAGE
+from damian_fleet.fleet import Fleet, Waiting
 from damian_fleet.rows import Acknowledgement, Advice, Asking, Change, Command, FleetStatus, Members
 from damian_fleet.store import Fleets, NoFleet
 
-MAX_BODY, TICK, JUMP = 1_000_000, 1.0, 1.0
+MAX_BODY, TICK = 1_000_000, 1.0
 """Largest body of a request [bytes]; time between two updates of all fleets, so that no request waits for
-many steps [s]; by how much the system clock must change against the monotonic one for a jump [s]."""
-STATUS = {NoFleet: 404, Waiting: 409, InputError: 422, RunError: 507}
+many steps [s]."""
+STATUS = {NoFleet: 404, Waiting: 409, InputError: 422, RequestValidationError: 422, RunError: 507}
 """What a request is answered that ends with an error; 507: it could not be stored, and changed nothing."""
 _LOG = logging.getLogger("damian_fleet")
 
@@ -40,37 +45,32 @@ _LOG = logging.getLogger("damian_fleet")
 class Clock:
     """Seconds since 1970 that never jump: the system's at the start, then by the monotonic clock.
 
-    It starts at ``least`` [s] at least, such as the latest time that is stored. ``ahead`` is by how much the
-    clock of the system was ahead of it when somebody looked last [s].
+    It starts at ``least`` [s] at least, such as the latest time that is stored.
     """
 
     def __init__(self, least: float = 0.0, system: Any = time.time, monotonic: Any = time.monotonic) -> None:
         self._system, self._monotonic = system, monotonic
         self._base = max(system(), least) - monotonic()
-        self.ahead = system() - self()
 
     def __call__(self) -> float:
         return self._base + self._monotonic()
 
-    def watch(self) -> None:
-        """Look at the clock of the system, and note it if it has jumped."""
-        before, self.ahead = self.ahead, self._system() - self()
-        if abs(self.ahead - before) > JUMP:
-            _LOG.warning(
-                "the system clock is now %.1f s ahead of the service, which keeps its time", self.ahead
-            )
+    @property
+    def system_ahead(self) -> float:
+        """By how much the clock of the system is ahead, because it was set [s]."""
+        return self._system() - self()
 
 
-def status_of(error: Exception) -> int:
-    """The HTTP status of an error."""
-    return next((status for kind, status in STATUS.items() if isinstance(error, kind)), 500)
-
-
-def refused(_: Request, error: Exception) -> Response:
+def refused(_: Request, error: Any) -> Response:
     """An error as one line."""
     if isinstance(error, AnyHTTPException):
         return JSONResponse({"error": str(error.detail)}, error.status_code, error.headers)
-    return JSONResponse({"error": one_line(str(error))}, status_of(error))
+    text = str(error)
+    if isinstance(error, RequestValidationError):
+        first = error.errors()[0]
+        text = f"{'.'.join(map(str, first['loc'][1:]))}: {show(first['input'])}: {first['msg']}"
+    status = next(status for kind, status in STATUS.items() if isinstance(error, kind))
+    return JSONResponse({"error": one_line(text)}, status)
 
 
 async def check_size(request: Request) -> None:
@@ -86,30 +86,25 @@ async def rows_of(request: Request) -> Found:
     """The rows of a body, JSON (one object or a list) or CSV."""
     body = await request.body()
     is_table = request.headers.get("content-type", "").startswith("text/csv")
-    return rows_of_csv(body.decode("utf-8-sig", "replace")) if is_table else rows_of_json(body)
+    found = rows_of_csv(body.decode("utf-8-sig", "replace")) if is_table else rows_of_json(body)
+    if not found:
+        raise InputError("there are no rows")
+    return found
 
 
-def body_of(model: type[BaseModel]) -> Any:
-    """A body as a model, whatever type of content the request names."""
-
-    async def read(request: Request) -> BaseModel:
-        return validated(model, parsed_json(await request.body() or b"{}"))
-
-    return Depends(read)
-
-
-def described(model: type[BaseModel], rows: bool = False) -> dict[str, Any]:
-    """How OpenAPI describes a body; ``rows``: one of these objects, a list of them, or a table."""
-    one, table = model.model_json_schema(), {"text/csv": {"schema": {"type": "string"}}} if rows else {}
-    schema = {"anyOf": [one, {"type": "array", "items": one}]} if rows else one
-    return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}, **table}}}
+def rows_as(model: type[BaseModel]) -> dict[str, Any]:
+    """How OpenAPI describes a body of rows: one of these objects, a list of them, or a table."""
+    one = model.model_json_schema()
+    row = {"schema": {"anyOf": [one, {"type": "array", "items": one}]}}
+    content = {"application/json": row, "text/csv": {"schema": {"type": "string"}}}
+    return {"requestBody": {"required": True, "content": content}}
 
 
 Rows = Annotated[Found, Depends(rows_of)]
 
 
-def make_app(fleets: Fleets, token: str, clock: Callable[[], float] | None = None) -> FastAPI:
-    """The service as an ASGI application; ``clock`` tells its time [s since 1970]."""
+def make_app(fleets: Fleets, token: str, clock: Clock | None = None) -> FastAPI:
+    """The service as an ASGI application."""
     now = clock or Clock(fleets.latest)
 
     @contextlib.asynccontextmanager
@@ -119,7 +114,7 @@ def make_app(fleets: Fleets, token: str, clock: Callable[[], float] | None = Non
         ticking.cancel()
 
     app = FastAPI(title="damian-fleet", version=damian.__version__, lifespan=lifespan)
-    for kind in (AnyHTTPException, InputError, RunError):
+    for kind in (AnyHTTPException, *STATUS):
         app.add_exception_handler(kind, refused)
 
     @app.get("/health")
@@ -132,15 +127,27 @@ def make_app(fleets: Fleets, token: str, clock: Callable[[], float] | None = Non
     @app.get("/time")
     async def service_time() -> dict[str, Any]:
         """The time of the service, and how far the clock of its system is ahead [s]."""
-        ahead = now.ahead if isinstance(now, Clock) else 0.0
-        return {"time": now(), "written": written(now()), "system_ahead": round(ahead, 3)}
+        return {"time": now(), "written": written(now()), "system_ahead": round(now.system_ahead, 3)}
 
-    app.include_router(map_router)
+    @app.get("/fleets/{name}/map", response_class=HTMLResponse)
+    async def show_map(name: str) -> str:
+        """The fleet as it flies; the page asks for what it shows with the token that one types in."""
+        page = Path(__file__).with_name("map.html").read_text(encoding="utf-8")
+        return page.replace("$colours", json.dumps(UAV_COLOURS))
+
+    @app.get("/page/{name}", include_in_schema=False)
+    async def part(name: str) -> FileResponse:
+        """A module or the style of the replay page, with which the map is drawn."""
+        path = PAGE / (name if name.endswith(".css") else f"{name}.js")
+        if path not in {*PAGE.iterdir()}:
+            raise HTTPException(404, "the map has no file of this name")
+        return FileResponse(path)
+
     app.include_router(_fleets(fleets, token, now))
     return app
 
 
-def _fleets(fleets: Fleets, token: str, now: Callable[[], float]) -> APIRouter:
+def _fleets(fleets: Fleets, token: str, now: Clock) -> APIRouter:
     """The requests about fleets."""
     bearer = HTTPBearer(auto_error=False)
 
@@ -155,51 +162,56 @@ def _fleets(fleets: Fleets, token: str, now: Callable[[], float]) -> APIRouter:
         """The fleets."""
         return {"fleets": fleets.names}
 
-    @router.put("/{name}", openapi_extra=described(Members))
-    async def create(name: str, members: Annotated[Members, body_of(Members)], response: Response) -> Members:
+    @router.put("/{name}")
+    async def create(name: str, said: Members, response: Response) -> Members:
         """Create a fleet (201), or find it (200)."""
-        response.status_code = 201 if fleets.create(name, members.uavs) else 200
-        return members
+        response.status_code = 201 if fleets.create(name, said.uavs) else 200
+        return said
 
     @router.get("/{name}", response_model_exclude_unset=True)
     async def status(name: str) -> FleetStatus:
         """What is known of a fleet."""
-        return fleets.status(name, now())
+        return fleets[name].status(now())
 
     @router.delete("/{name}", status_code=204)
     async def end(name: str) -> None:
         """End a fleet; what happened to it is kept."""
         fleets.end(name, now())
 
-    @router.post("/{name}/reports", openapi_extra=described(Report, rows=True))
-    async def reports(name: str, rows: Rows) -> dict[str, Any]:
-        """Take reports; each is ``new``, ``late``, a ``duplicate`` or too ``old``."""
-        return fleets.report(name, rows, now())
+    @router.post("/{name}/reports", openapi_extra=rows_as(Report))
+    async def report(name: str, rows: Rows) -> dict[str, Any]:
+        """Take reports, all or none; each is ``new``, ``late``, a ``duplicate`` or too ``old``."""
+        reports = reports_of(rows)
+        ignored = sorted({column for _, report in reports for column in report.model_extra or ()})
+        found = fleets.take(name, Fleet.reported, reports, now())
+        return {"accepted": len(found), "found": found, "ignored": ignored}
 
-    @router.post("/{name}/advice", openapi_extra=described(Asking), response_model_exclude_unset=True)
-    async def advise(name: str, asking: Annotated[Asking, body_of(Asking)]) -> dict[str, list[Advice]]:
+    @router.post("/{name}/advice", response_model_exclude_unset=True)
+    async def advise(name: str, said: Asking) -> dict[str, list[Advice]]:
         """Let UAVs choose, and tell them."""
-        return {"advice": fleets.advise(name, asking.uavs, now())}
+        fleets.take(name, Fleet.advised, said, now())
+        return {"advice": fleets[name].advice(said)}
 
-    @router.post("/{name}/acknowledgements", openapi_extra=described(Acknowledgement, rows=True))
+    @router.post("/{name}/acknowledgements", openapi_extra=rows_as(Acknowledgement))
     async def acknowledge(name: str, rows: Rows) -> dict[str, list[str]]:
-        """Take what UAVs do with answers; how far these have come."""
-        return {"status": fleets.acknowledge(name, rows, now())}
+        """Take what UAVs do with answers, all or none; how far these have come, or ``unknown``."""
+        said = [validated(Acknowledgement, row, where) for where, row in rows]
+        return {"status": fleets.take(name, Fleet.acknowledged, said, now())}
 
-    @router.post("/{name}/command", openapi_extra=described(Command))
-    async def command(name: str, said: Annotated[Command, body_of(Command)]) -> dict[str, list[str]]:
+    @router.post("/{name}/command")
+    async def command(name: str, said: Command) -> dict[str, list[str]]:
         """Hold, resume or return UAVs."""
-        return {"uavs": fleets.command(name, said.command, said.uavs, now())}
+        return {"uavs": fleets.take(name, Fleet.commanded, said, now())}
 
-    @router.post("/{name}/uavs", openapi_extra=described(Change))
-    async def change(name: str, said: Annotated[Change, body_of(Change)]) -> dict[str, list[str]]:
-        """Let UAVs join and leave."""
-        return {"uavs": fleets.change_members(name, said.join, said.leave, now())}
+    @router.post("/{name}/uavs")
+    async def change(name: str, said: Change) -> dict[str, list[str]]:
+        """Let UAVs join and leave; the members from now on."""
+        return {"uavs": fleets.take(name, Fleet.changed, said, now())}
 
     @router.get("/{name}/geofence")
     async def geofence(name: str) -> dict[str, Any]:
         """The region as a GeoJSON feature, with its landing points."""
-        ground = fleets.fleet(name).ground
+        ground = fleets[name].ground
         region = ground.region
         if region.origin is None:
             raise InputError(f"geofence: {region.name} has no place on Earth")
@@ -216,11 +228,9 @@ def _fleets(fleets: Fleets, token: str, now: Callable[[], float]) -> APIRouter:
     return router
 
 
-async def _tick(fleets: Fleets, now: Callable[[], float]) -> None:
+async def _tick(fleets: Fleets, now: Clock) -> None:
     """Let the fleets take their steps, one fleet at a time, so that requests come in between."""
     while True:
-        if isinstance(now, Clock):
-            now.watch()
         for name, fleet in [*fleets.loaded.items()]:
             try:
                 fleet.advance(now())

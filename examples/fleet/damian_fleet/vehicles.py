@@ -42,14 +42,14 @@ class Copter:
     calls `change_mode`, `arm` and `disarm`; faults are `crash()`, `reboot(now)` and the fields `wind` [m/s],
     `fix`, `glitch` [m, of what it says], `prearm` (a text that refuses arming), `battery` [%] of each.
 
-    ``origin`` is latitude and longitude [deg] of place 0, ``drain`` what a second in the air costs [%],
-    ``battery_action`` the mode of its failsafe (BATT_FS_LOW_ACT); it lands if the MAVLink system ``station``
-    is silent for 5 s (MAV_GCS_SYSID, FS_GCS_ENABLE=5), if one is given.
+    ``origin`` is latitude and longitude [deg] of place 0, ``drain`` what a second in the air costs [%]. It
+    returns on a low battery (BATT_FS_LOW_ACT=2), and lands if the MAVLink system ``station`` is silent for
+    5 s (MAV_GCS_SYSID, FS_GCS_ENABLE=5), if one is given.
     """
 
-    def __init__(self, origin, place=0j, *, system=1, now=0.0, drain=0.05, battery_action=RTL, station=None):
+    def __init__(self, origin, place=0j, *, system=1, now=0.0, drain=0.05, station=None):
         self.origin, self.place, self.height, self.landed = origin, complex(place), 0.0, True
-        self.system, self.drain, self.battery_action, self.station = system, drain, battery_action, station
+        self.system, self.drain, self.station = system, drain, station
         self.wind, self.fix, self.glitch, self.prearm = 0j, True, 0j, None
         self.battery, self.crashed = [100.0], False
         self.mav, self.sent, self.now = mavlink.MAVLink(None, system, 1), [], now
@@ -156,8 +156,6 @@ class Copter:
         modes = {
             mavlink.MAV_CMD_DO_SET_MODE: int(second) if int(first) & CUSTOM_MODE else None,
             mavlink.MAV_CMD_NAV_LAND: LAND,
-            mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: RTL,
-            mavlink.MAV_CMD_NAV_LOITER_UNLIM: LOITER,
         }
         if command.command in modes:
             return ACCEPTED if self.change_mode(modes[command.command]) else FAILED
@@ -175,9 +173,7 @@ class Copter:
             case mavlink.MAV_CMD_DO_REPOSITION:
                 return self.reposition(command, frame)
             case mavlink.MAV_CMD_DO_CHANGE_SPEED:
-                if (
-                    self.mode == GUIDED and second > 0 and first in (0, 1)
-                ):  # climb and descent keep theirs here
+                if self.mode == GUIDED and second > 0 and first in (0, 1):  # no speed of climb or descent
                     self.speed = second
                 return DENIED if second <= 0 else ACCEPTED if self.mode == GUIDED else FAILED
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL if int(first) in STREAMS:
@@ -216,7 +212,7 @@ class Copter:
         silent = None not in (self.station, self.heard) and self.now - self.heard > STATION_FAILSAFE
         causes = {
             "EKF": (lost and not self.landed and self.mode in NEED_POSITION, LAND),
-            "battery": (min(self.battery) <= BATTERY_LOW, self.battery_action),
+            "battery": (min(self.battery) <= BATTERY_LOW, RTL),
             "station": (silent, LAND),
         }
         for name, (cause, mode) in causes.items():

@@ -18,6 +18,7 @@ from unittest import mock
 
 import httpx2
 import numpy as np
+import shapely
 import torch
 
 from damian.baselines.random import random_policy
@@ -26,47 +27,27 @@ from damian_fleet.bridge import Answer, Bridge, Memory
 from damian_fleet.program import config_of, make_fleets
 from damian_fleet.service import Clock, make_app
 from damian_fleet.store import Fleets
-from damian_fleet.vehicles import (
-    ALT_HOLD,
-    ARMED,
-    BRAKE,
-    GUIDED,
-    LAND,
-    LOITER,
-    RTL,
-    STABILIZE,
-    Copter,
-    mavlink,
-)
+from damian_fleet.vehicles import ARMED, GUIDED, LAND, LOITER, MODES, RTL, STABILIZE, Copter, mavlink
 
 UAVS, TICK, HOUR = "ABCDE", 0.25, 3600.0
 ORIGIN = (52.8110, -4.1283)
 STARTS = (0j, 170 + 0j, 340 + 0j, 510 + 0j, -170 + 0j)
-SAME_POINT, SAME_LEVEL, CLEARANCE = (
-    15.0,
-    2.5,
-    8.0,
-)  # [m]; levels are 5 m apart, and 10 m are set
+SAME_POINT, CLEARANCE = 15.0, 5.0  # [m]; 10 m are set, and a copter stands up to 2 m beside its landing point
 HOVER, LONGEST = 30.0, 600.0  # [s] that a copter may stand in the air in GUIDED, and that it may fly
 HARMLESS = (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE)
-USUAL = {"loss": 0.02, "double": 0.02, "slowest": 0.3}  # of links: the longest delay [s]
 TOKEN = "campaign-campaign"
-WORDS = [
-    "policy=script",
-    "region=llanbedr",
-    "motion=polynomial",
-    "motion.max_speed=8",
-    "motion.max_acceleration=1.5",
-]
-WORDS += ["region.lattice_step=130", "highest_level=20", "port=0"]  # few points, one level: they meet
+WORDS = ["region=llanbedr", "motion=polynomial", "motion.max_speed=8", "battery.enabled=true"]
+WORDS += ["region.lattice_step=170", "actions.distances=[260,390]", "levels=[20,25,30]"]
+"""15 landing points, long flights and three levels for five, so that UAVs meet often."""
 
 
 class Line:
-    """A link that delays, loses and doubles what it carries."""
+    """A link that delays, loses and doubles what it carries; ``slowest`` is the longest delay [s]."""
 
-    def __init__(self, rng):
+    def __init__(self, rng, slowest):
         self.rng, self.items = rng, []
-        vars(self).update(USUAL)
+        self.usual = {"loss": 0.02, "double": 0.02, "slowest": slowest}
+        vars(self).update(self.usual)
 
     def send(self, now, *things):
         for thing in things:
@@ -121,9 +102,12 @@ class Uav:
     def __init__(self, name, number, rng):
         self.name = name
         self.copter = Copter(ORIGIN, STARTS[number], system=number + 1, station=255)
-        self.lines = self.down, self.up, self.asked, self.answered = [Line(rng) for _ in range(4)]
+        self.down, self.up, self.asked, self.answered = [
+            Line(rng, slowest) for slowest in (0.3, 0.3, 1.5, 1.5)
+        ]
         self.memory, self.bridge, self.epoch, self.off_until = None, None, 0.0, 0.0
-        self.act, self.act_seen, self.strayed, self.changed = None, False, False, ()
+        self.act, self.act_seen, self.changed = None, False, {}
+        self.strayed, self.known, self.confirmed, self.accepted, self.way = False, 0.0, 0.0, 0.0, None
         self.last_command = self.hover_since = self.air_since = self.idle_since = None
         self.flights, self.shown = 0, None
 
@@ -135,7 +119,7 @@ class Uav:
     def start_bridge(self, epoch):
         memory = Memory.model_validate_json(self.memory) if self.memory else None
         own = {"system": self.copter.system, "memory": memory}
-        self.epoch, self.bridge = epoch, Bridge(self.name, "north", [*UAVS], 1.0, **own)
+        self.epoch, self.bridge = epoch, Bridge(self.name, "north", [*UAVS], **own)
 
     def acted(self, now, why, *changed):
         """Somebody else has changed mode (0) or motors (1): once it has seen that, the bridge is quiet."""
@@ -143,7 +127,10 @@ class Uav:
         memory = self.bridge.memory if self.bridge else Memory.model_validate_json(self.memory)
         lands = self.copter.mode == LAND and (self.last_command == LAND or memory.state == "landing")
         if fell or not lands:
-            self.act, self.act_seen, self.strayed, self.changed = (now, why), False, True, changed
+            after = self.copter.mode, ARMED * self.copter.armed
+            self.act, self.act_seen, self.changed = (now, why), False, {i: after[i] for i in changed}
+            if fell or not self.copter.landed:
+                self.strayed, self.known = True, np.inf
 
 
 class Campaign:
@@ -157,8 +144,8 @@ class Campaign:
         self.uavs = [Uav(name, number, self.rng) for number, name in enumerate(UAVS)]
         self.broken, self.faults, self.answers, self.reported = {}, Counter(), {}, {}
 
-    def play(self, faults, every=8.0, afterwards=300.0):
-        """Let it fly, with a fault every so many seconds, then without: in that time every UAV must fly."""
+    def play(self, faults, every=10.0):
+        """Let it fly, with a fault every so many seconds, then without, until every UAV has flown again."""
         self.run(30.0)
         for _ in range(faults):
             kind = FAULTS[self.rng.integers(len(FAULTS))]
@@ -168,13 +155,14 @@ class Campaign:
             kind(self, uav, seconds)
             self.run(self.rng.exponential(every))
         self.run(60.0)
-        flown = {uav.name: uav.flights for uav in self.uavs}
-        self.run(afterwards)
+        waiting, end = {uav: uav.flights for uav in self.uavs}, self.now + 900.0
+        while waiting and self.now < end:
+            self.run(30.0)
+            waiting = {uav: flights for uav, flights in waiting.items() if uav.flights == flights}
         rows = {row["ID"]: row for row in self.service.ask("GET", "/fleets/north")[1]["uavs"]}
-        for uav in self.uavs:
-            if uav.flights == flown[uav.name]:
-                state = uav.bridge and (uav.bridge.state, uav.bridge.why)
-                self.break_("flies again", f"{uav.name}: {state}, {rows[uav.name]}")
+        for uav in waiting:
+            state = uav.bridge and (uav.bridge.state, uav.bridge.why)
+            self.break_("flies again", f"{uav.name}: {state}, {rows[uav.name]}")
         for name, numbers in self.reported.items():
             if rows[name]["reports"] < len(numbers):
                 self.break_("no report is lost", f"{name}: {rows[name]['reports']} of {len(numbers)}")
@@ -202,21 +190,23 @@ class Campaign:
         """Change links for so long [s]."""
         for line in lines:
             vars(line).update(change)
-            self.after(seconds, lambda line=line: vars(line).update({name: USUAL[name] for name in change}))
+            self.after(seconds, lambda line=line: vars(line).update(line.usual))
 
-    def command(self, body):
-        """An operator, who asks again until the service answers."""
+    def command(self, command, uavs, seconds=None):
+        """An operator, who asks again until the service answers, and lets UAVs go on after so long [s]."""
         if self.now < self.service.down_until:
-            self.after(1.0, lambda: self.command(body))
-        else:
-            self.service.ask("POST", "/fleets/north/command", body)
+            self.after(1.0, lambda: self.command(command, uavs, seconds))
+            return
+        self.service.ask("POST", "/fleets/north/command", {"command": command, "uavs": uavs})
+        if seconds is not None:
+            self.after(seconds, lambda: self.command("resume", uavs))
 
     # One step of one UAV.
 
     def step(self, uav):
         copter, now = uav.copter, self.now
         for request in uav.asked.due(now):
-            uav.answered.send(now, Answer(*self.serve(request), request.number))
+            uav.answered.send(now, Answer(*self.serve(uav, request), request.number))
         if uav.bridge is None and now >= uav.off_until:
             uav.start_bridge(self.rng.uniform(-HOUR, HOUR))
             uav.shown = None
@@ -225,7 +215,9 @@ class Campaign:
             for at, message in heard:
                 if message.get_type() == "HEARTBEAT":
                     shown = message.custom_mode, message.base_mode & ARMED
-                    is_new = uav.shown is None or any(shown[i] != uav.shown[i] for i in uav.changed)
+                    is_new = uav.shown is None or any(
+                        shown[i] == after != uav.shown[i] for i, after in uav.changed.items()
+                    )
                     uav.act_seen |= uav.act is not None and at >= uav.act[0] and is_new
                     uav.shown = shown
             messages, requests = uav.bridge.step(now + uav.epoch, [message for _, message in heard], answers)
@@ -238,9 +230,13 @@ class Campaign:
         uav.up.send(now, *((now, message) for message in copter.step(now, uav.down.due(now))))
         if copter.failsafe - failsafe:
             uav.acted(now, f"failsafe {copter.failsafe}", 0 if copter.mode != mode else 1)
+        if copter.landed or (copter.position_control and uav.way is None):
+            goal, level = copter.goal or (copter.place, 0.0)
+            path = shapely.LineString([(end.real, end.imag) for end in (copter.place, goal)])
+            uav.way = None if copter.landed else (level, path)
         if was_landed and not copter.landed:
             uav.flights, uav.air_since = uav.flights + 1, now
-            uav.strayed = uav.strayed and uav.act is not None
+            uav.strayed, uav.accepted = uav.strayed and uav.act is not None, uav.confirmed
         self.see_to(uav)
 
     def look_at_command(self, uav, message):
@@ -256,7 +252,7 @@ class Campaign:
         if uav.act_seen:
             self.break_("no command after a pilot's act", f"{uav.name} {uav.act}: {message}")
 
-    def serve(self, request):
+    def serve(self, uav, request):
         """Status and body of an answer of the service, None without one."""
         if self.now < self.service.down_until:
             return None, None
@@ -265,6 +261,11 @@ class Campaign:
             self.break_("no error of the service", f"{request}: {status} {body}")
         if status == 200 and request.path.endswith("/reports"):
             self.reported.setdefault(request.body["ID"], set()).add(request.body["number"])
+            at = uav.copter.metres(request.body["lat"], request.body["lon"])
+            if uav.copter.landed and uav.known > self.now and abs(at - uav.copter.place) < SAME_POINT:
+                uav.known = self.now
+        if body.get("status") == ["accepted"]:
+            uav.confirmed = self.now
         for row in body.get("advice", []) if status == 200 else []:
             told = {key: value for key, value in row.items() if key not in ("state", "age")}
             if row["answer"] and self.answers.setdefault(row["answer"], told) != told:
@@ -273,11 +274,8 @@ class Campaign:
 
     def see_to(self, uav):
         """What a person does: lands what he has taken over, mends it, and hands it over again."""
-        copter, waits = (
-            uav.copter,
-            uav.act or uav.copter.failsafe or (uav.bridge and uav.bridge.state == "watch"),
-        )
-        if not waits:
+        copter = uav.copter
+        if not (uav.act or copter.failsafe or (uav.bridge and uav.bridge.state == "watch")):
             uav.idle_since = None
         elif not copter.landed:
             uav.idle_since = self.now
@@ -306,14 +304,15 @@ class Campaign:
                 self.break_("airborne is commanded", f"{uav.name} stands, {uav.bridge and uav.bridge.state}")
             if not copter.landed and self.now > uav.air_since + LONGEST:
                 self.break_("airborne is commanded", f"{uav.name} flies too long: {copter.mode}")
-        for one, other in combinations([uav for uav in self.uavs if not uav.strayed], 2):
+        for one, other in combinations(self.uavs, 2):
+            if any(a.strayed and a.known > b.accepted for a, b in ((one, other), (other, one))):
+                continue  # nobody knew where it would be
             sites = [site(uav.copter) for uav in (one, other)]
             if None not in sites and abs(sites[0] - sites[1]) < SAME_POINT:
                 self.break_("no two at one point", f"{one.name}, {other.name} at {sites}")
-            (a, b) = one.copter, other.copter
-            is_cruise = all(not c.landed and c.position_control for c in (a, b))
-            if is_cruise and abs(a.height - b.height) < SAME_LEVEL and abs(a.place - b.place) < CLEARANCE:
-                self.break_("no two paths too near", f"{one.name}, {other.name} at {a.place}")
+            levels, paths = zip(*(uav.way or (uav.name, None) for uav in (one, other)), strict=True)
+            if levels[0] == levels[1] and shapely.distance(*paths) < CLEARANCE:
+                self.break_("no two paths too near", f"{one.name}, {other.name} on {paths}")
         if self.now % 5:
             return
         told = [row["advice"] or {} for row in self.service.ask("GET", "/fleets/north")[1].get("uavs", [])]
@@ -387,7 +386,7 @@ class Faults:
 
     def pilot_takes_over(field, uav, seconds):
         def act():
-            modes = (LOITER, ALT_HOLD, STABILIZE, BRAKE, RTL, LAND)
+            modes = [mode for mode in MODES if mode != GUIDED]
             if uav.copter.change_mode(modes[field.rng.integers(len(modes))]):
                 uav.acted(field.now, "mode", 0)
 
@@ -421,9 +420,10 @@ class Faults:
         field.after(seconds, lambda: vars(uav.copter).update(prearm=None))
 
     def operator_holds(field, uav, seconds):
-        for delay, command in ((0.0, ("hold", "return")[field.rng.integers(2)]), (2 * seconds, "resume")):
-            body = {"command": command, "uavs": [uav.name]}
-            field.after(delay, lambda body=body: field.command(body))
+        field.command("hold", [uav.name], 3 * seconds)
+
+    def operator_sends_all_home(field, _, seconds):
+        field.command("return", None, 30 + 3 * seconds)
 
 
 FAULTS = [fault for name, fault in vars(Faults).items() if not name.startswith("_")]
@@ -457,10 +457,7 @@ def main():
         totals.update(flights=sum(uav.flights for uav in field.uavs), hours=field.now / 3600)
         print(f"seed {seed}: {field.now:.0f} s, {field.broken or 'everything held'}", flush=True)
     print(f"\n{faults.total()} faults, {totals['flights']} flights in {totals['hours']:.1f} h of flying\n")
-    for title, rows in (
-        ("fault", dict(sorted(faults.items()))),
-        ("broken", {i: broken[i] for i in INVARIANTS}),
-    ):
+    for title, rows in (("fault", faults), ("broken", {i: broken[i] for i in INVARIANTS})):
         print(f"| {title} | |", "|:--|--:|", *(f"| {name} | {n} |" for name, n in rows.items()), "", sep="\n")
     sys.exit(bool(broken))
 

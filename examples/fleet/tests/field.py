@@ -1,22 +1,21 @@
 """Fleets for tests: one whose policy does as it is told, and one that follows a simulation."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
-from reports import LLANBEDR, START, Reporter, names_of
+from reports import LLANBEDR, START, Reporter, names_of, read_json
 
 from damian import keys
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.field.node import Node, for_uavs
-from damian.field.rows import rows_of_json
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.world.config import ActionConfig, MotionConfig, SourceConfig
 from damian_fleet.fleet import Fleet
-from damian_fleet.rules import FieldRules
+from damian_fleet.rows import Acknowledgement, Asking, Change, Command
+from damian_fleet.settings import FleetConfig
 from damian_fleet.store import Fleets
 
 EAST, WEST = 0, 1
@@ -41,10 +40,10 @@ class Field:
     """A fleet in a database, whose policy sends UAV ``i`` by ``wishes[i]`` unless ``policy_of`` makes one."""
 
     def __init__(
-        self, path: Path | None = None, uavs="AB", scenario=SCENARIO, policy_of=None, **rules: Any
+        self, path: str | Path = ":memory:", uavs="AB", scenario=SCENARIO, policy_of=None, **rules: Any
     ) -> None:
         self.wishes, self.now = [EAST] * 4, START
-        self.scenario, self.policy_of, self.path, self.rules = scenario, policy_of, path, FieldRules(**rules)
+        self.scenario, self.policy_of, self.path, self.rules = scenario, policy_of, path, FleetConfig(**rules)
         self.fleets = self.open()
         self.fleets.create("north", [*uavs])
 
@@ -61,7 +60,7 @@ class Field:
         return NODES[key], self.policy_of(NODES[key].env) if self.policy_of else self.wish
 
     def make(self, uavs: list[str], mark: str, latest: float) -> Fleet:
-        return Fleet(self.parts, uavs, self.rules, mark=mark, computed_from=latest - 1000)
+        return Fleet(self.parts, uavs, self.rules, mark, latest - 1000)
 
     def wish(self, read):
         n = read[keys.ACTION_MASK].shape[1]
@@ -69,30 +68,36 @@ class Field:
 
     @property
     def fleet(self) -> Fleet:
-        return self.fleets.fleet("north")
+        return self.fleets["north"]
 
     def report(self, uav: str, point: int, **said: Any) -> list[str]:
         lat, lon = self.fleet.ground.place(point)
         row = {"ID": uav, "time": self.now, "lat": lat, "lon": lon, "battery": 90.0} | said
         return self.send(row)
 
+    def take(self, request, said: Any) -> list[str]:
+        return self.fleets.take("north", request, said, self.now)
+
     def send(self, *rows: dict[str, Any]) -> list[str]:
-        return self.fleets.report("north", rows_of_json(json.dumps(rows)), self.now)["found"]
+        return self.take(Fleet.reported, read_json(rows))
 
     def ask(self, uav: str, after: float = 0.0):
         self.now += after
-        return self.fleets.advise("north", [uav], self.now)[0]
+        return self.ask_all([uav])[0]
+
+    def ask_all(self, uavs: list[str]):
+        self.take(Fleet.advised, Asking(uavs=uavs))
+        return self.fleet.advice(Asking(uavs=uavs))
 
     def say(self, uav: str, answer: str | None, status: str, after: float = 0.0) -> str:
         self.now += after
-        row = {"ID": uav, "answer": answer or "", "status": status}
-        return self.fleets.acknowledge("north", [("row 1", row)], self.now)[0]
+        return self.take(Fleet.acknowledged, [Acknowledgement(ID=uav, answer=answer or "", status=status)])[0]
 
     def command(self, command: str, uavs: list[str] | None) -> list[str]:
-        return self.fleets.command("north", command, uavs, self.now)
+        return self.take(Fleet.commanded, Command(command=command, uavs=uavs))
 
     def change(self, join: list[str], leave: list[str]) -> list[str]:
-        return self.fleets.change_members("north", join, leave, self.now)
+        return self.take(Fleet.changed, Change(join=join, leave=leave))
 
     def booked(self, uav: str) -> int:
         return self.fleet._standing(uav, False)
@@ -111,7 +116,7 @@ def flights(scenario: ScenarioConfig, policy_of, n_steps: int, fraction: float =
     """
     env = make_env(scenario, 1, 3, extras=["message"])
     policy, uavs = policy_of(env), names_of(scenario.agents)
-    field = Field(None, uavs, scenario, policy_of, reserve=0.0, oldest_report=1e6, clearance=0.0)
+    field = Field(":memory:", uavs, scenario, policy_of, reserve=0.0, oldest_report=1e6, clearance=0.0)
     field.fleet._bends = lambda _: False  # UAVs of a simulation fly around
     reporter = Reporter(env, field.fleet.ground, fraction)
     shown = env.reset()

@@ -1,139 +1,69 @@
-"""A vehicle and a service that say what a test scripts."""
+"""A copter and a service that do and say what a test scripts, and a bridge between them in virtual time."""
 
-import os
 from collections.abc import Callable
 from typing import Any
 
-os.environ.setdefault("MAVLINK20", "1")
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from damian_fleet.bridge import Answer, Bridge, Memory, Request
+from damian_fleet.vehicles import Copter, mavlink
 
-from damian_fleet.bridge import GUIDED, LAND, STATION, Answer, Request, way
-
-STABILIZE, LOITER, RTL = 0, 5, 6
 HOME, GOAL = (52.811, -4.1283), (52.8115, -4.1283)
 BEGIN = 1_750_000_000.0
-TICK = 0.1
+TICK = 0.25
 
 
-class Vehicle:
-    """Says what it is told to say; takes mode, arming, takeoff, reposition and landing as ArduCopter does."""
+class Vehicle(Copter):
+    """Hears and says nothing if it is ``deaf`` or ``silent``, and gives ``results`` instead of obeying."""
 
     def __init__(self, system: int = 1) -> None:
-        self.mav = mavlink.MAVLink(None, system, 1)
-        self.mode, self.armed, self.landed = STABILIZE, False, True
-        self.place, self.height, self.pace, self.fall = list(HOME), 0.0, 0.0, 0.0
-        self.goal: tuple[tuple[float, float], float] | None = None
-        self.speed, self.target = 10.0, 0.0
         self.results: dict[int, int] = {}
-        self.heard: list[tuple[float, Any]] = []
+        self.orders: list[Any] = []
         self.silent = self.deaf = False
-        self.booted, self.status = -100.0, 0
-        self.fix, self.batteries, self.kind = True, {0: 80}, (2, 3)
-        self.station = STATION
-        self.said: list[Any] = []
-        self.extra: list[Any] = []
+        self.kind, self.sensors, self.receiver, self.acknowledges_to = (2, 3), (0, 0), None, None
+        super().__init__(HOME, system=system, drain=0.0)
 
     def commands(self, *numbers: int) -> list[int]:
         """The commands that it has heard, but those that ask for telemetry."""
-        heard = [each.command for _, each in self.heard if each.command != 511]
+        heard = [each.command for each in self.orders if each.command != 511]
         return [each for each in heard if not numbers or each in numbers]
 
-    def step(self, now: float, messages: list[Any]) -> list[Any]:
-        said: list[Any] = []
-        for message in [] if self.deaf else messages:
-            if message.get_type().startswith("COMMAND") and message.target_system == self.mav.srcSystem:
-                self.heard.append((now, message))
-                result = self.results.get(message.command)
-                result = self.obey(message) if result is None else result
-                said.append(mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, *self.station))
-            elif message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                said.append(mavlink.MAVLink_timesync_message(int((now - self.booted) * 1e9), message.ts1))
-        self.fly()
-        n = round(now / TICK)
-        flags = 1 | (128 if self.armed else 0)
-        if n % 10 == 0:
-            said.append(
-                mavlink.MAVLink_heartbeat_message(
-                    *self.kind, flags, self.mode, self.status or (3 if self.landed else 4), 3
-                )
-            )
-            for number, left in self.batteries.items():
-                said.append(
-                    mavlink.MAVLink_battery_status_message(number, 0, 0, 0, [0] * 10, -1, -1, -1, left)
-                )
-        if n % 3 == 0:
-            place = [round(each * 1e7) for each in (self.place if self.fix else (0, 0))]
-            up, fall = round(self.height * 1000), round(self.fall * 100)
-            boot = round((now - self.booted) * 1000)
-            said.append(
-                mavlink.MAVLink_global_position_int_message(
-                    boot, *place, up, up, round(self.pace * 100), 0, fall, 0
-                )
-            )
-        if n % 5 == 0:
-            state = 1 if self.landed else 4 if self.mode == LAND else 3 if self.goal is None else 2
-            said.append(mavlink.MAVLink_extended_sys_state_message(0, state))
-        said, self.extra = said + self.extra, []
-        return [] if self.silent else self.wired(said)
+    def step(self, now: float, messages: Any = ()) -> list[Any]:
+        sent = super().step(now, [] if self.deaf else messages)
+        return [] if self.silent else sent
 
-    def wired(self, messages: list[Any]) -> list[Any]:
-        """Messages as they come in."""
-        parser, found = mavlink.MAVLink(None), []
-        for message in messages:
-            found += parser.parse_buffer(message.pack(self.mav)) or []
-            self.mav.seq = (self.mav.seq + 1) % 256
-        return found
+    def obey(self, command: Any, *rest: Any) -> int:
+        self.orders.append(command)
+        result = self.results.get(command.command)
+        return super().obey(command, *rest) if result is None else result
 
-    def obey(self, message: Any) -> int:
-        command = message.command
-        if command == 176:
-            self.mode = int(message.param2)
-        elif command == 400:
-            self.armed = bool(message.param1)
-        elif command == 22:
-            if self.mode != GUIDED or not self.armed or not self.landed:
-                return 4
-            self.landed, self.target, self.goal, self.speed = False, message.param7, None, 10.0
-        elif command == 192:
-            if self.mode != GUIDED:
-                return 2
-            if self.goal is None:
-                self.speed = 10.0  # the position controller begins with the default
-            self.goal, self.target = (message.x / 1e7, message.y / 1e7), message.z
-        elif command == 178:
-            self.speed = message.param2
-        elif command == 21:
-            self.mode = LAND
-        return 0
+    def send(self, *messages: Any) -> None:
+        for each in messages:
+            if each.get_type() == "COMMAND_ACK" and self.acknowledges_to:
+                each.target_system, each.target_component = self.acknowledges_to
+            elif each.get_type() == "HEARTBEAT":
+                each.type, each.autopilot = self.kind
+            elif each.get_type() == "GPS_RAW_INT" and self.receiver is not None:
+                each.fix_type = self.receiver
+            elif each.get_type() == "SYS_STATUS":
+                present, healthy = self.sensors
+                each.onboard_control_sensors_present, each.onboard_control_sensors_health = present, healthy
+        super().send(*messages)
 
-    def fly(self) -> None:
-        self.pace = self.fall = 0.0
-        if self.landed:
-            return
-        if self.mode in (LAND, RTL):
-            self.fall = 1.0
-            self.height -= TICK
-            if self.height <= 0:
-                self.height, self.landed, self.armed, self.goal = 0.0, True, False, None
-        elif self.mode == GUIDED:
-            self.height += max(-0.3, min(0.3, self.target - self.height))
-            if self.goal is not None:
-                away = way(tuple(self.place), self.goal)[0]
-                self.pace = min(self.speed, away)
-                share = min(1.0, self.pace * TICK / away) if away else 0.0
-                self.place = [a + share * (b - a) for a, b in zip(self.place, self.goal, strict=True)]
+    def switch_motors(self) -> None:
+        """On, or off, as somebody does who is not the bridge."""
+        if self.armed:
+            self.disarm(force=True)
+        else:
+            self.armed, self.on_ground_since = True, self.now
 
 
 class Service:
-    """Sends the UAV to and fro, and keeps what it is told."""
+    """Sends the UAV to and fro, and keeps what it is told; ``bad`` changes its answers."""
 
     def __init__(self) -> None:
-        self.goals, self.level, self.command = [GOAL, HOME], 20.0, ""
+        self.command, self.reason, self.status, self.n = "", "held", "", 0
         self.reports: list[dict[str, Any]] = []
         self.facts: list[tuple[str, str]] = []
         self.offer: dict[str, Any] | None = None
-        self.status = ""
-        self.n, self.reason = 0, "held"
         self.log: list[str] = []
         self.bad: Callable[[Request, Answer], Answer] = lambda _, answer: answer
         self.members: list[str] | None = None
@@ -169,22 +99,63 @@ class Service:
         is_over = self.offer is None or self.status in ("landed", "aborted", "lapsed")
         kind = self.command or "fly"
         if is_over or (self.command and self.offer["state"] != self.command):
-            self.n += 1
-            place = self.goals[self.n % 2 - 1]
-            told = {
-                "answer": f"x-{self.n}",
-                "ID": "A",
-                "state": kind,
-                "reason": self.reason if self.command else None,
-            }
+            self.n, self.status = self.n + 1, "offered"
+            self.offer = {"answer": f"x-{self.n}", "ID": "A", "state": kind}
+            self.offer |= {"reason": self.reason if self.command else None}
             if kind != "hold":
-                told |= {
-                    "lat": place[0],
-                    "lon": place[1],
-                    "altitude": self.level,
-                    "speed": 5.0,
-                    "duration": 30.0,
-                }
-            self.offer, self.status = told, "offered"
-        bound = self.status in ("accepted", "taken off")
-        return self.offer | ({"state": "bound"} if bound else {})
+                lat, lon = (HOME, GOAL)[self.n % 2]
+                self.offer |= {"lat": lat, "lon": lon, "altitude": 5.0, "speed": 5.0, "duration": 30.0}
+        return self.offer | ({"state": "bound"} if self.status in ("accepted", "taken off") else {})
+
+
+class World:
+    """Bridge, vehicle and service in one virtual time; ``system`` as of ``Bridge``."""
+
+    def __init__(self, system: int | None = None) -> None:
+        self.vehicle, self.service, self.now = Vehicle(), Service(), 0.0
+        self.bridge = Bridge("A", "north", system=system)
+        self.states: list[str] = []
+        self.others: Callable[[float], list[Any]] = lambda _: []
+        """What others say on the link of the vehicle."""
+        self._out: list[Any] = []
+        self._answers: list[Answer] = []
+
+    def run(self, seconds: float, until: Callable[[], Any] = lambda: False) -> bool:
+        for _ in range(round(seconds / TICK)):
+            if until():
+                return True
+            self.now = round(self.now + TICK, 3)
+            messages = [*self.vehicle.step(self.now, packed(self._out)), *self.others(self.now)]
+            self._out, requests = self.bridge.step(self.now, messages, self._answers)
+            self._answers = [self.service.answer(each, self.now) for each in requests]
+            if [self.bridge.state] != self.states[-1:]:
+                self.states.append(self.bridge.state)
+        return bool(until())
+
+    def until(self, state: str) -> "World":
+        assert self.run(120, lambda: self.bridge.state == state), (self.bridge.state, self.bridge.why)
+        return self
+
+    def until_said(self, answer: str, how: str) -> bool:
+        """Whether the service is told within two flights how an answer ended."""
+        return self.run(200, lambda: (answer, how) in self.service.facts)
+
+    def heal(self) -> "World":
+        """Let everything go as it should from now on."""
+        self.vehicle.results, self.service.bad = {}, lambda _, answer: answer
+        return self
+
+    def start_again(self) -> "World":
+        """Start the bridge again, with what it remembers."""
+        stored = self.bridge.memory.model_dump_json()
+        self.bridge = Bridge("A", "north", memory=Memory.model_validate_json(stored))
+        self._out, self._answers = [], []
+        return self
+
+
+def packed(messages: list[Any]) -> list[Any]:
+    """Messages of the bridge as they come in."""
+    station = mavlink.MAVLink(None, 255, 191)
+    for message in messages:
+        message.pack(station)
+    return messages

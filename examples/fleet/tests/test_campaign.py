@@ -1,10 +1,11 @@
 """A short campaign in the ordinary tests; the full one is `make fleet-campaign`."""
 
+import shapely
 from campaign import Campaign
 
 
 def test_what_must_hold_holds_through_faults_of_every_link(tmp_path):
-    field = Campaign(1, tmp_path).play(10, every=5.0, afterwards=180.0)
+    field = Campaign(110, tmp_path).play(70)
     assert field.broken == {}
     assert sum(uav.flights for uav in field.uavs) >= 10
     # It would see two at one point, and two that meet.
@@ -14,7 +15,7 @@ def test_what_must_hold_holds_through_faults_of_every_link(tmp_path):
         vars(uav.copter).update(place=place, landed=True, mode=4, velocity=5 + 0j)
     field.check()
     assert [*field.broken] == ["no two at one point"]
-    for uav, goal in ((one, 100j), (other, -100j)):
-        vars(uav.copter).update(landed=False, position_control=True, goal=(goal, 20.0), height=20.0)
+    for uav, ends in ((one, [(0, 0), (100, 100)]), (other, [(0, 100), (100, 0)])):
+        uav.way = 20.0, shapely.LineString(ends)
     field.check()
     assert [*field.broken] == ["no two at one point", "no two paths too near"]

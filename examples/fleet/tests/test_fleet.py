@@ -60,7 +60,7 @@ def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task)
             continue
         chosen = torch.tensor([[each in ready for each in fleet.uavs]])
         goals = fleet.node.simulation.decide(fleet.tracker.state(ready), action, chosen).goal[0]
-        told = field.fleets.advise("north", ready, field.now)
+        told = field.ask_all(ready)
         assert [each.ID for each in told] == ready
         for each in told:
             goal = int(goals[fleet.tracker.uavs.index(each.ID)])

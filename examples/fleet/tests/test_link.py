@@ -60,11 +60,11 @@ def served(request):
 )
 def test_what_is_no_json_over_http_is_no_answer(said, status, content, served):
     url = served(lambda *_: said)
-    assert ask(url, "token", Request("GET", "/time", None, 7)) == Answer(status, content, 7)
+    assert ask(url, "token", Request("GET", "/time", number=7)) == Answer(status, content, 7)
 
 
 def test_a_service_that_is_not_there_is_no_answer():
-    assert ask("http://127.0.0.1:9", "token", Request("POST", "/x", {}, 7)) == Answer(None, None, 7)
+    assert ask("http://127.0.0.1:9", "token", Request("POST", "/x", {}, number=7)) == Answer(None, None, 7)
 
 
 def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(served, tmp_path, monkeypatch):
@@ -72,7 +72,7 @@ def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(served, t
     service.command = "hold"
 
     def answer(method, path, body):
-        found = service.answer(Request(method, path, body, 0), now[0])
+        found = service.answer(Request(method, path, body), now[0])
         return found.status, json.dumps(found.body).encode()
 
     own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -8,8 +8,11 @@ from importlib import import_module
 import pytest
 import uvicorn
 from chromium import chromium, problems, resize
+from reports import read_json
 
+from damian_fleet.fleet import Fleet
 from damian_fleet.program import config_of, make_fleets
+from damian_fleet.rows import Asking
 from damian_fleet.service import make_app
 
 pytestmark = pytest.mark.browser
@@ -28,9 +31,9 @@ return seen;
 
 
 @contextmanager
-def service(folder):
+def service():
     """The fleets of a service that runs, and its address."""
-    words = ["policy=script", "region=llanbedr", "motion=polynomial", "port=0", f"database={folder / 'base'}"]
+    words = ["region=llanbedr", "motion=polynomial", "database=':memory:'"]
     fleets = make_fleets(*config_of(words))
     server = uvicorn.Server(uvicorn.Config(make_app(fleets, TOKEN), port=0, log_level="warning"))
     thread = threading.Thread(target=server.run, daemon=True)
@@ -45,19 +48,18 @@ def service(folder):
 def report(fleets, uav, number):
     lat, lon = PLACES[uav]
     row = {"ID": uav, "number": number, "time": time.time(), "lat": lat, "lon": lon, "battery": 80 - number}
-    rows = import_module("damian.field.rows").rows_of_json(import_module("json").dumps(row).encode())
-    fleets.report("north", rows, time.time())
+    fleets.take("north", Fleet.reported, read_json(row), time.time())
 
 
 def test_the_map_shows_each_uav_its_goal_and_its_row_and_asks_for_the_token(tmp_path):
-    with service(tmp_path) as (fleets, address), chromium() as driver:
+    with service() as (fleets, address), chromium() as driver:
         wait = import_module("selenium.webdriver.support.wait").WebDriverWait(driver, 20, 0.05).until
         text = lambda name: driver.find_element("id", name).text  # noqa: E731
         resize(driver, 1000)
         fleets.create("north", [*PLACES])
         for uav in PLACES:
             report(fleets, uav, 1)
-        fleets.advise("north", ["A"], time.time())
+        fleets.take("north", Fleet.advised, Asking(uavs=["A"]), time.time())
         driver.get(f"{address}/fleets/north/map")
         field = driver.find_element("id", "token")
         field.send_keys("wrong\n")
