@@ -47,7 +47,7 @@ POLICIES = {
         "minute, at most six of them open at once.",
     ),
     "convoy": (
-        "scenario=convoy frames=600000 observation.own=true model=gru delay.obs=1..7 seed=0",
+        "scenario=convoy frames=600000 aware=timeline model=gru delay.obs=1..7 seed=0",
         "UAVs of 10, 15 and 20 m/s that follow two sources in the paper's polygon, and no other region.",
     ),
     "tracking": (
