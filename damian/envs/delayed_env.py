@@ -82,7 +82,8 @@ class DelayedEnv(TransformedEnv):
         """Compile a step with its transforms as one graph, on a GPU as one CUDA graph.
 
         Args:
-            cuda_graph: on a GPU, launch all kernels at once, for the memory of a state and a step.
+            cuda_graph: on a GPU, launch all kernels at once, for the memory of a state and a step. A step
+                then changes the state in place: clone what ``state`` or ``state_dict`` have given.
             options: of ``torch.compile``.
         """
         methods = CompiledMethods(options, cuda_graph and self.uav_env.device.type == "cuda")
