@@ -16,7 +16,6 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.fields import leaves, value_at
 from damian.common.tables import write_csv
 from damian.compare.comparison import RUN, TRAINED
 from damian.compare.config import Experiment
@@ -29,17 +28,11 @@ from . import cli
 from .config import SubmitConfig
 from .known import key_of
 from .shared.comparison_runs import stored_results
-from .shared.runs import stored_values
+from .shared.runs import changed_settings
 
-OF_TASKS = ["agents", "region", "motion", "wind", "source", "requests", "battery", "reward", "episode"]
-OF_TASKS += [
-    "clock",
-    "links",
-    "randomise",
-    "frames",
-    *(f"delay.{of}" for of in ("obs", "act", "rew", "loss")),
-]
-"""Settings that a task and its delay state, and no method changes."""
+_NAMES = "agents region motion wind source requests battery reward episode clock links randomise frames"
+OF_TASKS = tuple(f"{name}." for name in f"{_NAMES} delay.obs delay.act delay.rew delay.loss".split())
+"""How the keys of settings begin that a task and its delay state, and no method changes."""
 
 
 def delaybench() -> Experiment:
@@ -47,12 +40,16 @@ def delaybench() -> Experiment:
     return cli.settings("experiment=delaybench", program="compare").experiment
 
 
-def submission(folder: Path, method: str, authors: str) -> pd.DataFrame:
+def submission(folder: Path, method: str, authors: str, experiment: Experiment) -> pd.DataFrame:
     """The rows of a method in the folder of a comparison, beside what their run folders tell."""
     rows = stored_results(folder).rows
     checks.one_of("method", method, [*rows["method"].unique()])
     rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
-    words, facts, trained = words_of_tasks(), list[dict[str, object]](), dict[tuple[str, str], Path]()
+    words, facts, trained = (
+        words_of_tasks(experiment),
+        list[dict[str, object]](),
+        dict[tuple[str, str], Path](),
+    )
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
         run = folder / task / delay / method / f"seed_{seed}"
         record, should = read_record(run), "is not the folder of a finished run: keep those of all runs"
@@ -70,19 +67,17 @@ def submission(folder: Path, method: str, authors: str) -> pd.DataFrame:
     return known.assign(authors=authors, parameters=size)[COLUMNS]
 
 
-def words_of_tasks() -> dict[tuple[str, str], list[str]]:
-    """The settings of each task of delaybench under each delay."""
-    tasks, delays = delaybench().tasks, delaybench().delays
+def words_of_tasks(experiment: Experiment) -> dict[tuple[str, str], list[str]]:
+    """The settings of each task under each delay."""
+    tasks, delays = experiment.tasks, experiment.delays
     return {(task, delay): [*tasks[task], *delays[delay]] for task in tasks for delay in delays}
 
 
 def check_task(run: Path, words: Sequence[str]) -> None:
     """Require that a run was in the task, under the delay, and for the steps that these settings state."""
-    stored = stored_values(run, "folder")
-    for key, asked in leaves(_composed(*words)):
-        if f"{key}.".startswith(tuple(f"{name}." for name in OF_TASKS)):
-            found = value_at(stored, key)
-            checks.require(found == asked, f"{run}: {key}", found, f"is not {asked}, as the task has it")
+    for key, found, asked in changed_settings(_composed(*words), run, "folder"):
+        of_task = f"{key}.".startswith(OF_TASKS)
+        checks.require(not of_task, f"{run}: {key}", found, f"is not {asked}, as the task has it")
 
 
 _composed = cache(cli.settings)  # the same for all runs of a task
@@ -102,8 +97,9 @@ def _count(value: object) -> int:
 
 def submit(config: SubmitConfig) -> None:
     """Check a submission, and write its file."""
-    rows = submission(Path(config.folder), config.method, config.authors)
-    check_submission(rows, delaybench(), config.folder)
+    experiment = delaybench()
+    rows = submission(Path(config.folder), config.method, config.authors, experiment)
+    check_submission(rows, experiment, config.folder)
     path = Path(f"{config.method}.csv")
     write_csv(path, rows)
     print(

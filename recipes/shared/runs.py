@@ -114,14 +114,23 @@ def _same_policy(config: TrainConfig, folder: Path) -> bool:
     return policy is None or policy == digest(checkpoint_file(Path(str(config.checkpoint))))
 
 
+def changed_settings(config: TrainConfig, folder: Path, key: str) -> Iterator[tuple[str, Any, Any]]:
+    """Settings that differ from those in a run folder: their keys, the stored values, and these.
+
+    ``key`` is the setting that names the folder.
+    """
+    stored = stored_values(folder, key)
+    for name, new in leaves(config):
+        if (old := value_at(stored, name)) != new:
+            yield name, old, new
+
+
 def check_stored(config: TrainConfig, folder: Path) -> None:
     """Check that a run folder is empty or holds a run with the same settings."""
     if not (folder / CONFIG).exists():
         return
-    stored = stored_values(folder, "hydra.run.dir")
-    for key, new in leaves(config):
-        old = value_at(stored, key)
-        if old != new and key not in ("resume", "checkpoint", "learner.teacher", "trust"):
+    for key, old, new in changed_settings(config, folder, "hydra.run.dir"):
+        if key not in ("resume", "checkpoint", "learner.teacher", "trust"):
             raise InputError(
                 f"{folder}: {key} is {old} in this stored run, and {new} is asked "
                 "for: delete the folder, or choose another one with hydra.run.dir"
