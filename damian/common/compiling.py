@@ -53,19 +53,16 @@ class CudaGraph:
         if self._calls == 3:
             inputs, self._form = tree_flatten(args)
             self._inputs = [x.clone() for x in inputs]
-            own = self._arguments()
+            self._own = tree_unflatten(self._inputs, self._form)
             with torch.cuda.graph(self._graph):
-                first, second, *self._others = self._function(*own)
+                first, second, *self._others = self._function(*self._own)
                 computed = tree_map(Tensor.clone, (first, second))  # since one may be another's input
-                tree_map(Tensor.copy_, own[:2], computed)
+                tree_map(Tensor.copy_, self._own[:2], computed)
         for mine, given in zip(self._inputs, self._form.flatten_up_to(args), strict=True):
             if mine is not given:
                 mine.copy_(given)
         self._graph.replay()
-        return *self._arguments()[:2], *tree_map(Tensor.clone, self._others)
-
-    def _arguments(self) -> Any:
-        return tree_unflatten(self._inputs, self._form)
+        return *self._own[:2], *tree_map(Tensor.clone, self._others)
 
 
 def compiled(function: Function, **options: Any) -> Function:
