@@ -246,7 +246,7 @@ def until(
 ) -> tuple[float, int]:
     """Processor time [s] and steps until the mean return of the episodes that a batch ends reaches ``goal``.
 
-    Infinite if it does not within ``frames`` steps.
+    Infinite if it does not within ``frames`` steps. Kernels that other processes compile do not count.
     """
     begin, steps = time.process_time(), 0
     for _, batch in iterations:

@@ -180,7 +180,7 @@ def ended_episodes(world: TensorDictBase) -> list[dict[str, float]]:
 def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when_all_have_one(monkeypatch):
     monkeypatch.setattr(EpisodeLog, "EPISODES", 3 * len(batch := training_batch()))
     log = EpisodeLog(len(batch))
-    for part in batch.split(3, 1):  # of which some end no episode
+    for part in batch.split(3, 1):  # in some parts no episode ends
         state, log = log.state_dict(), EpisodeLog(len(batch))
         log.load_state_dict(state)
         log.add(part)

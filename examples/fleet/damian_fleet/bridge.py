@@ -235,7 +235,7 @@ class Bridge:
             said = seen["EXTENDED_SYS_STATE"].landed_state if "EXTENDED_SYS_STATE" in seen else 0
             self.on_ground = said == low or (not self.armed and self.height < 0.5)
             self.in_air = not self.on_ground and (said > low or (self.armed and self.height > 1))
-        if "SYS_STATUS" in seen:  # which may tell of the checks before arming
+        if "SYS_STATUS" in seen:  # has a bit for the pre-arm checks
             status, bit = seen["SYS_STATUS"], mavlink.MAV_SYS_STATUS_PREARM_CHECK
             passed = ~status.onboard_control_sensors_present | status.onboard_control_sensors_health
             self.is_ready = bool(passed & bit)

@@ -470,7 +470,7 @@ class Fleet:
         return self.danger(uav) not in (None, decision.reason) or self._meets(uav, decision, {})
 
     def _start(self, uav: Uav, point: int) -> tuple[float, float]:
-        """Where a UAV stands, by its newest report if that tells of this landing point [m]."""
+        """Position of a UAV [m]: by its newest report, if it stands at this landing point; or the point."""
         newest = self._newest(uav)
         if newest.point != point or newest.report.flies:
             return tuple(self.ground.points[point].tolist())
@@ -503,7 +503,7 @@ class Fleet:
         return self._decision(uav, None, goal, reason)
 
     def _decision(self, uav: Uav, action: Any, goal: int, reason: str | None = None) -> Decision:
-        """A decision for a UAV where it stands, or is bound for."""
+        """A decision for a UAV, made from where it stands or will land."""
         origin, step = self._standing(uav.id, True), self.tracker.step
         start, until = self._start(uav, origin), self.clock + self.config.answer_time
         duration = self._flight(uav, start, goal)[0] if goal != origin else 0.0
