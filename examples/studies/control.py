@@ -3,6 +3,7 @@
     python examples/studies/control.py --jobs 2                  (Pendulum-v1; an hour, two free cores)
     python examples/studies/control.py --methods history bpql         (these methods only)
     python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out runs/control_random
+                                                    (delays are drawn from 1 to 7 steps: two hours)
     python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 --hidden 256 \\
         --lr 3e-4 --episodes 10 --out runs/cheetah               (pip install "gymnasium[mujoco]"; 50 minutes)
     ... --shortest 1 --out runs/cheetah_random                   (delays are drawn from 1 to 9 steps)
@@ -10,8 +11,11 @@
 These methods are trained for each seed: undelayed; naive, whose observations are late; history, which also
 observes the agent's latest actions, with the age of the observation if that varies (an augmented state); and
 bpql, whose actor is the same, but whose critics read only the state, as it is known once it has arrived
-(``BackupdateStorage``). The undelayed policy is also evaluated under the delay. The folder gets the mean
-returns as results.md and results.csv, and a JSON file for each method and seed.
+(``BackupdateStorage``). Where delays vary, there are two more ways to observe for each of the last two:
+timeline, all that has arrived, by when it was true (``ObservationTimeline``); and hold, a jitter buffer, in
+which observations wait until they are as old as the oldest may be. The undelayed policy is also evaluated
+under the delay. The folder gets the mean returns as results.md and results.csv, and a JSON file for each
+method and seed.
 """
 
 import csv
@@ -30,6 +34,7 @@ from torchrl.envs import (
     Compose,
     DoubleToFloat,
     EnvBase,
+    FlattenObservation,
     GymEnv,
     RenameTransform,
     RewardSum,
@@ -51,9 +56,10 @@ from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
-from damian.transforms import ActionHistory, ObservationDelay, set_seed
+from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline, set_seed
 
-METHODS = ("undelayed", "naive", "history", "bpql")
+CONSTANT = ("undelayed", "naive", "history", "bpql")
+METHODS = (*CONSTANT, "timeline", "bpql+timeline", "hold", "bpql+hold")
 RANDOM_STEPS = 1000  # steps with random actions before the first update
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 BATCH, GAMMA, TAU = 256, 0.99, 0.005
@@ -73,6 +79,8 @@ class Task(NamedTuple):
     """Longest delay [steps]."""
     history: int = 0
     """Number of latest actions that are appended to the actor's observation."""
+    timeline: bool = False
+    """Does the actor observe all that has arrived of the latest steps, instead of the newest message?"""
 
     @property
     def horizon(self) -> int:
@@ -104,7 +112,12 @@ def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
     ]
     ages = ["age"] * (varies and task.history > 0)
     transforms.append(CatTensors(["received"], "state", del_keys=False))
-    transforms.append(CatTensors(["received", *ages], "observed", del_keys=False))
+    read = ["received", *ages]
+    if task.timeline:
+        transforms.append(ObservationTimeline(task.longest + 1, delay_key="delay"))
+        transforms.append(FlattenObservation(-2, -1, ["timeline"]))
+        read = ["timeline"]
+    transforms.append(CatTensors(read, "observed", del_keys=False))
     if task.history:
         transforms.append(ActionHistory(task.history, append_to="observed"))
     # The learner expects these keys; a single agent needs no agent dimension.
@@ -175,11 +188,13 @@ def run_method(method: str, seed: int, args: Namespace) -> dict[str, float]:
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     shortest = args.delay if args.shortest is None else args.shortest
-    late = Task(args.env, shortest, args.delay, args.delay * (method in ("history", "bpql")))
+    history = args.delay * (method not in ("undelayed", "naive"))
+    sent = args.delay if "hold" in method else shortest
+    late = Task(args.env, sent, args.delay, history, "timeline" in method)
     task = Task(args.env) if method == "undelayed" else late
     env = make_env(task)
     set_seed(env, seed)
-    learner = make_learner(env, method == "bpql", args.steps, args.delay, args.hidden, args.lr)
+    learner = make_learner(env, "bpql" in method, args.steps, args.delay, args.hidden, args.lr)
     with tqdm(total=args.steps, desc=f"seed {seed} {method}") as bar:
         train(env, learner, args.steps, bar)
     name = f"{shortest} to {args.delay}" if shortest < args.delay else str(args.delay)
@@ -214,6 +229,8 @@ def main(words: list[str] | None = None) -> None:
     options.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
     options.add_argument("--lr", type=float, default=1e-3, help="learning rate of Adam")
     args = options.parse_args(words)
+    if args.shortest is None and args.methods == list(METHODS):
+        args.methods = list(CONSTANT)
     print(table(carried_out(args, run_method), args))
 
 
