@@ -73,9 +73,11 @@ package: $(VENV)/package
 bench: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py $(ARGS)
 
-# How long trainings take to reach a return, beside TorchRL: ten minutes.
-bench-training: $(VENV)/bench
-	$(PY) examples/benchmarks/bench_training.py $(ARGS)
+BENCHMARL := build/benchmarl-venv
+
+# How long trainings take to reach a return, beside TorchRL and BenchMARL: fifteen minutes.
+bench-training: $(BENCHMARL)/ready
+	PYTHONPATH=examples/benchmarl $(BENCHMARL)/bin/python examples/benchmarks/bench_training.py $(ARGS)
 
 # On a machine with a GPU; ARGS="--device cpu --worlds 64" tries it without.
 bench-gpu: $(VENV)/bench
@@ -103,7 +105,6 @@ bench-quick: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py quick
 
 # Algorithms of BenchMARL, in an environment of its own: it asks for another TorchRL than ours. Fails if one learns nothing.
-BENCHMARL := build/benchmarl-venv
 BENCHMARL_TRAIN = TQDM_DISABLE=1 $(BENCHMARL)/bin/python examples/benchmarl/train.py --folder build/benchmarl
 benchmarl: $(BENCHMARL)/ready
 	$(BENCHMARL_TRAIN) --algorithm mappo $(ARGS)

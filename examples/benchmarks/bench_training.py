@@ -5,7 +5,8 @@ They take turns, iteration by iteration, so that a busy machine slows all of the
 
     python examples/benchmarks/bench_training.py --seeds 3     (make bench-training)
 
-trains until a return is reached, on crowded ground, and beside it TorchRL's MAPPO on the same environment.
+trains until a return is reached, on crowded ground, and beside it TorchRL's MAPPO on the same environment,
+and that of BenchMARL where it is installed.
 """
 
 import importlib.util
@@ -13,6 +14,7 @@ import math
 import statistics
 import time
 from argparse import ArgumentParser
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, cast
 
@@ -221,7 +223,6 @@ def agent_network(
 
 TASK = "scenario=delaybench/crowded"
 OURS = {"damian train": "compile=false", "damian train, compiled": "compile=true"}
-THEIRS = "TorchRL's MAPPO on our environment"
 
 
 def discrete_actor(env: EnvBase, config: TrainConfig) -> ProbabilisticActor:
@@ -241,38 +242,45 @@ def discrete_actor(env: EnvBase, config: TrainConfig) -> ProbabilisticActor:
     )
 
 
-def until(
-    iterations: Iterator[tuple[Seconds, TensorDictBase]], goal: float, frames: int
-) -> tuple[float, int]:
+class Meter:
     """Processor time [s] and steps until the mean return of the episodes that a batch ends reaches ``goal``.
 
     Infinite if it does not within ``frames`` steps. Kernels that other processes compile do not count.
     """
-    begin, steps = time.process_time(), 0
-    for _, batch in iterations:
-        steps += batch.numel()
+
+    def __init__(self, goal: float, frames: int) -> None:
+        self.goal, self.frames, self.steps, self.begin = goal, frames, 0, time.process_time()
+
+    def after(self, batch: TensorDictBase) -> tuple[float, int] | None:
+        """What has been measured, once that is decided."""
+        self.steps += batch.numel()
         over = batch["next", "done"].squeeze(-1)
-        if over.any() and batch[keys.next_key(keys.EPISODE_REWARD)][over].mean() >= goal:
-            return time.process_time() - begin, steps
-        if steps >= frames:
-            return math.inf, steps
-    raise AssertionError("iterations never end")
+        if over.any() and batch[keys.next_key(keys.EPISODE_REWARD)][over].mean() >= self.goal:
+            return time.process_time() - self.begin, self.steps
+        return (math.inf, self.steps) if self.steps >= self.frames else None
+
+
+def until(batches: Iterator[tuple[Seconds, TensorDictBase]], meter: Meter) -> tuple[float, int]:
+    """What the meter measures of a training."""
+    return next(found for _, batch in batches if (found := meter.after(batch)))
 
 
 def to_a_return(goal: float, seeds: int, frames: int) -> str:
     """Processor time and steps until trainings without delay reach a return, median (least, most)."""
-    found: dict[str, list[tuple[float, int]]] = {name: [] for name in (*OURS, THEIRS)}
+    found: dict[str, list[tuple[float, int]]] = defaultdict(list)
     for seed in tqdm(range(seeds), "seeds"):
         for name, words in OURS.items():
             torch.manual_seed(seed)
-            config = composed_config(*TASK.split(), words, f"seed={seed}")
-            found[name].append(until(damian_batches(config), goal, frames))
+            config, meter = composed_config(TASK, words, f"seed={seed}"), Meter(goal, frames)
+            found[name].append(until(damian_batches(config), meter))
+        config = composed_config(TASK, f"seed={seed}")
         torch.manual_seed(seed)
-        config = composed_config(*TASK.split(), f"seed={seed}")
-        env = learning_env(config)
-        found[THEIRS].append(
-            until(mappo_batches(config, env, discrete_actor(env, config), True), goal, frames)
-        )
+        meter, env = Meter(goal, frames), learning_env(config)
+        rival = mappo_batches(config, env, discrete_actor(env, config), True)
+        found["TorchRL's MAPPO, the same environment"].append(until(rival, meter))
+        if importlib.util.find_spec("benchmarl"):
+            rival_until = importlib.import_module("until").until
+            found["BenchMARL's, the same"].append(rival_until(config, [TASK], Meter(goal, frames).after))
     rows = []
     for name, runs in found.items():
         cells = [(statistics.median(x), min(x), max(x)) for x in zip(*runs, strict=True)]

@@ -1,0 +1,60 @@
+"""BenchMARL's MAPPO, with settings of ``damian train``, until a return is reached: for ``make bench-training``."""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from typing import cast
+
+import compat  # noqa: F401  before BenchMARL
+from benchmarl.algorithms import MappoConfig
+from benchmarl.experiment import Callback, Experiment, ExperimentConfig
+from benchmarl.models.mlp import MlpConfig
+from tensordict import TensorDictBase
+from uav_task import UavTask
+
+from damian.learners import mappo
+from damian.recipes.config import TrainConfig
+
+Measured = tuple[float, int]
+"""Processor time [s] and steps."""
+
+
+class Reached(Exception):
+    """Ends an experiment: its argument is what was measured."""
+
+
+class Ends(Callback):
+    """Ends an experiment when ``after``, of a batch, returns what was measured instead of None."""
+
+    def __init__(self, after: Callable[[TensorDictBase], Measured | None]) -> None:
+        super().__init__()
+        self.after = after
+
+    def on_batch_collected(self, batch: TensorDictBase) -> None:
+        if found := self.after(batch):
+            raise Reached(found)
+
+
+def until(
+    config: TrainConfig, words: Sequence[str], after: Callable[[TensorDictBase], Measured | None]
+) -> Measured:
+    """Train with the batches, widths and settings of ``config``, composed of ``words``, until ``after`` ends it."""
+    ours = cast(mappo.MappoConfig, config.learner)
+    batch, options = config.worlds * config.update_steps, ExperimentConfig.get_from_yaml()
+    options.on_policy_n_envs_per_worker, options.on_policy_collected_frames_per_batch = config.worlds, batch
+    options.on_policy_minibatch_size = batch // ours.minibatches
+    options.on_policy_n_minibatch_iters = ours.epochs
+    options.lr, options.gamma, options.clip_grad_val = ours.lr, ours.gamma, ours.max_grad_norm
+    options.prefer_continuous_actions = options.evaluation = options.render = options.create_json = False
+    options.loggers = []
+    algorithm, model = MappoConfig.get_from_yaml(), MlpConfig.get_from_yaml()
+    algorithm.entropy_coef, algorithm.clip_epsilon = ours.entropy_coeff, ours.clip_epsilon
+    algorithm.lmbda = ours.lmbda
+    model.num_cells = list(config.model.hidden)
+    task = UavTask("until", {"overrides": list(words)})
+    with tempfile.TemporaryDirectory() as options.save_folder:
+        experiment = Experiment(task, algorithm, model, config.seed, options, callbacks=[Ends(after)])
+        try:
+            experiment.run()
+        except Reached as end:
+            return end.args[0]
+    raise AssertionError("BenchMARL ends by itself")
