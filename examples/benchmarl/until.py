@@ -1,4 +1,4 @@
-"""BenchMARL's MAPPO with settings of ``damian train``, until a return is reached (``make bench-training``)."""
+"""BenchMARL's MAPPO, set as ``damian train`` is, until a return is reached (``make bench-training``)."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ class Ends(Callback):
 def until(
     config: TrainConfig, words: Sequence[str], after: Callable[[TensorDictBase], Measured | None]
 ) -> Measured:
-    """Train with the batches and settings of ``config``, which is made of ``words``, until ``after`` ends it."""
+    """Train with the settings of ``config``, which is made of ``words``, until ``after`` ends it."""
     ours = cast(mappo.MappoConfig, config.learner)
     batch, options = config.worlds * config.update_steps, ExperimentConfig.get_from_yaml()
     options.on_policy_n_envs_per_worker, options.on_policy_collected_frames_per_batch = config.worlds, batch
