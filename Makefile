@@ -5,7 +5,9 @@ PYTHON ?= python3
 VENV   ?= .venv
 TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
-PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
+# Modules are compiled when they are first imported, a third of what pip would compile.
+PIP     = $(PY) -m pip install --quiet --disable-pip-version-check --no-compile $(CONSTRAINTS)
+export PYTHONDONTWRITEBYTECODE :=
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
 .PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-training bench-gpu fleet fleet-campaign benchmarl upstream pictures docs page-libraries check format clean
@@ -152,10 +154,9 @@ format: $(VENV)/dev
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
 
-# Torch first and by itself: an unpinned one would bring gigabytes of CUDA along.
+# An unpinned torch would bring gigabytes of CUDA along.
 $(VENV)/base: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) "$(TORCH)"
 	$(PIP) -e . "$(TORCH)"
 	touch $@
 
@@ -171,9 +172,9 @@ $(VENV)/docs: $(VENV)/base
 	$(PIP) -e ".[docs]" "$(TORCH)"
 	touch $@
 
-$(VENV)/dev: $(VENV)/test
-	$(PIP) -e ".[dev]" "$(TORCH)"
-	touch $@
+$(VENV)/dev: $(VENV)/base
+	$(PIP) -e ".[test,dev]" "$(TORCH)"
+	touch $(VENV)/test $@
 
 $(VENV)/package: $(VENV)/base
 	$(PIP) build twine
