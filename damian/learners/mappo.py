@@ -36,6 +36,9 @@ LOSS_KEYS: list[NestedKey] = [
 ]
 """Entries of a step that the loss reads, besides the critic's observation."""
 
+UNREAD: list[NestedKey] = ["collector", keys.LOGITS, keys.LOC, keys.SCALE, keys.next_key(keys.ACTION_MASK)]
+"""Entries that MAPPO never reads; they are not stored."""
+
 
 class Mappo:
     """Multi-agent PPO, which with a replay ``buffer`` on a ``BackupdateStorage`` reads corrected batches."""
@@ -49,6 +52,8 @@ class Mappo:
         self.actor = config.make_actor(env, setup.model)
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
+        observed = setup.recompute_actor or setup.critic_key == keys.OBSERVATION
+        self.unread = UNREAD if observed else [*UNREAD, keys.next_key(keys.OBSERVATION)]
         self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
         # Compiling a recurrent actor, whose loop over time becomes one graph, takes many minutes.
         compiles = setup.compile and not setup.model.recurrent
@@ -78,8 +83,8 @@ class Mappo:
         """
         if self.buffer is None:
             return batch
-        self.buffer.extend(batch)
         storage, settle = cast(BackupdateStorage, self.buffer.storage), self.setup.settle_steps
+        self.buffer.extend(batch.exclude(*self.unread))
         latest = storage.latest(batch.shape[1] + settle)
         batch = storage[latest[: len(latest) - settle]].transpose(0, 1)
         if self.setup.recompute_actor:

@@ -164,7 +164,7 @@ class BackupdateStorage(TimeStorage):
         n_steps = min(n_steps, len(index))
         read = n_steps + min(self.lookback + 1, len(index) - n_steps)
         messages, added = self._messages_by_now(self.rows(index), read)
-        recomputed = self._recomputed(self.rows(index[-read:]), messages, read - n_steps)
+        recomputed = self._recomputed(index[-read:], messages, read - n_steps)
         entries = {**recomputed, **added}
         self.overwrite(index[-n_steps:], {key: value[-n_steps:] for key, value in entries.items()})
 
@@ -183,8 +183,9 @@ class BackupdateStorage(TimeStorage):
         hindsight = {self._hindsight: latest, self._hindsight_age: age}
         return latest, cast(Entries, hindsight if self._hindsight else {})
 
-    def _recomputed(self, steps: TensorDictBase, messages: Tensor | None, n_right: int) -> Entries:
-        """The corrected entries of steps [T, B]; the first ``n_right`` are stored as they should be."""
+    def _recomputed(self, index: Tensor, messages: Tensor | None, n_right: int) -> Entries:
+        """The corrected entries of the steps at ``index`` [T]; the first ``n_right`` are right already."""
+        steps = self.rows(index)
         begins = steps[self._count].squeeze(-1) == 0
         entries = self.recompute(steps, messages) if self.recompute and messages is not None else {}
         after = self._correct(entries, steps)
@@ -205,7 +206,7 @@ class BackupdateStorage(TimeStorage):
             paid = cast(Callable[..., Tensor], late.paid)(steps, steps[self._count].squeeze(-1))
             changed = paid & (steps[self._delay] > 0)
         marks = {self._backupdated: changed, keys.VALID: ~over.unsqueeze(-1)}
-        return {**after, **_before(steps, after, begins, n_right), **marks}
+        return {**after, **self._before(index, after, begins, n_right), **marks}
 
     def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
         """Apply the corrections to what ``recompute`` returned for steps [T, B]."""
@@ -217,11 +218,28 @@ class BackupdateStorage(TimeStorage):
         for correction in self.corrections:
             entries = correction.correct(entries, steps, count)
         for key, value in entries.items():
-            stored = steps.get(key, None)
+            stored = self.steps.get(key, None)
             should = "is not an entry after the steps of the same shape and dtype"
-            same = stored is not None and (value.shape, value.dtype) == (stored.shape, stored.dtype)
-            checks.require(same and key[0] == "next", "recompute", key, should)
+            same = stored is not None and value.shape == (*steps.shape, *stored.shape[2:])
+            checks.require(
+                same and value.dtype == stored.dtype and key[0] == "next", "recompute", key, should
+            )
         return entries
+
+    def _before(self, index: Tensor, after: Entries, begins: Tensor, n_right: int) -> Entries:
+        """Entries before the steps that follow the right ones: those after the step before each."""
+        keep = begins[n_right:].clone()
+        keep[0] |= n_right == 0  # the step before the first one is not among these steps
+        step, world = keep.nonzero(as_tuple=True)
+        before: Entries = {}
+        for next_, value in after.items():
+            key = unravel_key(next_[1:])
+            stored = None if next_ in ENDS else self.steps.get(key, None)
+            if stored is not None:
+                previous = value[n_right - 1 : -1] if n_right else value.roll(1, 0)
+                before[key] = previous.clone()
+                before[key][step, world] = stored[index[n_right:][step], world]
+        return before
 
 
 def _rewards_changed(after: Entries, steps: TensorDictBase, changed: Tensor) -> Tensor:
@@ -233,18 +251,3 @@ def _rewards_changed(after: Entries, steps: TensorDictBase, changed: Tensor) -> 
             of_sender = now if now.shape == changed.shape else expand_mask(now.flatten(2).any(-1), changed)
             changed = changed | of_sender
     return changed
-
-
-def _before(steps: TensorDictBase, after: Entries, begins: Tensor, n_right: int) -> Entries:
-    """Entries before the steps [T, B] that follow the right ones: those after the step before each."""
-    keep = begins[n_right:].clone()
-    keep[0] |= n_right == 0  # the step before the first one is not among these steps
-    before: Entries = {}
-    for next_, value in after.items():
-        key = unravel_key(next_[1:])
-        stored = None if next_ in ENDS else steps.get(key, None)
-        if stored is not None:
-            stored = stored[n_right:]
-            previous = value[n_right - 1 : -1] if n_right else torch.cat([value[:1], value[:-1]])
-            before[key] = torch.where(expand_mask(keep, stored), stored, previous)
-    return before

@@ -7,7 +7,7 @@ available from step g + d on, even if its episode has ended meanwhile.
 import torch
 from torch import Tensor
 
-from damian.common.tensors import expand_mask
+from damian.common.tensors import expand_mask, gather_rows
 
 
 def latest_arrived(sent: Tensor, delay: Tensor, held: Tensor, age: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,4 +54,5 @@ def _steps(like: Tensor) -> Tensor:
 
 def _at(rows: Tensor, step: Tensor) -> Tensor:
     """``rows[step[t, *], *]`` for every t and *, [T, *, M]."""
-    return rows.gather(0, step.unsqueeze(-1).expand_as(rows))
+    column = torch.arange(step[0].numel(), device=step.device).view_as(step[0])
+    return gather_rows(rows.flatten(0, -2), step * column.numel() + column)

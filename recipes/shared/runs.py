@@ -18,6 +18,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from damian.common.atomic_files import remove_unfinished, write_atomically
+from damian.common.devices import keep_freed_memory
 from damian.common.errors import InputError, RunError
 from damian.common.fields import default_of, filled, has, leaves, nested, set_at, value_at
 from damian.common.registry import stored_settings
@@ -143,6 +144,7 @@ def perform(config: TrainConfig, folder: Path, work: Work, key: str = "hydra.run
     ``key`` is the setting that names the folder.
     """
     torch.set_num_threads(1)
+    keep_freed_memory()
     seed_generators(config.seed)
     with locked(folder, key):
         if (folder / CONFIG).exists() and (folder / CHECKPOINT).exists() and _same_policy(config, folder):
