@@ -10,6 +10,7 @@ and written to runs/bench.md, with a figure in runs/bench.png.
 
 import importlib.util
 import subprocess
+import sys
 from argparse import ArgumentParser
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -396,6 +397,8 @@ def measure(names: Sequence[str]) -> None:
         "memory": lambda: memory(presets),
         "training": lambda: training_speed(sizes),
     }
+    if unknown := [name for name in names if name not in parts]:
+        sys.exit(f"{unknown[0]} is none of the parts {', '.join(parts)}")
     for name in names or [name for name in parts if name != "quick"]:
         report.append(parts[name]())
         print(report[-1])
