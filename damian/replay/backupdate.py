@@ -220,10 +220,9 @@ class BackupdateStorage(TimeStorage):
         for key, value in entries.items():
             stored = self.steps.get(key, None)
             should = "is not an entry after the steps of the same shape and dtype"
-            same = stored is not None and value.shape == (*steps.shape, *stored.shape[2:])
-            checks.require(
-                same and value.dtype == stored.dtype and key[0] == "next", "recompute", key, should
-            )
+            written = (*value.shape, value.dtype)
+            same = stored is not None and written == (*steps.shape, *stored.shape[2:], stored.dtype)
+            checks.require(same and key[0] == "next", "recompute", key, should)
         return entries
 
     def _before(self, index: Tensor, after: Entries, begins: Tensor, n_right: int) -> Entries:
