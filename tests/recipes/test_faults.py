@@ -9,9 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import check_refused
 from stopped_runs import TINY, at_each_update, ended, files, forked, killed_after
 
+from damian.common.devices import keep_freed_memory
 from damian.learners.mappo import Mappo
 from damian.recipes import train
 from damian.recipes.shared import learning
@@ -72,6 +74,14 @@ def test_worlds_that_do_not_fit_into_the_memory_are_refused(run, capsys, monkeyp
     should = "these worlds need about 0.6 GiB of memory, 0.5 are free: take fewer"
     check_refused(lambda: run(*TINY, "worlds=4"), f"worlds: 4 {should}", capsys)
     assert not Path("run").exists() or not files(Path("run"))
+
+
+def test_freed_memory_is_used_again():
+    keep_freed_memory()
+    for _ in range(4):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        [torch.ones(2**22) for _ in range(8)]  # 16 MiB each
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before < 2**13
 
 
 def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatch):

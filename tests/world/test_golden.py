@@ -1,9 +1,4 @@
-"""Comparison with runs recorded from the original implementation: moves, detections, geometry.
-
-A recorded value that this project computes differently is left out only for a named reason, whose
-condition is checked in the record itself. Each test pins how many values were compared, and how
-many were left out for each reason.
-"""
+"""As ``server/test_golden_rewards.py``: moves, detections, geometry."""
 
 import json
 import math
@@ -16,6 +11,7 @@ from golden_records import (
     CUMULATIVE,
     EPISODES,
     PERSISTENT,
+    TOLERANCE,
     Transition,
     column,
     ready_env,
@@ -28,8 +24,6 @@ from helpers import DATA, GOLDEN, act, nearest, sent_messages, usecase
 from damian.envs.uav_env import UavEnv
 from damian.world.landing import action_table
 from damian.world.motion import MotionConfig
-
-TOLERANCE = 1e-4
 
 
 def reason_for_other_point(case: int, transition: Transition, uav: int) -> str | None:
