@@ -1,6 +1,7 @@
 """Measures of episodes in evaluations and in training, and the files that hold them."""
 
 import math
+import time
 from statistics import fmean
 from typing import Any
 
@@ -235,9 +236,6 @@ def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_no
     assert (found.isnan().logical_not().sum(1) == 5).all()
 
 
-# Tables and files.
-
-
 def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
     log = MetricsLog(tmp_path)
     log.add(10, {"loss": 2.0, "old": 3.0})
@@ -253,6 +251,7 @@ def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
 
 def test_tensorboard_shows_numbers_up_to_where_a_run_resumed(tmp_path):
     for resumed, frames in ((0, [10, 20]), (10, [20, 30])):
+        time.sleep(1)  # files are in the order of the seconds in their names
         log = MetricsLog(tmp_path, to_csv=False, loggers=[TensorBoard(tmp_path, resumed)])
         for each in frames:
             log.add(each, {"loss": float(each + resumed)})
