@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
-# Modules are compiled when they are first imported, a third of what pip would compile.
+# Modules are compiled, and kept so, when they are first imported: pip would compile all of them.
 PIP     = $(PY) -m pip install --quiet --disable-pip-version-check --no-compile $(CONSTRAINTS)
 export PYTHONDONTWRITEBYTECODE :=
 

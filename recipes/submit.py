@@ -45,11 +45,8 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
     rows = stored_results(folder).rows
     checks.one_of("method", method, [*rows["method"].unique()])
     rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
-    words, facts, trained = (
-        words_of_tasks(experiment),
-        list[dict[str, object]](),
-        dict[tuple[str, str], Path](),
-    )
+    words = words_of_tasks(experiment)
+    facts, trained = list[dict[str, object]](), dict[tuple[str, str], Path]()
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
         run = folder / task / delay / method / f"seed_{seed}"
         record, should = read_record(run), "is not the folder of a finished run: keep those of all runs"

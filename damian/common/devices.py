@@ -31,7 +31,7 @@ def keep_freed_memory() -> None:
 
     The system would clear every page that it hands out again, which takes a tenth of a training's time.
     """
-    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
-        largest_kept, largest_tensor = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
-        ctypes.CDLL(None).mallopt(largest_kept, 2**31 - 1)
-        ctypes.CDLL(None).mallopt(largest_tensor, 2**25)
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD of malloc.h: the most that is kept
+        mallopt(-3, 2**25)  # M_MMAP_THRESHOLD: what is larger is not kept

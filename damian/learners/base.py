@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
+from damian import keys
 from damian.learners.config import LEARNERS, LearnerConfig, LearningSetup  # noqa: F401
 
 
@@ -35,6 +36,8 @@ class Learner(Protocol):
         ...
 
 
+UNREAD: list[NestedKey] = ["collector", keys.LOGITS, keys.LOC, keys.SCALE]
+"""Entries that a collector and an actor write, and no learner reads; they are not stored."""
 LARGEST_WEIGHT = 1e5
 """Weights of useful networks are thousands of times smaller."""
 

@@ -15,7 +15,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
 from damian.common.compiling import compiled
-from damian.learners.base import LearningSetup
+from damian.learners.base import UNREAD, LearningSetup
 from damian.learners.config import MappoConfig
 from damian.learners.networks import COMPILE_OPTIONS, NormalizedValue, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
@@ -36,9 +36,6 @@ LOSS_KEYS: list[NestedKey] = [
 ]
 """Entries of a step that the loss reads, besides the critic's observation."""
 
-UNREAD: list[NestedKey] = ["collector", keys.LOGITS, keys.LOC, keys.SCALE, keys.next_key(keys.ACTION_MASK)]
-"""Entries that MAPPO never reads; they are not stored."""
-
 
 class Mappo:
     """Multi-agent PPO, which with a replay ``buffer`` on a ``BackupdateStorage`` reads corrected batches."""
@@ -53,7 +50,8 @@ class Mappo:
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
         observed = setup.recompute_actor or setup.critic_key == keys.OBSERVATION
-        self.unread = UNREAD if observed else [*UNREAD, keys.next_key(keys.OBSERVATION)]
+        unread = [keys.ACTION_MASK] if observed else [keys.ACTION_MASK, keys.OBSERVATION]
+        self.unread = [*UNREAD, *map(keys.next_key, unread)]
         self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
         # Compiling a recurrent actor, whose loop over time becomes one graph, takes many minutes.
         compiles = setup.compile and not setup.model.recurrent

@@ -14,7 +14,7 @@ from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 
 from damian import keys
 from damian.keys import next_key
-from damian.learners.base import LearningSetup
+from damian.learners.base import UNREAD, LearningSetup
 from damian.learners.config import SacConfig
 from damian.learners.networks import ModelConfig, make_mlp
 from damian.replay.smdp import find_decisions, transitions
@@ -90,10 +90,7 @@ class Sac:
 
 
 _UNREAD: list[NestedKey] = [
-    "collector",
-    keys.LOGITS,
-    keys.LOC,
-    keys.SCALE,
+    *UNREAD,
     keys.ACTION_LOG_PROB,
     keys.EPISODE_REWARD,
     keys.MESSAGE,

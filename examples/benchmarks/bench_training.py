@@ -252,7 +252,7 @@ class Meter:
         self.goal, self.frames, self.steps, self.begin = goal, frames, 0, time.process_time()
 
     def after(self, batch: TensorDictBase) -> tuple[float, int] | None:
-        """What has been measured, once that is decided."""
+        """Processor time and steps if the training has ended with this batch, else None."""
         self.steps += batch.numel()
         over = batch["next", "done"].squeeze(-1)
         if over.any() and batch[keys.next_key(keys.EPISODE_REWARD)][over].mean() >= self.goal:
@@ -261,7 +261,7 @@ class Meter:
 
 
 def until(batches: Iterator[tuple[Seconds, TensorDictBase]], meter: Meter) -> tuple[float, int]:
-    """What the meter measures of a training."""
+    """Processor time and steps until the goal."""
     return next(found for _, batch in batches if (found := meter.after(batch)))
 
 

@@ -19,7 +19,7 @@ Measured = tuple[float, int]
 
 
 class Reached(Exception):
-    """Ends an experiment: its argument is what was measured."""
+    """Raised to end an experiment; its argument is the processor time and the steps."""
 
 
 class Ends(Callback):

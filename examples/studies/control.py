@@ -228,9 +228,9 @@ def main(words: list[str] | None = None) -> None:
     options.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
     options.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
     options.add_argument("--lr", type=float, default=1e-3, help="learning rate of Adam")
+    options.set_defaults(methods=None)  # which ones depends on the delays
     args = options.parse_args(words)
-    if args.shortest is None and args.methods == list(METHODS):
-        args.methods = list(CONSTANT)
+    args.methods = args.methods or list(CONSTANT if args.shortest is None else METHODS)
     print(table(carried_out(args, run_method), args))
 
 
