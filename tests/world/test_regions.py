@@ -1,7 +1,9 @@
 """FIR tables and maps: regions of valid files, and the one-line error of each invalid file."""
 
 import json
+import sqlite3
 import sys
+from contextlib import closing
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -113,7 +115,8 @@ def test_the_coordinate_reference_system_of_geojson_is_obeyed(tmp_path, holder):
 
 @pytest.mark.parametrize("turns", [-1, 0])
 def test_longitudes_of_an_area_across_the_antimeridian_may_go_beyond_180_degrees(tmp_path, turns):
-    lon, lat = np.array([[179.99, -17], [180.01, -17], [180.01, -16.99], [179.99, -16.99]]).T
+    corners = [[179.99, -17], [180.01, -17], [180.01, -16.99], [179.99, -16.99]]
+    lon, lat = np.array([*corners, corners[0]]).T
     found = []
     for written in (lon + 360 * turns, (lon + 180) % 360 - 180):
         ring = np.column_stack([written, lat]).tolist()
@@ -174,6 +177,47 @@ def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(
     _assert_one_line_error(file, "geoFence.circles: a circle is not read", lambda: read_area(file))
 
 
+PICTURES = """<GroundOverlay><name>photo</name><Icon><href>photo.png</href></Icon><LatLonBox>
+<north>45.1</north><south>45</south><east>8.1</east><west>8</west></LatLonBox></GroundOverlay><Placemark><name>start</name><Point>
+<coordinates>8,45</coordinates></Point></Placemark><Placemark><name>outline</name><LinearRing><coordinates>{}
+</coordinates></LinearRing></Placemark></Document>"""
+
+
+def test_only_areas_of_a_map_count_and_what_else_is_in_it_is_told_once(tmp_path, capsys):
+    file = _map(tmp_path / "map.kml")
+    drawn = read_area(file, every=True).polygon
+    rings = " ".join(f"{x},{y}" for x, y in RING)
+    text = file.read_text(encoding="utf-8").replace("</Document>", PICTURES.format(rings))
+    text = text.replace("<Polygon>", "<MultiGeometry><Polygon>", 1)
+    text = text.replace("</Polygon>", "</Polygon></MultiGeometry>", 1)
+    file.write_text(text, encoding="utf-8")
+    assert not capsys.readouterr().err
+    for _ in range(2):
+        assert read_area(file, every=True).polygon.equals(drawn)
+    told = "features[0] is a picture (GroundOverlay), features[1] is a Point, features[2] has no geometry"
+    assert capsys.readouterr().err == f"{file}: left out: {told}\n"
+    both = read_area(file, where=["name:Łąka: a=b", "NAME=yard"])
+    assert both.polygon.equals(drawn)
+    assert not capsys.readouterr().err  # what is left out was not chosen
+    points = _collection(POINT, _feature(_polygon(RING)))
+    read_area(_written(tmp_path, "points.geojson", points))
+    assert "points.geojson: left out: features[0] is a Point" in capsys.readouterr().err
+
+
+def test_layers_without_shapes_are_skipped(tmp_path, capsys):
+    file = _map(tmp_path / "styled.gpkg")
+    with closing(sqlite3.connect(file)) as tables:
+        tables.execute("CREATE TABLE layer_styles (id INTEGER PRIMARY KEY, styleQML TEXT)")
+        tables.execute("INSERT INTO layer_styles VALUES (1, '<qgis/>')")
+        tables.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type) VALUES ('layer_styles', 'attributes')"
+        )
+        tables.commit()
+    assert read_area(file, index=1).name == "yard"
+    assert read_area(file, every=True).polygon.area > 0
+    assert not capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("key", "sign", "value"), [("name", ":", "12:30"), ("ISO 3166:2", "=", "x=y:z")])
 def test_a_property_and_its_value_may_have_any_characters(tmp_path, key, sign, value):
     features = [_feature(_polygon(RING), **{key: "other"}), _feature(_polygon(RING), **{key: value})]
@@ -231,6 +275,8 @@ def test_an_invalid_table_raises_one_line_that_names_the_file_and_the_fault(tmp_
 FAR_HOLE = [[18, 45], [18.01, 45], [18.01, 45.01], [18, 45]]
 TWO_FEATURES = _collection(_feature(_polygon(RING), zone="a"), _feature(_polygon(RING), zone="b"))
 
+CORNERS = [[lat, lon] for lon, lat in RING]
+SURVEY = {"items": [{"complexItemType": "survey", "polygon": CORNERS}]}
 LINE = _feature({"type": "LineString", "coordinates": RING})
 METRES = _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]])
 
@@ -245,12 +291,33 @@ METRES = _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]])
         (LINE, {}, "feature is a LineString; a region is an area: draw a closed outline (Polygon)"),
         (METRES, {}, "[500000.0, 4000000.0] is not a longitude"),
         (_polygon(RING) | {"crs": _crs("EPSG:999999")}, {}, "reference system is not understood: "),
+        (_polygon(RING[:-1]), {}, "geometry: its outline is open: repeat the first corner at the end"),
+        (_polygon(*RING), {}, "geometry: its outline is not a list of corners [longitude, latitude]"),
         (_polygon(RING, FAR_HOLE), {}, "hole lies outside shell at [18, 45] deg"),
     ],
 )
 def test_an_invalid_map_raises_one_line_that_names_the_file_and_the_fault(tmp_path, content, choice, message):
     file = _written(tmp_path, "bad.geojson", content)
     _assert_one_line_error(file, message, lambda: read_area(file, **choice))
+
+
+@pytest.mark.parametrize(
+    ("fence", "message"),
+    [
+        ({}, "geoFence: the plan has none, and a survey is no area: draw a polygon as its fence"),
+        ({"geoFence": {"polygons": [], "version": 2}}, "geoFence: the plan has none"),
+        ({"geoFence": {"polygon": CORNERS}}, "geoFence: its version, before 2, is not read: draw a polygon"),
+        ({"geoFence": {"polygons": [{"inclusion": True, "polygon": CORNERS[:2]}]}}, "2 distinct points"),
+    ],
+)
+def test_a_plan_without_the_outline_of_a_fence_is_refused_with_the_remedy(tmp_path, fence, message):
+    file = _written(tmp_path, "fence.plan", {"fileType": "Plan", "mission": SURVEY, **fence})
+    _assert_one_line_error(file, message, lambda: read_area(file))
+
+
+def test_an_open_outline_of_a_kml_is_refused(tmp_path):
+    file, message = _map(tmp_path / "open.kml", ring=[*RING[:3], RING[1]]), "features[0]: "
+    _assert_one_line_error(file, message, lambda: read_area(file, index=1))
 
 
 def _assert_one_line_error(file: Path, message: str, read) -> None:

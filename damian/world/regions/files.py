@@ -3,7 +3,10 @@
 import json
 import os
 import re
+import sys
+import warnings
 from collections.abc import Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +16,7 @@ import shapely
 from shapely.geometry import mapping
 
 from damian.common.errors import InputError
-from damian.common.text_files import listed, named, near, read_text, show
+from damian.common.text_files import listed, named, near, one_line, read_text, show
 from damian.world.regions.geodesy import Floats
 from damian.world.regions.region import Region, local_region
 
@@ -21,6 +24,8 @@ _AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
 _DEGREES = re.compile(r"(CRS:?84|EPSG:[\d.]*:?4326)$", re.IGNORECASE)
 """Names of WGS 84, the coordinate reference system of GPS and of GeoJSON."""
 _REMEDY = "save the map in WGS 84 (EPSG:4326)"
+_DRAW = "draw a polygon as its fence in QGroundControl, and save it there"
+_KML = (".kml", ".kmz")
 
 
 class _Feature(NamedTuple):
@@ -52,12 +57,14 @@ def read_area(
     An area is a Polygon, a MultiPolygon, or what a GeometryCollection has of them. Heights are ignored.
     Parts that touch or overlap are united; those that a plan excludes are cut out.
 
-    Neither ``index`` nor ``where`` is needed if only one feature is an area.
+    Neither ``index`` nor ``where`` is needed if only one feature is an area. What is no area is left out,
+    which a line on stderr tells if nothing was chosen.
 
     Args:
         path: the file.
         index: the feature's index, counted from 0 over all features of the file, or a list of them.
-        where: a property that only the feature has, as ``property:value`` or ``property=value``, or a list.
+        where: a property that only the feature has, as ``property:value`` or ``property=value``, or a list;
+            the property's name may be in capitals or not.
         every: unite all features that are areas.
 
     Raises:
@@ -83,14 +90,28 @@ def read_area(
             raise
         except Exception as error:  # a file can hold anything at any place
             raise InputError(f"is not {kind}: {error!r}") from None
+        left_out = [each for each in features if each.fault and not each.is_excluded]
+        if left_out and (every or index is where is None):
+            _tell(f"{path}: left out: {listed(f'{each.place} {each.fault}' for each in left_out)}")
         names = [_name(each) or f"{path.stem} {each.place}" for each in chosen]
         return local_region(parts, listed(names), None, listed(each.place for each in chosen), excluded)
 
 
+@cache
+def _tell(line: str) -> None:
+    """Print a line once, however many environments read the map."""
+    print(one_line(line), file=sys.stderr)
+
+
+def _value(feature: _Feature, key: str) -> Any:
+    """A property of a feature, or the one whose name differs only in capitals: KML writes ``Name``."""
+    named_so = {each.lower(): value for each, value in feature.properties.items()}
+    return feature.properties.get(key, named_so.get(key.lower()))
+
+
 def _name(feature: _Feature) -> str:
-    """The name of a feature among its properties, which KML writes with a capital."""
-    names = (value for key, value in feature.properties.items() if key.lower() == "name")
-    return next((name for name in names if isinstance(name, str)), "")
+    name = _value(feature, "name")
+    return name if isinstance(name, str) else ""
 
 
 def _from_geojson(path: Path) -> list[_Feature]:
@@ -108,34 +129,57 @@ def _from_geojson(path: Path) -> list[_Feature]:
 
 
 def _from_plan(path: Path) -> list[_Feature]:
-    """The polygons of the fence of a plan, whose corners are latitude and longitude."""
-    fence, found = json.loads(read_text(path))["geoFence"], []
+    """The polygons of the fence of a plan, whose corners are latitude and longitude, the first once."""
+    fence, found = json.loads(read_text(path)).get("geoFence") or {}, []
     if fence.get("circles"):
         raise InputError("geoFence.circles: a circle is not read; draw a polygon in its place")
+    if "polygon" in fence:
+        raise InputError(f"geoFence: its version, before 2, is not read: {_DRAW}")
+    if not fence.get("polygons"):
+        raise InputError(f"geoFence: the plan has none, and a survey is no area: {_DRAW}")
     for i, each in enumerate(fence["polygons"]):
-        ring = [[lon, lat] for lat, lon in each["polygon"]]
-        geometry, is_excluded = {"type": "Polygon", "coordinates": [ring]}, not each["inclusion"]
+        ring = [[lon, lat] for lat, lon, *_ in each["polygon"]]
+        geometry = {"type": "Polygon", "coordinates": [ring + ring[:1]]}
+        is_excluded = not each["inclusion"]
         found.append(_Feature(f"geoFence.polygons[{i}]", {}, geometry, None, is_excluded))
     return found
 
 
 def _from_map(path: Path) -> list[_Feature]:
-    """All features of all layers of a file that GDAL reads."""
+    """All features of all layers of a file that GDAL reads, but of tables without shapes, such as styles."""
     pyogrio, found = _extra("pyogrio", f"a file {path.suffix}"), []
     if not path.is_file():
         raise InputError("no such file")
-    for layer in pyogrio.list_layers(path)[:, 0]:
-        about, _, shapes, columns = pyogrio.raw.read(path, layer=layer, force_2d=True)
+    for layer in (name for name, kind in pyogrio.list_layers(path) if kind is not None):
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of outlines that are open
+            about, _, shapes, columns = pyogrio.raw.read(path, layer=layer, force_2d=True)
         columns = [column.tolist() for column in columns]
         for i, shape in enumerate(shapes):
             properties = {name: column[i] for name, column in zip(about["fields"], columns, strict=True)}
-            geometry = {} if shape is None else mapping(shapely.from_wkb(shape))
-            found.append(_Feature(f"features[{len(found)}]", properties, geometry, about["crs"] or {}))
+            place = f"features[{len(found)}]"
+            if path.suffix.lower() in _KML and shape and _is_picture(properties):
+                geometry: dict[str, Any] = {"type": "picture (GroundOverlay)"}
+            else:
+                geometry = _of_wkb(shape, place)
+            found.append(_Feature(place, properties, geometry, about["crs"] or {}))
     return found
 
 
+def _is_picture(properties: dict[str, Any]) -> bool:
+    """Is a shape of a KML the outline of a picture? Of all others GDAL says whether they are extruded."""
+    return properties.get("extrude", 0) not in (0, 1)  # but None, or nan
+
+
+def _of_wkb(shape: bytes | None, place: str) -> dict[str, Any]:
+    """The geometry of well-known binary, as in GeoJSON; empty if there is none."""
+    try:
+        return mapping(shapely.from_wkb(shape)) if shape else {}
+    except shapely.errors.GEOSException as error:
+        raise InputError(f"{place}: {error}; draw a closed outline (Polygon)") from None
+
+
 _READERS = {".plan": (_from_plan, "a plan of QGroundControl")} | {
-    suffix: (_from_map, f"a map ({suffix})") for suffix in (".kml", ".kmz", ".gpkg", ".shp")
+    suffix: (_from_map, f"a map ({suffix})") for suffix in (*_KML, ".gpkg", ".shp")
 }
 """How files are read that are not GeoJSON, and what they are, by their suffixes."""
 
@@ -176,14 +220,14 @@ def _fitting(features: list[_Feature], where: str) -> _Feature:
     pairs = [(where[: sign.start()], where[sign.end() :]) for sign in re.finditer("[:=]", where)]
 
     def has(feature: _Feature, key: str, value: str) -> bool:
-        own = feature.properties.get(key)
+        own = _value(feature, key)
         return value in (str(own), json.dumps(own, ensure_ascii=False, default=str))
 
     found = [each for each in features if any(has(each, *pair) for pair in pairs)]
     if len(found) != 1:
         names = {name for each in features for name in each.properties}
         key, value = next((pair for pair in pairs if pair[0] in names), pairs[0])
-        known = {str(each.properties[key]) for each in features if key in each.properties}
+        known = {str(own) for each in features if (own := _value(each, key)) is not None}
         hint = near(value, known) if known else near(key, names)
         raise InputError(f"region.where: {show(where)} fits {len(found)} features, not one; {hint}")
     return found[0]
@@ -204,13 +248,19 @@ def _polygons(geometry: dict[str, Any]) -> Iterator[list[Any]]:
 
 def _degrees(ring: Any, feature: _Feature) -> Floats:
     """Corners without their heights in degrees (longitude, latitude), [V, 2]."""
-    corners = np.array([position[:2] for position in ring], dtype=np.float64).reshape(len(ring), 2)
+    try:
+        corners = np.array([position[:2] for position in ring], dtype=np.float64).reshape(len(ring), 2)
+    except (TypeError, ValueError):
+        problem = "its outline is not a list of corners [longitude, latitude]"
+        raise InputError(f"{feature.place}: {problem}; a Polygon is a list of outlines") from None
     degrees = corners if feature.crs is None else _from_crs(corners, feature.crs)
     # Areas across the antimeridian have corners beyond 180 degrees.
     outside = np.flatnonzero(~(np.abs(degrees) <= [360, 90]).all(axis=1))
     if len(outside):
         problem = "is not a longitude between -360 and 360 deg and a latitude between -90 and 90 deg"
         raise InputError(f"{feature.place}: {corners[outside[0]].tolist()} {problem}; {_REMEDY}")
+    if not np.array_equal(corners[0], corners[-1]):
+        raise InputError(f"{feature.place}: its outline is open: repeat the first corner at the end")
     return degrees
 
 
