@@ -18,7 +18,7 @@ import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from damian.common.atomic_files import write_atomically
+from damian.common.atomic_files import not_linked, write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import write_csv
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, RUN, Comparison
@@ -27,7 +27,7 @@ from damian.compare.figures import plot_curves, plot_profiles, plot_scores
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.processes import end_interrupted
-from damian.runs.run_folder import locked
+from damian.runs.run_folder import check_no_links, locked
 
 from . import cli
 from .evaluate import fly
@@ -94,6 +94,7 @@ def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) ->
 
 def compare(config: CompareConfig, folder: Path) -> None:
     """Carry out the runs of a comparison that are not finished, and report on them."""
+    check_no_links(folder)
     has_rows, failed = (folder / ROWS).exists(), []
     if (
         config.report_only
@@ -109,6 +110,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
         kept = stored_results(folder) if config.keep and has_rows else NO_RESULTS
         runs = _not_kept(plan(config, folder), kept)
     for run in runs:
+        not_linked(run.folder, below=folder)
         check_stored(run.config, run.folder)
     try:
         if not config.report_only:

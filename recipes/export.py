@@ -19,7 +19,7 @@ from torchrl.data import Bounded, TensorSpec
 
 import damian
 from damian import keys
-from damian.common.atomic_files import write_atomically, writing
+from damian.common.atomic_files import make_folder, not_linked, write_atomically, writing
 from damian.common.errors import InputError
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
@@ -47,14 +47,15 @@ def export(run: Path, trust: bool = False) -> Path:
         raise InputError(f"export needs {error.name}: pip install 'damian[export]'") from None
     actor, env = load(run, worlds=2, deterministic=True, trust=trust)
     config, shipped = stored_config(run_folder(run), "checkpoint"), str(run).startswith("damian:")
-    target = (Path("runs", run_folder(run).name) if shipped else run_folder(run)) / EXPORT
+    named = Path("runs") if shipped else run_folder(run)
+    target = named / run_folder(run).name / EXPORT if shipped else named / EXPORT
     any_number = any_number_of_uavs(config)
     policy, program, onnx = exported(actor, env, any_number, config.learner.name)
     described = describe(run, policy, env, any_number)
     with writing(target):
-        target.mkdir(parents=shipped, exist_ok=True)
-        torch.export.save(program, target / "policy.pt2")
-        onnx.save(target / "policy.onnx", external_data=False)
+        make_folder(target, below=named)
+        torch.export.save(program, not_linked(target / "policy.pt2"))
+        onnx.save(not_linked(target / "policy.onnx"), external_data=False)
     text = json.dumps(described, indent=2, default=lambda x: x.tolist() if isinstance(x, Tensor) else str(x))
     write_atomically(target / "policy.json", text + "\n")
     return target

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from pandas.api.types import is_numeric_dtype
 
-from damian.common.plotting import STYLE
+from damian.common.plotting import STYLE, save_figure
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method
 from damian.compare.config import LESS_IS_BETTER
 from damian.compare.statistics import Floats, bootstrap, normalised
@@ -193,7 +193,7 @@ def save(
             axis.set_axis_off()
         if drawn:
             figure.legend([*drawn.values()], [*drawn], loc="outside right upper", frameon=False)
-        figure.savefig(path, dpi=150)
+        save_figure(figure, path, dpi=150)
 
 
 def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, str]) -> None:

@@ -10,6 +10,7 @@ import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 
 from damian.common import checks
+from damian.common.atomic_files import not_linked
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry, check_parameters
 from damian.common.tables import read_csv, write_csv
@@ -86,6 +87,7 @@ def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Lo
     """A run of Weights & Biases, named as the run folder; a resumed training continues it."""
     from torchrl.record.loggers import WandbLogger  # noqa: PLC0415 (takes seconds to import)
 
+    not_linked(folder / "wandb")
     number = uuid5(NAMESPACE_URL, str(folder.resolve())).hex
     logger: Any = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
     logger.close = import_module("wandb").finish

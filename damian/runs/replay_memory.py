@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from damian.common.atomic_files import remove_unfinished, writing
+from damian.common.atomic_files import make_folder, remove_unfinished
 from damian.replay.time_storage import TimeStorage
 from damian.runs.checkpoint import read_checkpoint, to_tensordict, write_checkpoint
 
@@ -41,8 +41,7 @@ class ReplayMemory:
         final = written - cast(int, getattr(storage, "longest", -1)) - 1
         files = range(oldest // per_file, max(final // per_file, oldest // per_file))
         for file in {*files} - {*self._files}:
-            with writing(self._folder):
-                self._folder.mkdir(exist_ok=True)
+            make_folder(self._folder)
             rows = self._rows(max(oldest, file * per_file), (file + 1) * per_file)
             write_checkpoint(self._path(file), {"rows": rows})
         self._files = list(files)

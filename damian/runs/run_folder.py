@@ -7,8 +7,9 @@ from pathlib import Path
 import pandas as pd
 from filelock import FileLock, Timeout
 
-from damian.common.atomic_files import write_atomically, writing
+from damian.common.atomic_files import not_linked, write_atomically, writing
 from damian.common.errors import InputError
+from damian.common.plotting import save_figure
 from damian.common.tables import markdown_table, read_csv, write_csv
 from damian.runs.metrics import Evaluation
 
@@ -27,13 +28,11 @@ DETERMINISTIC = ", deterministic"
 """Ending of the name of a policy whose most likely actions are taken, not drawn from its distribution."""
 
 
-def check_no_links(folder: Path, key: str) -> None:
-    """Refuse a folder in which a link stands where a run reads, writes or deletes; ``key`` names it."""
+def check_no_links(folder: Path) -> None:
+    """Refuse a folder in which a link stands where a run reads, writes or deletes, before it does so."""
     for each in (folder, folder / REPLAY, folder / EXPORT):
         for path in each.iterdir() if each.is_dir() else ():
-            if path.is_symlink():
-                problem = "is a link, and links in a run folder are not followed"
-                raise InputError(f"{key}: {path} {problem}: put there what it leads to")
+            not_linked(path)
 
 
 def plot_learning_curve(
@@ -62,7 +61,7 @@ def plot_learning_curve(
         axis.grid(alpha=0.3)
     axes[0][0].legend(loc="best", fontsize="small")
     figure.suptitle(title, fontsize="medium")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path, dpi=120)
 
 
 LATE = """perceived: as far as the server knew; all else as it truly was; age: mean age of the messages at the
@@ -111,7 +110,7 @@ LOCK = ".lock"
 @contextmanager
 def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
     """Lock a folder for what is done inside; the lock ends with the process, however that ends."""
-    check_no_links(folder, key)
+    check_no_links(folder)
     lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
     with writing(folder):
         try:

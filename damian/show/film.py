@@ -1,5 +1,6 @@
 """Films of an episode: what is true, what the server believes, and the messages between them."""
 
+import io
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from tensordict import TensorDictBase
 
-from damian.common.plotting import STYLE
+from damian.common.atomic_files import not_linked, write_atomically
+from damian.common.plotting import STYLE, save_figure
 from damian.envs.uav_env import UavEnv
 from damian.show.episode import Episode, at_instant, episode_of
 from damian.show.frame import INK, chosen_of, frame_of
@@ -36,7 +38,7 @@ def save_film(episode: Episode, path: Path, view: str = "2d", shown: Collection[
     film, steps = Film(episode, view, shown), range(episode.n_steps + 1)
     if path.suffix != ".gif":
         writer = FFMpegWriter(STEPS_PER_SECOND)
-        with writer.saving(film.figure, str(path), DPI):
+        with writer.saving(film.figure, str(not_linked(path)), DPI):
             for step in [*steps, *[episode.n_steps] * LAST_STEPS]:
                 film.draw(step)
                 writer.grab_frame()
@@ -45,7 +47,9 @@ def save_film(episode: Episode, path: Path, view: str = "2d", shown: Collection[
     kept = {"method": Image.Quantize.MAXCOVERAGE, "dither": Image.Dither.NONE}  # not the mean of like colours
     first, *others = [each.quantize(**kept) for each in pictures]  # a third of the size
     times = [1000 // STEPS_PER_SECOND] * episode.n_steps + [1000 * LAST_STEPS // STEPS_PER_SECOND]
-    first.save(path, save_all=True, append_images=others, duration=times, loop=0)
+    content = io.BytesIO()
+    first.save(content, "GIF", save_all=True, append_images=others, duration=times, loop=0)
+    write_atomically(path, content.getvalue())
 
 
 def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
@@ -53,7 +57,7 @@ def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> N
     error = np.linalg.norm(episode.true - episode.believed, axis=-1).sum(-1)
     film = Film(episode, shown=shown)
     film.draw(int(np.flatnonzero(error == error.max())[-1]))
-    film.figure.savefig(path, dpi=2 * DPI)
+    save_figure(film.figure, path, dpi=2 * DPI)
 
 
 class Film:

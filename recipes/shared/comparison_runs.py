@@ -21,13 +21,14 @@ import torch
 from tqdm import tqdm
 
 from damian.common import checks
+from damian.common.atomic_files import make_folder, not_linked
 from damian.common.errors import InputError, RunError
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, OF_METHOD, RUN, Method, regime
 from damian.compare.config import CompareConfig, HeldOut
 from damian.compare.figures import LABELS
 from damian.runs.metrics_log import read_metrics
 from damian.runs.processes import each_in_processes
-from damian.runs.run_folder import RESULTS, read_results
+from damian.runs.run_folder import RESULTS, check_no_links, read_results
 from damian.runs.run_record import read_record
 
 from .. import cli
@@ -157,9 +158,9 @@ def perform_all(runs: Sequence[Run], processes: int, train: Work, fly: Work) -> 
 
 def perform_run(run: Run, work: Work) -> None:
     """Carry out one run, or go on with it."""
-    run.folder.mkdir(parents=True, exist_ok=True)
+    make_folder(run.folder, below=run.folder.parents[3])
     with (
-        (run.folder / LOG).open("a", encoding="utf-8", buffering=1) as log,
+        not_linked(run.folder / LOG).open("a", encoding="utf-8", buffering=1) as log,
         redirect_stdout(log),
         redirect_stderr(log),
     ):
@@ -240,5 +241,6 @@ def _of_run(run: Run, methods: Mapping[str, Method]) -> Results:
 
 def stored_results(folder: Path) -> Results:
     """Read the results that a folder stores, but no curves of a version that drew perceived returns."""
+    check_no_links(folder)
     rows, points = (read_results(folder / name) for name in (ROWS, POINTS))
     return Results(rows, points if LABELS.keys() <= {*points} else NO_RESULTS.points)

@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from damian.common.atomic_files import remove_unfinished, write_atomically
+from damian.common.atomic_files import not_linked, remove_unfinished, write_atomically
 from damian.common.devices import keep_freed_memory
 from damian.common.errors import InputError, RunError
 from damian.common.fields import default_of, filled, has, leaves, nested, set_at, value_at
@@ -54,6 +54,7 @@ def start(work: Work, given: DictConfig, program: str = "train") -> None:
         with one_line_errors(program):
             _carry_out(work, plain(given, words, program), words, program, folder)
         return
+    not_linked(folder, below=short(Path(running.sweep.dir).absolute()))
     try:
         (folder / FAILED).unlink(missing_ok=True)
         _carry_out(work, plain(given, words, program), words, program, folder, of_sweep=True)
@@ -127,7 +128,8 @@ def changed_settings(config: TrainConfig, folder: Path, key: str) -> Iterator[tu
 
 
 def check_stored(config: TrainConfig, folder: Path) -> None:
-    """Check that a run folder is empty or holds a run with the same settings."""
+    """Check that a run folder has no links, and is empty or holds a run with the same settings."""
+    check_no_links(folder)
     if not (folder / CONFIG).exists():
         return
     for key, old, new in changed_settings(config, folder, "hydra.run.dir"):
@@ -191,7 +193,7 @@ def stored_values(folder: Path, key: str) -> dict[str, Any]:
     file = folder / CONFIG
     if not file.is_file():
         raise InputError(f"{key}: {folder} holds no {CONFIG}, so there is no run")
-    check_no_links(folder, key)
+    check_no_links(folder)
     check_version(folder, key)
     try:
         values = yaml.safe_load(read_text(file))

@@ -20,7 +20,7 @@ from damian.compare.paired import as_table, means
 from damian.runs.run_folder import FAILED, RESULTS, check_no_links, read_results
 from damian.runs.run_record import read_record
 
-from ..cli import short
+from ..cli import one_line_errors, short
 from ..known import key_of
 from .comparison_runs import FIGURE, MARKDOWN, ROWS
 from .runs import JOB, OVERRIDES, SEED
@@ -31,10 +31,13 @@ class SweepReport(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         str(config.hydra.sweep.subdir)  # the names of the runs' folders need the words of the whole sweep
+        with one_line_errors():
+            check_no_links(short(Path(config.hydra.sweep.dir)))  # where Hydra writes, too
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         folder = short(Path(config.hydra.sweep.dir))
-        print(f"\nresults of the sweep:\n\n{report(folder)}\n\nresults: {folder}")
+        with one_line_errors():
+            print(f"\nresults of the sweep:\n\n{report(folder)}\n\nresults: {folder}")
         if any(folder.rglob(FAILED)):
             sys.exit(1)
 
@@ -45,7 +48,7 @@ def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
     if not runs:
         raise InputError(f"{folder}: there is no {RESULTS} in it, so no run has finished there")
     for run in runs:
-        check_no_links(run, "folders")
+        check_no_links(run)
     records = {run: read_record(run) for run in runs}
     runs.sort(key=lambda run: records[run].get(JOB, 0))  # as the command line names them
     words = [[word.partition("=") for word in records[run].get(OVERRIDES, [])] for run in runs]
@@ -66,7 +69,7 @@ def report(folder: Path) -> str:
     """Write rows, table and figure of a sweep into its folder; returns the table."""
     failed = [file.parent for file in sorted(folder.rglob(FAILED))]
     for each in (folder, *failed):
-        check_no_links(each, "folders")
+        check_no_links(each)
     errors = [[str(run.relative_to(folder)), json.loads(read_text(run / FAILED))["error"]] for run in failed]
     parts, rows = [], pd.DataFrame(errors, columns=["folder", "error"])
     if any(folder.rglob(RESULTS)) or not failed:

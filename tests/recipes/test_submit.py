@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import torch
 import yaml
+from helpers import check_refused
 
 from damian.common.errors import InputError
 from damian.common.tables import read_csv, write_csv
@@ -58,6 +59,12 @@ def test_a_submission_holds_what_the_evaluations_of_the_runs_found(folder, capsy
     assert "## crowded, late data" in table
     assert "| mine | 30.0 [" in table
     assert "A. Author | 1 | 12 | 0.18.0 (abc) |" in table
+
+
+def test_a_submission_is_not_written_through_a_link(folder, capsys):
+    Path("mine.csv").symlink_to("outside")
+    check_refused(lambda: main(SUBMIT), "mine.csv is a link", capsys)
+    assert not Path("outside").exists()
 
 
 def test_a_submission_without_the_folders_of_its_runs_is_refused(folder, capsys):
