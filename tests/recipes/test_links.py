@@ -118,7 +118,7 @@ def link(path: Path, original: Path, outside: Path, dangling: bool) -> None:
     path.symlink_to(outside / "target")
 
 
-CASES = [pytest.param("report", 4), *(pytest.param(door, 1, marks=pytest.mark.slow) for door in DOORS)]
+CASES = [pytest.param("report", 3), *(pytest.param(door, 1, marks=pytest.mark.slow) for door in DOORS)]
 
 
 @pytest.mark.parametrize(("door", "share"), CASES)
