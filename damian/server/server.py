@@ -16,14 +16,15 @@ from torch import Tensor
 from damian import keys
 from damian.common import checks
 from damian.common.tensors import gather_rows, move_attributes
-from damian.server.belief import SourceGrid, build_source_grids
+from damian.server.belief import SourceGrid
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.server.features import ServerContext, check_features, feature_of, observe, observe_own, stack
+from damian.server.features import ServerContext, feature_of, layout_of, observe, observe_own, stack
+from damian.server.features.base import check_features, source_grid
+from damian.server.layout import Layout
 from damian.server.rewards import Counters, final_reward, reward, terms_of
-from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
 from damian.world.config import FOOTPRINT, IN_REACH
-from damian.world.coverage import KnownCoverage, tables_of_all
+from damian.world.coverage import KnownCoverage
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.signal_source import footprint_radius
 from damian.world.simulation import Simulation
@@ -86,47 +87,26 @@ class Server:
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._widths = simulation.widths
-        footprints, surrounded = None, "coverage_map" in self.names
         levels = simulation.vehicles.values.choices.get("source.level_db")
-        source, radii, scaled = simulation.config.source, [simulation.radius], None
-        if levels is not None:
-            tabled = surrounded or "coverage" in self.names or observation.belief
-            ranged, remedy = len(levels) == 2 and bool(tabled), "give a list, as in [138,140,142]"
-            problem = f"is a range, but coverage and beliefs have tables for each footprint: {remedy}"
-            checks.require(not ranged, "randomise.source.level_db", levels, problem)
-            radii = [*map(footprint_radius, (replace(source, level_db=level) for level in levels))]
-            scaled = torch.cat([airspace.points.flatten(0, 1) * (radii[0] / each) for each in radii])
-        self._radii = None if levels is None else torch.tensor(radii)
-        if "coverage" in self.names:
-            polygons, points = [region.polygon for region in airspace.regions], airspace.points.double().cpu()
-            footprints = tables_of_all(polygons, points.numpy(), radii)
-        grid = None
-        if observation.belief:
-            drawn = [{"level_db": each} for each in levels or ()] or [{}]
-            kinds = [replace(each, **level) for level in drawn for each in simulation.sources]
-            grid = build_source_grids(airspace, kinds, self.dt, observation.belief_cell)
-            grid = grid._replace(first=grid.first.view(len(drawn), -1))
-        gains = "belief_gain" in observation.belief
+        radii = [
+            footprint_radius(replace(simulation.config.source, level_db=level)) for level in levels or ()
+        ]
+        self._radii = torch.tensor(radii) if radii else None
+        makers = dict.fromkeys(make for name in self.names for make in feature_of(name).tables)
         self._context = ServerContext(
             now=torch.zeros(()),
             scale=torch.zeros(()),
             time_scale=time_scale,
-            battery=battery,
-            footprints=footprints,
             points=airspace.points.flatten(0, 1),
-            scaled_points=scaled,
             observation=observation,
             dt=simulation.dt,
-            readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
-            radius=simulation.radius,
-            kinds=simulation.vehicles.kinds(simulation.config.agents),
             n_points=airspace.max_points,
-            goals=simulation.candidates.goals() if gains else None,
-            places_inside=torch.cat([places_inside(airspace, r) for r in radii]) if surrounded else None,
-            grid=grid,
+            radius=simulation.radius,
+            readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
+            tables={make: make(simulation, observation) for make in makers},
         )
         # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.
-        self.remembers_coverage = footprints is not None and not simulation.vehicles.instant
+        self.remembers_coverage = "coverage" in self.names and not simulation.vehicles.instant
 
     def _read_terms(self) -> None:
         self.terms = terms_of(self.reward)
@@ -145,7 +125,7 @@ class Server:
     @property
     def grid(self) -> SourceGrid | None:
         """Cells of the belief; None if no feature reads it."""
-        return self._context.grid
+        return self._context.tables.get(source_grid)
 
     @property
     def rewards_belief(self) -> bool:
@@ -164,14 +144,6 @@ class Server:
     def counted(self, messages: Messages) -> Tensor:
         """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
         return messages.trail[..., : self.observation.window]
-
-    def action_columns(self, features: Features) -> slice | None:
-        """The columns of the actors' observations that hold ``belief_gain``; None if there are none."""
-        names = self.observation.actor
-        if "belief_gain" not in names:
-            return None
-        parts = [stack(features, [name]).shape[-1] for name in names[: names.index("belief_gain") + 1]]
-        return slice(sum(parts[:-1]), sum(parts))
 
     def region_of(self, messages: Messages) -> Tensor:
         """Index of the region to which each world's landing points belong, [*]."""
@@ -226,6 +198,10 @@ class Server:
         """Observations of the actors [*, N, F] and of the critic [*, N, G]."""
         return stack(features, self.observation.actor), stack(features, self.observation.critic)
 
+    def layouts(self, features: Features) -> tuple[Layout, Layout]:
+        """The layouts of the actors' and the critic's observations, from features of any worlds."""
+        return layout_of(features, self.observation.actor), layout_of(features, self.observation.critic)
+
     def observe_with_own_messages(
         self, received: Tensor, sent: Tensor, steps: Tensor, belief: Tensor | None = None
     ) -> Tensor:
@@ -254,7 +230,7 @@ class Server:
         context = self._context._replace(now=steps * self.dt, scale=self.scales(messages))
         if self._radii is None:
             return context
-        return context._replace(radius=self._told_radius(messages), footprint=self.level(messages))
+        return context._replace(radius=self._told_radius(messages), level=self.level(messages))
 
     def level(self, messages: Messages) -> Tensor | None:
         """Number of the drawn level of the source in each world, [*]; None if none is drawn."""

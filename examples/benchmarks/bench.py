@@ -36,8 +36,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.learners.networks import ModelConfig, make_actor
 from damian.recipes.cli import settings as composed_config
-from damian.server.config import BUILT_IN
-from damian.server.features import ObservationConfig
+from damian.server.config import BUILT_IN, ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig

@@ -23,12 +23,13 @@ from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.learners.config import MappoConfig, ModelConfig
 from damian.learners.networks import hidden_layers, make_mlp, with_distribution
-from damian.server.features import FeatureCache, feature_of, of_others
+from damian.server.features import FeatureCache, feature_of
+from damian.server.features.others import of_others
 
 HEARD = "talking:heard"
 
 
-@feature("global", width=None, low=-1.0)
+@feature("global", [None], low=-1.0)
 def heard(v: FeatureCache) -> Tensor:
     """What the UAV holds of each other UAV, [*, N, (N - 1) K] with K = 2 ``observation.window`` + 4.
 

@@ -27,7 +27,7 @@ from damian.keys import PRIVILEGED_OBSERVATION as PRIVILEGED
 from damian.learners.config import MappoConfig, ModelConfig, SacConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.state import Truth

@@ -20,7 +20,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.termination import EpisodeConfig
 
 STEPS, WORLDS, LONGEST = 40, 4, 5

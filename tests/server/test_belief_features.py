@@ -12,7 +12,9 @@ from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import places, predict
-from damian.server.features import BELIEF_RINGS, BELIEF_SECTORS, ObservationConfig, feature
+from damian.server.config import ObservationConfig
+from damian.server.features import feature
+from damian.server.features.belief import BELIEF_RINGS, BELIEF_SECTORS
 from damian.world.config import SourceConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
