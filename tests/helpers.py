@@ -17,7 +17,7 @@ from twin import GLOBAL, LOCAL, Uav
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.learners.base import LearningSetup
-from damian.learners.networks import ModelConfig
+from damian.models.config import ModelConfig
 from damian.server.config import BUILT_IN, ObservationConfig
 from damian.server.features import ServerContext
 from damian.server.features.place import battery_settings

@@ -1,11 +1,15 @@
 """What the columns of an observation mean: named blocks, each with the shape that its values have."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
+from torchrl.envs import EnvBase
+
+from damian import keys
 
 
 @dataclass(frozen=True)
@@ -82,3 +86,19 @@ class Layout:
         limits = torch.tensor([[block.low, block.high] for block in self.blocks])
         low, high = limits.repeat_interleave(widths, 0).unbind(-1)
         return low, high
+
+
+def joined(layouts: Sequence[Layout]) -> Layout:
+    """The layout of several observations, one behind the other."""
+    blocks: list[Block] = []
+    for layout in layouts:
+        first = sum(block.width for block in blocks)
+        blocks += [replace(block, first=first + block.first) for block in layout]
+    return Layout(tuple(blocks))
+
+
+def layout_at(env: EnvBase, key: NestedKey) -> Layout:
+    """The layout of an observation of an environment; a single block where it tells none of these columns."""
+    width = env.observation_spec[key].shape[-1]
+    told = getattr(env, "layout", {}).get(keys.last_part(key))
+    return told if told and told.width == width else Layout().appended(keys.last_part(key), (width,))

@@ -106,7 +106,7 @@ def test_a_uavs_own_features_are_those_of_its_own_belief():
     messages, steps = server.messages(td["agents", "message"]), torch.full((3,), 5)
     for uav in range(env.uav_env.n_agents):
         features = server.features(messages, steps, ALL, belief=td["agents", "belief"][:, uav])
-        own = torch.cat([features[name][:, uav] for name in ALL], -1)
+        own = torch.cat([features[name][:, uav].flatten(1) for name in ALL], -1)
         torch.testing.assert_close(td["agents", "observation"][:, uav, 1:], own)
 
 
