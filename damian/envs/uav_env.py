@@ -88,11 +88,12 @@ class UavEnv(EnvBase):
         checks.device("device", str(device))
         self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         of = self.scenario
-        self.simulation = Simulation(of, of.clock.dt, of.observation.stops, seed)
+        self.simulation = Simulation(of, of.clock.dt, of.observation.carried_stops, seed)
         self.server = Server(self.simulation, of.observation, of.reward, of.episode, of.time_scale)
-        problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
-        known = messages_only or self.server.grid is None
-        checks.require(known, "observation.belief", self.server.observation.belief, problem)
+        problem = "needs transforms before a ServerNode: build the environment by damian.make_env"
+        for name in ("belief", "timeline"):
+            value = getattr(of.observation, name)
+            checks.require(messages_only or not value, f"observation.{name}", value, problem)
         initial = self.simulation.initial
         features = checked_features(self.server, initial.sent, initial.steps)
         self.layout = self._layouts(features)

@@ -20,6 +20,7 @@ from damian.server.belief import SourceGrid
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext, feature_of, layout_of, observe, observe_own, stack
 from damian.server.features.base import check_features, source_grid
+from damian.server.features.timeline import first_timeline, stop_ages, stop_places
 from damian.server.layout import Layout
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.termination import Status, status
@@ -63,8 +64,8 @@ class Server:
     In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of the episode
     [*], ``source_over`` tells whether the source has finished its walk [*], ``coverage`` is that of an
     earlier step of the same worlds, which saves time, and ``belief`` the probability that each source is in
-    each cell of ``grid`` [*, K, C]; without it, these are the first messages of the episode. Time features
-    are divided by ``time_scale`` [s].
+    each cell of ``grid`` [*, K, C], and ``timeline`` what is known of each UAV's stops (``ServerContext``); without
+    them, these are the first messages of the episode. Time features are divided by ``time_scale`` [s].
     """
 
     def __init__(
@@ -156,6 +157,7 @@ class Server:
         source_over: Tensor | None = None,
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
+        timeline: Tensor | None = None,
         observers: Collection[str] = ("actor", "critic"),
     ) -> ServerOutputs:
         """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and what ``observers`` observe.
@@ -164,11 +166,11 @@ class Server:
         """
         seen = {observer: getattr(self.observation, observer) for observer in observers}
         names = sorted({*self.reads, *itertools.chain(*seen.values())})
-        features = self.features(messages, steps, names, coverage, belief)
+        features = self.features(messages, steps, names, coverage, belief, timeline)
         if self.reward.detection == "truth":
             first, _ = self._context.readings[IN_REACH]
             messages = messages._replace(spotted=messages.readings[..., first] > 0.5)
-            judged = self.features(messages, steps, self.reads, coverage, belief)
+            judged = self.features(messages, steps, self.reads, coverage, belief, timeline)
         else:
             judged = features
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
@@ -189,9 +191,11 @@ class Server:
         names: list[str] | None = None,
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
+        timeline: Tensor | None = None,
     ) -> Features:
         """The features of these names, or all that an observation or a reward term needs (paper, Table 2)."""
-        context = self._known(messages, steps)._replace(coverage=coverage, belief=belief)
+        remembered = {"coverage": coverage, "belief": belief, "timeline": timeline}
+        context = self._known(messages, steps)._replace(**remembered)
         return observe(messages, context, self.names if names is None else names)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
@@ -203,27 +207,60 @@ class Server:
         return layout_of(features, self.observation.actor), layout_of(features, self.observation.critic)
 
     def observe_with_own_messages(
-        self, received: Tensor, sent: Tensor, steps: Tensor, belief: Tensor | None = None
+        self,
+        received: Tensor,
+        sent: Tensor,
+        steps: Tensor,
+        belief: Tensor | None = None,
+        timeline: Tensor | None = None,
+        own_timeline: Tensor | None = None,
     ) -> Tensor:
         """Observations of actors that know their own messages at once, [*, N, F].
 
         ``received`` and ``sent`` are packed messages [*, N, M] as the server holds them, and as the UAVs sent
-        them last. ``belief``: that of each UAV, [*, N, K, C].
+        them last; ``timeline`` and ``own_timeline`` [*, N, slots, 3] are what follows from those that have
+        arrived, and from all sent. ``belief``: that of each UAV, [*, N, K, C].
         """
-        own = torch.eye(received.shape[-2], dtype=torch.bool, device=received.device).unsqueeze(-1)
-        known = torch.where(own, sent.unsqueeze(-3), received.unsqueeze(-3))  # [*, N receivers, N senders]
-        return self.observe_each(self.messages(known), steps, belief)
+        known = self.messages(_own_or_others(sent, received, 1))
+        both = None
+        if timeline is not None and own_timeline is not None:
+            both = _own_or_others(own_timeline, timeline, 2)
+        return self.observe_each(known, steps, belief, both)
 
-    def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
-        """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K, C]."""
-        return stack(self.own_features(known, steps, self.observation.actor, belief), self.observation.actor)
+    def observe_each(
+        self,
+        known: Messages,
+        steps: Tensor,
+        belief: Tensor | None = None,
+        timeline: Tensor | None = None,
+    ) -> Tensor:
+        """Observations [*, N, F] from messages and timelines [*, N, N, ...] (receiver, sender), and beliefs."""
+        names = self.observation.actor
+        return stack(self.own_features(known, steps, names, belief, timeline), names)
 
     def own_features(
-        self, known: Messages, steps: Tensor, names: list[str], belief: Tensor | None = None
+        self,
+        known: Messages,
+        steps: Tensor,
+        names: list[str],
+        belief: Tensor | None = None,
+        timeline: Tensor | None = None,
     ) -> Features:
-        """Features of UAVs, [*, N] each, who know messages [*, N, N] and beliefs as in ``observe_each``."""
+        """Features of UAVs, [*, N, ...] each, who know messages [*, N, N] and more, as in ``observe_each``."""
         context = self._known(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
-        return observe_own(known, context._replace(belief=belief), names)
+        return observe_own(known, context._replace(belief=belief, timeline=timeline), names)
+
+    def stop_places(self, rows: Tensor) -> Tensor:
+        """Where the stops have been of which packed messages [*, M] tell [m], [*, S, 2]."""
+        return stop_places(self.messages(rows), self._context)
+
+    def stop_ages(self, rows: Tensor) -> Tensor:
+        """How long ago those were when the message was generated [steps], [*, S]; -1 for none."""
+        return stop_ages(self.messages(rows), self._context)
+
+    def first_timeline(self, rows: Tensor) -> Tensor:
+        """What first messages [*, M] tell of the stops of their senders, [*, slots, 3]."""
+        return first_timeline(self.messages(rows), self._context)
 
     def _known(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages now."""
@@ -247,3 +284,13 @@ class Server:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
         region, scales = self.region_of(messages), self._scales
         return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)
+
+
+def _own_or_others(own: Tensor, others: Tensor, inner: int) -> Tensor:
+    """What each receiver knows of each sender, [*, N, N, ...]: of itself ``own``, of others ``others``.
+
+    Both are [*, N, ...], with ``inner`` dimensions behind the senders.
+    """
+    n = own.shape[-1 - inner]
+    itself = torch.eye(n, dtype=torch.bool, device=own.device).view(n, n, *[1] * inner)
+    return torch.where(itself, own.unsqueeze(-2 - inner), others.unsqueeze(-2 - inner))

@@ -51,6 +51,9 @@ class ServerContext(NamedTuple):
     """The tables that features declare, by the function that has made each."""
     belief: Tensor | None = None
     """Probability that each source is in each cell, [*, K, C]; None: as after these first messages."""
+    timeline: Tensor | None = None
+    """By sender and age in steps, where it is known to have stopped, east and north [m], and 1, else zeros,
+    [*, N, slots, 3]; None: as after these first messages."""
     coverage: KnownCoverage | None = None
     """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be computed."""
 
