@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from damian.envs.uav_env import UavEnv as UavEnv
     from damian.learners.config import LearnerConfig as LearnerConfig
     from damian.learners.config import LearningSetup as LearningSetup
+    from damian.models.config import ModelConfig as ModelConfig
     from damian.recipes.evaluate import load as load  # type: ignore[import-not-found]
     from damian.recipes.results import results as results  # type: ignore[import-not-found]
     from damian.recipes.shared.environments import compose_scenario as compose_scenario  # type: ignore[import-not-found]
@@ -56,6 +57,7 @@ _MODULES = {
     "damian.envs.config": ["ClockConfig", "ScenarioConfig"],
     "damian.envs.pipeline": ["make_env"],
     "damian.learners.config": ["LearnerConfig", "LearningSetup"],
+    "damian.models.config": ["ModelConfig"],
     "damian.envs.uav_env": ["UavEnv"],
     "damian.recipes.evaluate": ["load"],
     "damian.recipes.results": ["results"],

@@ -65,7 +65,7 @@ def _register() -> None:
 _register()
 
 
-OWN = {"learner": "name", "region": "kind", "motion": "kind"}
+OWN = {"learner": "name", "model": "name", "region": "kind", "motion": "kind"}
 """Groups whose option may be code of the user's own, and the setting that names it."""
 
 

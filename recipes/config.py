@@ -7,7 +7,8 @@ from damian.common import checks
 from damian.common.fields import Settings, constant, rules, setting
 from damian.compare.config import SCORES, STORED
 from damian.envs.config import ScenarioConfig
-from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
+from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig
+from damian.models.config import MODELS, MlpConfig, ModelConfig
 from damian.runs.config import LoggerConfig
 
 FORMATS = ("gif", "mp4", "png", "html", "geojson")
@@ -21,7 +22,7 @@ class TrainConfig(ScenarioConfig):
     """All settings of ``damian train``, beside those of the scenario."""
 
     learner: LearnerConfig = setting(MappoConfig)
-    model: ModelConfig = setting(ModelConfig)
+    model: ModelConfig = setting(MlpConfig)
     critic: str = setting(
         "server",
         "The critic observes the messages that the server holds, or the true state (privileged).",
@@ -67,9 +68,11 @@ class TrainConfig(ScenarioConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        matches = type(self.learner) is LEARNERS.get(self.learner.name, "learner")
-        problem = f"is not the learner of these settings: choose one with learner={'|'.join(LEARNERS)}"
-        checks.require(matches, "learner.name", self.learner.name, problem)
+        for key, registry in (("learner", LEARNERS), ("model", MODELS)):
+            section = getattr(self, key)
+            problem = f"is not the {key} of these settings: choose one with {key}={'|'.join(registry)}"
+            matches = type(section) is registry.get(section.name, key)
+            checks.require(matches, f"{key}.name", section.name, problem)
         checks.names("corrected", self.corrected, ("reward", "critic", "actor"))
         self.refuse(not self.corrected, "corrected", "is empty: choose reward, critic or actor")
         if not self.seeks_source:  # aware=belief suits any task: observe no belief by which nothing is won

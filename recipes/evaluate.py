@@ -19,7 +19,7 @@ from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.learners.recurrent import add_recurrent_state
+from damian.models.memory import add_recurrent_state
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, save_results
 from damian.runs.training_state import load_networks

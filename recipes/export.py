@@ -21,11 +21,10 @@ import damian
 from damian import keys
 from damian.common.atomic_files import make_folder, not_linked, write_atomically, writing
 from damian.common.errors import InputError
-from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.interop.exported_policy import ExportedPolicy, exported
 from damian.runs.run_folder import EXPORT, RESULTS
-from damian.server.features import feature_of
+from damian.server.layout import Layout
 from damian.world.config import ActionConfig
 from damian.world.landing import action_table
 
@@ -69,7 +68,7 @@ def describe(run: Path, policy: ExportedPolicy, env: DelayedEnv, any_number: boo
         shape = ["worlds", "uavs", *spec.shape[2:]]
         inputs[name] = {"shape": shape, "dtype": str(spec.dtype).removeprefix("torch.")}
         if key == keys.OBSERVATION:
-            inputs[name]["columns"] = columns(scenario, spec.shape[-1])
+            inputs[name]["columns"] = columns(env.layout[name])
     if "action_mask" in inputs:
         inputs["action_mask"]["meaning"] = "which actions are allowed now"
     if policy.recurrent:
@@ -95,25 +94,20 @@ def describe(run: Path, policy: ExportedPolicy, env: DelayedEnv, any_number: boo
     }
 
 
-def columns(scenario: ScenarioConfig, n_columns: int) -> list[dict[str, Any]]:
+def columns(layout: Layout) -> list[dict[str, Any]]:
     """Describe the columns of an observation, in order; the server has scaled them already."""
-    sources, found = scenario.source.count, []
-    widths = {"agent_distances": scenario.agents - 1, "belief_gain": scenario.actions.n_actions}
-    widths |= {"belief_moments": 4 * sources, "belief_map": 24 * sources}
-    for name in scenario.observation.actor:
-        feature = feature_of(name)
-        width = widths.get(name, feature.width)
-        meaning = " ".join((feature.compute.__doc__ or "").split())
-        found.append(
-            {"feature": name, "columns": width, "low": feature.low, "high": feature.high, "meaning": meaning}
-        )
-    left = n_columns - sum(each["columns"] or 0 for each in found)
-    if left and scenario.delay.history:
-        meaning = f"the latest {scenario.delay.history} actions of the UAV itself, scaled, the oldest first"
-        found.append(
-            {"feature": "action history", "columns": left, "low": 0.0, "high": 1.0, "meaning": meaning}
-        )
-    return found
+    return [
+        {
+            "feature": block.name,
+            "columns": block.width,
+            "shape": [*block.shape],
+            "entries": [*block.entries],
+            "low": block.low,
+            "high": block.high,
+            "meaning": block.meaning,
+        }
+        for block in layout
+    ]
 
 
 def actions(config: ActionConfig, spec: TensorSpec) -> dict[str, Any]:

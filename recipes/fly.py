@@ -22,7 +22,7 @@ from damian.baselines.script import script_policy
 from damian.common import checks
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.learners.recurrent import add_recurrent_state
+from damian.models.memory import add_recurrent_state
 from damian.show.episode import Episode, record
 from damian.show.film import save_film, save_picture
 from damian.show.geojson import origin_of, save_geojson

@@ -136,11 +136,11 @@ def check_words(program: str, words: Iterable[str]) -> None:
 
 
 def is_known(key: str, program: str) -> bool:
-    """Is a key that of a setting, or below one that holds anything, or of a learner of the user's own?"""
+    """Is a key that of a setting, or below one that holds anything, or of a learner or model of the user's own?"""
     known, parts = known_settings(program), key.partition("@")[0].split(".")
     above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
     is_open = any(each and each.kind.startswith(("Any", "list", "dict")) for each in above)
-    return key in known or is_open or parts[0] == "learner"
+    return key in known or is_open or parts[0] in ("learner", "model")
 
 
 def no_such_key(key: str, program: str) -> str:

@@ -139,7 +139,7 @@ def update(
     episodes.add(batch)
     progress.frames += batch.numel()
     progress.updates += 1
-    if problem := not_finite(env.server, env.uav_env.simulation, batch):
+    if problem := not_finite(env.layout, batch):
         raise failure(state, problem)
     threads = torch.get_num_threads()
     try:

@@ -15,7 +15,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 
 PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
 BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}

@@ -8,9 +8,9 @@ from helpers import GOLDEN, nearest
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.features import ObservationConfig, ServerContext
+from damian.server.config import ObservationConfig
+from damian.server.features import ServerContext
 from damian.server.rewards import Counters
-from damian.world.battery import BatteryConfig
 from damian.world.messages import Messages
 
 EPISODES = "episodes_usecase_settings"
@@ -153,8 +153,6 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         scale=torch.full((len(records),), golden["max_distance_normaliser_m"]),
         time_scale=golden["time_max_normaliser"],
         observation=ObservationConfig(),
-        battery=BatteryConfig(),
-        footprints=None,
         points=torch.zeros(1, 2),
     )
     return messages, server, Counters(number, motions)

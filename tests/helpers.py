@@ -17,9 +17,10 @@ from twin import GLOBAL, LOCAL, Uav
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.learners.base import LearningSetup
-from damian.learners.networks import ModelConfig
-from damian.server.config import BUILT_IN
-from damian.server.features import ObservationConfig, ServerContext
+from damian.models.config import ModelConfig
+from damian.server.config import BUILT_IN, ObservationConfig
+from damian.server.features import ServerContext
+from damian.server.features.place import battery_settings
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
@@ -263,8 +264,7 @@ def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, Server
         scale=torch.full((len(worlds),), SCALE),
         time_scale=TIME_SCALE,
         observation=ObservationConfig(),
-        battery=BatteryConfig(resolution=5.0),
-        footprints=None,
+        tables={battery_settings: BatteryConfig(resolution=5.0)},
         points=torch.zeros(1, 2),
     )
     return messages, server

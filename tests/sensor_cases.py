@@ -31,7 +31,7 @@ def gap(state: State, world: Simulation) -> Tensor:
     return torch.linalg.vector_norm(state.position[..., :2] - state.source[:, :1], dim=-1)
 
 
-@feature("local", width=2, low=-1.0, high=1.0)
+@feature("local", [2], low=-1.0, high=1.0)
 def gust_felt(cache: FeatureCache) -> Tensor:
     """Sine of the gust."""
     return cache.reading("gust").sin()
@@ -44,7 +44,7 @@ def widest_gap(cache: FeatureCache) -> Tensor:
     return gaps.amax(-1, keepdim=True).expand_as(gaps)
 
 
-@feature("global", width=None, high=1e4)
+@feature("global", [None], high=1e4)
 def gaps(cache: FeatureCache) -> Tensor:
     """Distances of all UAVs to the source, the same for every UAV [m]."""
     every = cache.reading("gap")

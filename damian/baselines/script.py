@@ -16,7 +16,7 @@ from damian.common.tensors import distances, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import any_of, chance_of_staying, detection_chance, places, report_rows
-from damian.server.surroundings import known_requests
+from damian.server.features.requests import known_requests
 from damian.world.messages import Messages
 
 BLUR_M = 5.0

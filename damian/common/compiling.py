@@ -9,6 +9,13 @@ from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+COMPILE_OPTIONS = {
+    "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
+    "fallback_random": True,  # the draws of torch's generator, as without compiling
+    "cpp.vec_isa_ok": True,  # by the processor's flags, without a trial
+}
+"""Options of ``torch.compile`` for networks."""
+
 
 class CompiledMethods:
     """The methods of an object, each compiled at its first call, with the options of ``compiled``.

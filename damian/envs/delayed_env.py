@@ -7,6 +7,7 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian import keys
@@ -15,9 +16,11 @@ from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask
 from damian.envs.nodes import Drop
 from damian.envs.uav_env import Outputs, UavEnv
+from damian.server.layout import Layout
 from damian.server.server import Server
 from damian.transforms.base import Memory, StatefulTransform
 from damian.transforms.entries import Entries, select_entries
+from damian.transforms.history import ActionHistory
 from damian.world.state import PackedState
 
 _BASE = "base_env."
@@ -44,6 +47,21 @@ class DelayedEnv(TransformedEnv):
     def server(self) -> Server:
         """The server node that environment, transforms, replay storage and evaluation share."""
         return self.uav_env.server
+
+    @property
+    def layout(self) -> dict[str, Layout]:
+        """What the columns of each observation mean, by the last part of its key.
+
+        The keys are ``observation`` (with the past actions that ``ActionHistory`` appends),
+        ``global_observation`` and ``privileged_observation``.
+        """
+        layouts = dict(self.uav_env.layout)
+        for transform in cast(Compose, self.transform):
+            if isinstance(transform, ActionHistory):
+                for key in transform.in_keys:
+                    name, spec = keys.last_part(key), self.observation_spec[key]
+                    layouts[name] = _with_past_actions(layouts[name], transform.steps, spec)
+        return layouts
 
     # Seeds, checkpoints and compiling.
 
@@ -222,6 +240,17 @@ class DelayedEnv(TransformedEnv):
         self.uav_env.worlds = worlds
         for transform, memory in zip(fused, memories, strict=True):
             transform.set_memory(memory)
+
+
+def _with_past_actions(layout: Layout, n_actions: int, spec: TensorSpec) -> Layout:
+    """A layout with the columns that an ``ActionHistory`` has appended, by the spec of the observation."""
+    bounds = {}
+    if isinstance(spec, Bounded):
+        low, high = spec.low[..., layout.width :].amin(), spec.high[..., layout.width :].amax()
+        bounds = {"low": low.item(), "high": high.item()}
+    shape = (n_actions, (spec.shape[-1] - layout.width) // n_actions)
+    meaning = f"The latest {n_actions} actions of the UAV itself, scaled, the oldest first."
+    return layout.appended("action_history", shape, meaning=meaning, **bounds)
 
 
 def _without_dropped(outputs: Outputs, transforms: Sequence[StatefulTransform]) -> Outputs:

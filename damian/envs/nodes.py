@@ -85,12 +85,16 @@ class ServerNode(WorldTransform):
         super().__init__([message_key], [*created, keys.SUCCESS, *keys.ENDS])
         self.server, self.heard_key, self.reward_terms = server, heard_key, reward_terms
         self.own_key = keys.MESSAGE if server.observation.own else None
-        self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + server.observation.own] if server.grid else []
+        own, timeline = server.observation.own, server.observation.timeline > 0
+        self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + own] if server.grid else []
+        heard = [keys.HEARD_STOPS] if heard_key else [keys.OWN_STOPS] if own else []
+        self.stop_keys = [keys.STOPS, *heard] if timeline else []
         self.step_keys = [*self.required_keys, keys.SOURCE_OVER]
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
-        return existing([*self.in_keys, self.heard_key, self.own_key, *self.belief_keys])
+        read = [*self.in_keys, self.heard_key, self.own_key, *self.belief_keys, *self.stop_keys]
+        return existing(read)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])
@@ -110,19 +114,33 @@ class ServerNode(WorldTransform):
         elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
         steps, messages = elapsed.view(self.rows), self.server.messages(received)
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
-        outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, entries.get(keys.BELIEF))
+        belief, timeline = entries.get(keys.BELIEF), entries.get(keys.STOPS)
+        outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, belief, timeline)
         written = outputs.entries(self.reward_terms)
         if self.heard_key:
             heard = self.server.messages(entries[self.heard_key])
-            written[keys.OBSERVATION] = self.server.observe_each(heard, steps)
+            heard_timeline = _by_sender(entries[keys.HEARD_STOPS]) if timeline is not None else None
+            written[keys.OBSERVATION] = self.server.observe_each(heard, steps, timeline=heard_timeline)
         elif self.own_key:
             written[keys.OBSERVATION] = self.server.observe_with_own_messages(
-                received, entries[self.own_key], steps, belief=entries.get(keys.OWN_BELIEF)
+                received,
+                entries[self.own_key],
+                steps,
+                entries.get(keys.OWN_BELIEF),
+                timeline,
+                entries.get(keys.OWN_STOPS),
             )
         memory = {"elapsed": elapsed}
         if outputs.coverage is not None:
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
         return memory, written
+
+
+def _by_sender(own_first: Tensor) -> Tensor:
+    """Timelines of receivers [B, N, N, K, C], whose senders begin with the receiver, in the order of senders."""
+    agent = torch.arange(own_first.shape[1], device=own_first.device)
+    receiver = agent.unsqueeze(-1)
+    return own_first[:, receiver, (agent - receiver) % len(agent)]
 
 
 class Belief(WorldTransform):
@@ -233,11 +251,8 @@ def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, age
 
     Of a single world; what a belief remembers is changed in place.
     """
-    if isinstance(transform, ObservationTimeline) and lag <= transform.slots:
-        row = {"kept": transform.encoded(message.view(1, 1, -1)).view(-1), "due": 1, "sent": True}
-        memory = memory | {name: memory[name].clone() for name in row}
-        for name, value in row.items():
-            memory[name][agent, lag - 1] = value
+    if isinstance(transform, ObservationTimeline):
+        return transform.noted_late(memory, message, agent, lag)
     if isinstance(transform, Belief) and lag <= transform.longest:
         messages = transform.server.messages(message.view(1, 1, -1))
         slot = (memory["slot"] + 1 - lag) % len(memory["report"])

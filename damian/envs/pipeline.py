@@ -15,6 +15,7 @@ from collections.abc import Collection
 from functools import partial
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
@@ -39,8 +40,10 @@ from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
 _REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LOSS]
-_REPORTED += [keys.BELIEF, keys.OWN_BELIEF]
+_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, keys.STOPS, keys.OWN_STOPS]
 """Entries that only the extra ``message`` outputs."""
+_LINKED = [keys.LINKED, keys.LINK_DELAY, keys.HEARD_STOPS]
+"""Entries from which UAVs that hear each other directly compute what they observe."""
 
 
 def make_env(
@@ -76,7 +79,10 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
     ]
-    dropped = [*[keys.LINKED] * (scenario.links.kind == "matrix"), *_REPORTED * ("message" not in extras)]
+    dropped = [
+        *_LINKED * (scenario.links.kind == "matrix"),
+        *_REPORTED * ("message" not in extras),
+    ]
     if has_server_node(scenario) and dropped:
         transforms.append(Drop(dropped))
     return Compose(*transforms)  # type: ignore[arg-type]
@@ -101,7 +107,7 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
 def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
     """The message delay (paper, section 3.4), links, and the server node, which uses arrived messages."""
     output_messages, delayed, links = "message" in extras, scenario.delays.obs.late, scenario.links
-    remembers = server.grid is not None or scenario.delay.messages > 0
+    remembers = server.grid is not None or scenario.delay.messages > 0 or scenario.observation.timeline > 0
     transforms: list[Transform] = []
     if delayed:
         uplink = ObservationDelay(
@@ -131,8 +137,10 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
             dt=scenario.clock.dt,
             age_key=None,
             mask_key=None,
+            delay_key=keys.LINK_DELAY if scenario.observation.timeline else None,
         )
         transforms.append(channel)
+        transforms += timeline_transforms(scenario, server, keys.HEARD_STOPS, keys.LINK_DELAY, group=True)
     node = ServerNode(server, held, heard_key=heard, reward_terms="reward_terms" in extras)
     return [*transforms, node]
 
@@ -156,7 +164,35 @@ def remembering_transforms(
             own=own,
         )
         transforms.append(history)
+    delay_key = keys.DELAY if delayed else None
+    transforms += timeline_transforms(scenario, server, keys.STOPS, delay_key)
+    if own:
+        transforms += timeline_transforms(scenario, server, keys.OWN_STOPS, None)
     return transforms
+
+
+def timeline_transforms(
+    scenario: ScenarioConfig,
+    server: Server,
+    out_key: NestedKey,
+    delay_key: NestedKey | None,
+    *,
+    group: bool = False,
+) -> list[Transform]:
+    """What is known of the stops of the latest steps, for the feature ``timeline``, if it is observed."""
+    if not scenario.observation.timeline:
+        return []
+    timeline = ObservationTimeline(
+        scenario.observation.timeline,
+        keys.MESSAGE,
+        out_key,
+        delay_key=delay_key,
+        sent_key=keys.MESSAGE_SENT,
+        encode=server.stop_places,
+        ages=server.stop_ages,
+        group=group,
+    )
+    return [timeline]
 
 
 def scaled_messages(server: Server, rows: Tensor) -> Tensor:
@@ -235,7 +271,8 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
 
 def has_server_node(scenario: ScenarioConfig) -> bool:
     """Whether a ``ServerNode`` computes observations and rewards, instead of ``UavEnv``."""
-    remembers = bool(scenario.observation.belief) or scenario.delay.messages > 0
+    observation, messages = scenario.observation, scenario.delay.messages
+    remembers = bool(observation.belief) or messages > 0 or observation.timeline > 0
     return scenario.delays.obs.late or remembers or scenario.links.kind == "matrix"
 
 

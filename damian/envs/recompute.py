@@ -5,13 +5,16 @@ from collections.abc import Collection
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torch.nn import functional as F
 
 from damian import keys
+from damian.common.tensors import expand_mask
 from damian.keys import next_key
 from damian.replay.backupdate import Recompute
 from damian.replay.hindsight import arrived_by_now
 from damian.server.belief import likelihood, places, predict, repeated, report_rows, weigh
 from damian.server.server import Server
+from damian.transforms.timeline import told_slots
 
 CORRECTED = {"reward": keys.REWARD, "critic": keys.GLOBAL_OBSERVATION, "actor": keys.OBSERVATION}
 """What late messages can correct in stored steps, and where it lies; of the actors' observations not what
@@ -27,24 +30,58 @@ def server_recompute(
     """
     own = "actor" in corrected and server.observation.own
     observers = {"critic", "actor"}.intersection(corrected) - ({"actor"} if own else set())
-    believes = server.grid is not None and (own or bool(observers) or server.rewards_belief)
+    observed = own or bool(observers)
+    believes = server.grid is not None and (observed or server.rewards_belief)
+    timed = server.observation.timeline > 0 and observed
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
         elapsed = steps[next_key(keys.STEP_COUNT)].squeeze(-1)
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
         belief = beliefs_in_hindsight(server, steps) if believes else None
+        timeline = timeline_in_hindsight(server, steps) if timed else None
         held = server.messages(messages)
-        outputs = server(held, elapsed, source_over, belief=belief, observers=observers)
+        remembered = {"belief": belief, "timeline": timeline}
+        outputs = server(held, elapsed, source_over, **remembered, observers=observers)
         entries = outputs.entries(reward_terms)
         if belief is not None:
             entries[keys.BELIEF] = belief
+        if timeline is not None:
+            entries[keys.STOPS] = timeline
         if own:
-            sent, own_belief = steps[next_key(keys.MESSAGE)], steps.get(next_key(keys.OWN_BELIEF), None)
-            entries[keys.OBSERVATION] = server.observe_with_own_messages(messages, sent, elapsed, own_belief)
+            read = (keys.MESSAGE, keys.OWN_BELIEF, keys.OWN_STOPS)
+            sent, own_belief, own_timeline = (steps.get(next_key(key), None) for key in read)
+            entries[keys.OBSERVATION] = server.observe_with_own_messages(
+                messages, sent, elapsed, own_belief, timeline, own_timeline
+            )
         kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
         return {next_key(key): value for key, value in entries.items() if key not in kept}
 
     return recompute
+
+
+def timeline_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
+    """What is known of stops after each stored step, by all that has arrived by now, [T, B, N, slots, 3]."""
+    messages, n_steps = steps[next_key(keys.MESSAGE)], len(steps)
+    places, told = told_slots(
+        server.stop_places(messages), server.stop_ages(messages), server.observation.timeline
+    )
+    step = torch.arange(n_steps, device=messages.device).view(-1, 1, 1)
+    arrived = steps[next_key(keys.MESSAGE_SENT)]
+    if next_key(keys.DELAY) in steps.keys(True):
+        delay = steps[next_key(keys.DELAY)].squeeze(-1)
+        arrived = arrived & arrived_by_now(delay, n_steps - 1 - step)
+    told = (told & arrived.unsqueeze(-1)).unsqueeze(-1)
+    new = torch.cat([places, torch.ones_like(places[..., :1])], -1)
+    begins = expand_mask(steps[keys.STEP_COUNT].squeeze(-1) == 0, new)
+    known, found = steps[keys.STOPS][0], []
+    for i in range(n_steps):  # each one follows from the one before
+        known = torch.where(begins[i], steps[keys.STOPS][i], known)
+        older = F.pad(known[..., :-1, :], (0, 0, 1, 0))  # a step older
+        known = torch.where(told[i], new[i], older)
+        if i == 0:  # where its episode began earlier, what had been told then is not known
+            known = torch.where(begins[0], known, steps[next_key(keys.STOPS)][0])
+        found.append(known)
+    return torch.stack(found)
 
 
 def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:

@@ -6,7 +6,6 @@ from typing import Any, cast
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torch.nn.functional import pad
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
@@ -18,7 +17,8 @@ from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.config import ScenarioConfig
 from damian.server.belief import certain_belief
 from damian.server.components import checked_features
-from damian.server.features import feature_bounds, nearest_way
+from damian.server.features.source import nearest_way
+from damian.server.layout import Layout
 from damian.server.server import Features, Server
 from damian.world.coverage import KnownCoverage
 from damian.world.requests import is_open
@@ -29,7 +29,7 @@ Outputs = dict[NestedKey, Tensor]
 """Entries that a step or a reset outputs, by key."""
 
 Bounds = dict[NestedKey, tuple[Tensor, Tensor]]
-"""Lowest and highest values of each column of an observation, [N, F] each, by key."""
+"""Lowest and highest values of each column of an observation, [F] each, by key."""
 
 EXTRAS = ("message", "state", "reward_terms")
 """Default optional outputs."""
@@ -88,17 +88,18 @@ class UavEnv(EnvBase):
         checks.device("device", str(device))
         self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         of = self.scenario
-        self.simulation = Simulation(of, of.clock.dt, of.observation.stops, seed)
+        self.simulation = Simulation(of, of.clock.dt, of.observation.carried_stops, seed)
         self.server = Server(self.simulation, of.observation, of.reward, of.episode, of.time_scale)
-        problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
-        known = messages_only or self.server.grid is None
-        checks.require(known, "observation.belief", self.server.observation.belief, problem)
+        problem = "needs transforms before a ServerNode: build the environment by damian.make_env"
+        for name in ("belief", "timeline"):
+            value = getattr(of.observation, name)
+            checks.require(messages_only or not value, f"observation.{name}", value, problem)
         initial = self.simulation.initial
         features = checked_features(self.server, initial.sent, initial.steps)
-        self.action_columns = self.server.action_columns(features)
-        """Columns of the actors' observations with a value for each action; None if there are none."""
+        self.layout = self._layouts(features)
+        """What the columns of each observation mean, by the last part of its key."""
         self._reset_outputs = self._outputs_at_reset(initial, features)
-        self._make_specs(features)
+        self._make_specs()
         self.set_seed(seed)
         self.to(torch.device(device))
 
@@ -278,14 +279,19 @@ class UavEnv(EnvBase):
         root[keys.AGENTS] = make(agents, shape, self.device)
         return make(root, self.batch_size, self.device)
 
-    def _make_specs(self, features: Features) -> None:
-        """Specs with the bounds that the features declare, and [-1, 1] for the offset to the source."""
-        first = {name: values[:1] for name, values in features.items()}
-        low, high = (self.server.observations(limit) for limit in feature_bounds(first))
-        actor, critic = ((lowest[0], highest[0]) for lowest, highest in zip(low, high, strict=True))
-        privileged = pad(critic[0], [0, 2], value=-1.0), pad(critic[1], [0, 2], value=1.0)
-        bounds: Bounds = {keys.OBSERVATION: actor, keys.GLOBAL_OBSERVATION: critic}
-        bounds[keys.PRIVILEGED_OBSERVATION] = privileged
+    def _layouts(self, features: Features) -> dict[str, Layout]:
+        actor, critic = self.server.layouts(features)
+        meaning = "Way from the UAV to the nearest source, over the size of the region."
+        privileged = critic.appended(
+            "source_way", (2,), -1.0, 1.0, entries=("east", "north"), meaning=meaning
+        )
+        observed = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.PRIVILEGED_OBSERVATION)
+        layouts = zip(observed, (actor, critic, privileged), strict=True)
+        return {keys.last_part(key): layout for key, layout in layouts}
+
+    def _make_specs(self) -> None:
+        """Specs with the bounds that the layouts state."""
+        bounds: Bounds = {(keys.AGENTS, name): layout.bounds() for name, layout in self.layout.items()}
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
         ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in keys.ENDS}
         observations: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}

@@ -14,7 +14,7 @@ from damian.common.text_files import named
 from damian.field.node import Node
 from damian.field.rows import Rows
 from damian.field.tracker import Tracker
-from damian.learners.recurrent import AgentGRU
+from damian.models.memory import AgentGRU
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 

@@ -78,7 +78,7 @@ class Tracker:
 
     def new_log(self) -> UavLog:
         """The log of a UAV that has not reported yet."""
-        widths, stops = self.node.simulation.widths, self.node.server.observation.stops
+        widths, stops = self.node.simulation.widths, self.node.server.observation.carried_stops
         return UavLog(self.node.ground, stops, widths.readings, self.node.dt)
 
     def check(self, report: Report, log: UavLog | None = None) -> None:

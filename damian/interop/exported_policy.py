@@ -12,7 +12,7 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.data import Categorical, TensorSpec
-from torchrl.modules import MultiAgentMLP, ProbabilisticActor
+from torchrl.modules import ProbabilisticActor
 
 from damian import keys
 from damian.common import checks
@@ -26,10 +26,6 @@ class ExportedPolicy(nn.Module):
     def __init__(self, actor: ProbabilisticActor, spec: TensorSpec) -> None:
         super().__init__()
         *layers, last = copy.deepcopy(actor.module)
-        for layer in layers:
-            for name, network in [*layer.named_modules()]:
-                if isinstance(network, MultiAgentMLP):
-                    layer.set_submodule(name, OwnLayers(network))
         self.last: Any = last
         self.last.return_log_prob = False
         self.layers, self.in_keys = nn.ModuleList(layers), [*actor.in_keys]
@@ -56,26 +52,6 @@ class ExportedPolicy(nn.Module):
             Distribution.set_default_validate_args(checked)
         shown = shown or [entries[key] for key in self.parameter_keys]
         return action, *shown, *([entries[keys.HIDDEN]] if self.recurrent else [])
-
-
-class OwnLayers(nn.Module):
-    """The layers of an actor for each UAV, for observations [*, N, F]; TorchRL's form cannot be exported."""
-
-    def __init__(self, network: MultiAgentMLP) -> None:
-        super().__init__()
-        parts = dict(network._empty_net.named_children())
-        self.parts = nn.ModuleList(
-            nn.ParameterList([network.params[name, "weight"], network.params[name, "bias"].unsqueeze(-1)])
-            if isinstance(part, nn.Linear)
-            else part
-            for name, part in parts.items()
-        )
-
-    def forward(self, features: Tensor) -> Tensor:
-        features = features.unsqueeze(-1)
-        for part in self.parts:
-            features = part[0] @ features + part[1] if isinstance(part, nn.ParameterList) else part(features)
-        return features.squeeze(-1)
 
 
 def exported(

@@ -1,4 +1,4 @@
-"""Settings of the networks and of the learners. A learner's settings name the class that learns with them."""
+"""Settings of learners, which name the class that learns with them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
 from damian.common.registry import Registry, resolved
+from damian.models.config import ModelConfig
 
 if TYPE_CHECKING:
     from tensordict import NestedKey
@@ -26,39 +27,6 @@ LEARNERS = Registry[type["LearnerConfig"]](
     "learner", _is_learner, "is not a @dataclass derived from damian.LearnerConfig with a method make"
 )
 """Settings of learners, by name; the user's own as ``package.module:Name``."""
-
-
-@dataclass
-class ModelConfig(Settings):
-    """Networks of actor and critic, one multilayer perceptron each."""
-
-    section: ClassVar[str] = "model"
-
-    hidden: list[int] = setting([256, 256], "Width of each hidden layer.", low=1, high=16384)
-    activation: str = setting("tanh", "Activation function.", choices=("tanh", "relu", "elu", "silu"))
-    rnn: str = setting(
-        "none",
-        "Recurrence: with gru the actor's last hidden layer remembers its observations of the episode.",
-        choices=("none", "gru"),
-    )
-    skip: bool = setting(False, "The actor begins by preferring actions of high ``belief_gain``.")
-    shared: bool = setting(
-        True, "All UAVs share one actor; if not, each has one of its own, for unequal UAVs."
-    )
-    shared_value: bool = setting(
-        False, "MAPPO's critic gives one value for all UAVs of a world; faster, but it learns less."
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.refuse(self.recurrent and not self.hidden, "hidden", "needs a layer for model.rnn=gru")
-        problem = "goes with model.rnn=none model.skip=false only"
-        self.refuse(not self.shared and (self.recurrent or self.skip), "shared", problem)
-
-    @property
-    def recurrent(self) -> bool:
-        """Whether the actor has a recurrent layer."""
-        return self.rnn != "none"
 
 
 class LearningSetup(NamedTuple):
@@ -154,7 +122,7 @@ class LearnerConfig(Settings):
 
     def make_actor(self, env: "EnvBase", model: ModelConfig) -> "ProbabilisticActor":
         """Build an actor as the learner has it, for evaluations, which load its weights."""
-        return resolved("damian.learners.networks:make_actor")(env, model)
+        return resolved("damian.models.actor:make_actor")(env, model)
 
 
 @LEARNERS.register("mappo")

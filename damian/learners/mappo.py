@@ -14,11 +14,11 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, set_recurrent_mode
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
-from damian.common.compiling import compiled
+from damian.common.compiling import COMPILE_OPTIONS, compiled
 from damian.learners.base import UNREAD, LearningSetup
 from damian.learners.config import MappoConfig
-from damian.learners.networks import COMPILE_OPTIONS, NormalizedValue, make_critic
-from damian.learners.recurrent import RECURRENT_KEYS
+from damian.models.critic import NormalizedValue, make_critic
+from damian.models.memory import RECURRENT_KEYS
 from damian.replay.backupdate import BackupdateStorage
 
 LOSSES = ("loss_objective", "loss_entropy", "loss_critic")

@@ -16,7 +16,7 @@ from damian import keys
 from damian.keys import next_key
 from damian.learners.base import UNREAD, LearningSetup
 from damian.learners.config import SacConfig
-from damian.learners.networks import ModelConfig, make_mlp
+from damian.models.critic import make_action_value
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
 
@@ -102,16 +102,6 @@ _UNREAD: list[NestedKey] = [
     next_key(keys.EPISODE_REWARD),
 ]
 """Entries that SAC never reads; they are not stored, to save memory, unless back-updating reads them."""
-
-
-def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -> TensorDictModule:
-    """Make a Q-function of the entries ``read``: values of all discrete actions, or of the one."""
-    n_features = sum(env.observation_spec[key].shape[-1] for key in read)
-    spec = env.full_action_spec_unbatched[keys.ACTION]
-    if isinstance(spec, Categorical):
-        return TensorDictModule(make_mlp(model, n_features, spec.n, env.device), read, ["action_value"])
-    network = make_mlp(model, n_features + spec.shape[-1], 1, env.device)
-    return TensorDictModule(network, [*read, keys.ACTION], ["state_action_value"])
 
 
 def sac_loss(

@@ -13,7 +13,7 @@ from damian import keys
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.recompute import beliefs_in_hindsight
 from damian.keys import next_key
-from damian.learners.recurrent import add_recurrent_state
+from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage
 from damian.runs.checkpoint import to_tensordict
 from damian.server.server import Server

@@ -1,5 +1,6 @@
 """Checks that features and reward terms, built-in or your own, have the shapes and bounds they declare."""
 
+from collections.abc import Mapping
 from typing import cast
 
 import torch
@@ -10,11 +11,11 @@ from damian import keys
 from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.tensors import expand_mask, tree_map
-from damian.server.features import feature_of, stack
+from damian.server.features import feature_of
+from damian.server.layout import Layout
 from damian.server.rewards import Counters
 from damian.server.server import Features, Server
 from damian.world.messages import Messages
-from damian.world.simulation import Simulation
 
 _WORLDS, _ROUNDING = 16, 1e-5
 
@@ -63,16 +64,13 @@ def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) 
     return server.own_features(tree_map(changed_of_others, messages), steps, [name])[name]
 
 
-def not_finite(server: Server, simulation: Simulation, steps: TensorDictBase) -> str | None:
+def not_finite(layouts: Mapping[str, Layout], steps: TensorDictBase) -> str | None:
     """Which feature or reward term of collected steps [*] is not finite; None if all are."""
-    first, observation = simulation.initial, server.observation
-    for key, names in ((keys.OBSERVATION, observation.actor), (keys.GLOBAL_OBSERVATION, observation.critic)):
+    for key in (keys.OBSERVATION, keys.GLOBAL_OBSERVATION):
         for values in (steps[key], steps[keys.next_key(key)]):
             if not values.isfinite().all():
-                features = server.features(first.sent, first.steps)
-                widths = [stack(features, [name]).shape[-1] for name in names]
-                columns = values[..., : sum(widths)].split(widths, -1)
-                wrong = [name for name, x in zip(names, columns, strict=True) if not x.isfinite().all()]
+                blocks = layouts[keys.last_part(key)]
+                wrong = [block.name for block in blocks if not block.of(values).isfinite().all()]
                 return f"feature {', '.join(wrong)}: a value is nan or infinite"
     terms = cast(TensorDictBase, steps[keys.next_key(keys.REWARD_TERMS)])
     wrong = [name for name, values in terms.items() if not values.isfinite().all()]

@@ -46,11 +46,20 @@ class ObservationConfig(Settings):
     timeline: int = setting(
         0, "Number of latest steps: actor and critic observe where other UAVs were in each.", low=0, high=100
     )
+    stops: int | None = setting(
+        None,
+        "Latest landing points of a UAV, with their times, that its messages carry; if not given, as many as "
+        "``window``, or as ``timeline`` has steps.",
+        low=1,
+        high=100,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("local_features", "global_features", "belief"):
             checks.distinct(f"observation.{name}", getattr(self, name))
+        fewer = self.stops is not None and self.stops < self.window
+        self.refuse(fewer, "stops", f"is fewer than observation.window={self.window}, which coverage counts")
         self.refuse(not self.actor, "local_features", "leaves the actor blind")
         self.refuse(not self.critic, "local_features", "leaves the critic blind")  # it observes no ages
 
@@ -74,9 +83,9 @@ class ObservationConfig(Settings):
         return ["timeline"] * (self.timeline > 0)
 
     @property
-    def stops(self) -> int:
+    def carried_stops(self) -> int:
         """Number of latest stops of a UAV that its messages carry."""
-        return max(self.window, self.timeline)
+        return max(self.window, self.timeline) if self.stops is None else self.stops
 
 
 @dataclass

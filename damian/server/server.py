@@ -16,14 +16,16 @@ from torch import Tensor
 from damian import keys
 from damian.common import checks
 from damian.common.tensors import gather_rows, move_attributes
-from damian.server.belief import SourceGrid, build_source_grids
+from damian.server.belief import SourceGrid
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.server.features import ServerContext, check_features, feature_of, observe, observe_own, stack
+from damian.server.features import ServerContext, feature_of, layout_of, observe, observe_own, stack
+from damian.server.features.base import check_features, source_grid
+from damian.server.features.timeline import first_timeline, stop_ages, stop_places
+from damian.server.layout import Layout
 from damian.server.rewards import Counters, final_reward, reward, terms_of
-from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
 from damian.world.config import FOOTPRINT, IN_REACH
-from damian.world.coverage import KnownCoverage, tables_of_all
+from damian.world.coverage import KnownCoverage
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.signal_source import footprint_radius
 from damian.world.simulation import Simulation
@@ -62,8 +64,8 @@ class Server:
     In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of the episode
     [*], ``source_over`` tells whether the source has finished its walk [*], ``coverage`` is that of an
     earlier step of the same worlds, which saves time, and ``belief`` the probability that each source is in
-    each cell of ``grid`` [*, K, C]; without it, these are the first messages of the episode. Time features
-    are divided by ``time_scale`` [s].
+    each cell of ``grid`` [*, K, C], and ``timeline`` what is known of each UAV's stops (``ServerContext``); without
+    them, these are the first messages of the episode. Time features are divided by ``time_scale`` [s].
     """
 
     def __init__(
@@ -86,47 +88,26 @@ class Server:
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._widths = simulation.widths
-        footprints, surrounded = None, "coverage_map" in self.names
         levels = simulation.vehicles.values.choices.get("source.level_db")
-        source, radii, scaled = simulation.config.source, [simulation.radius], None
-        if levels is not None:
-            tabled = surrounded or "coverage" in self.names or observation.belief
-            ranged, remedy = len(levels) == 2 and bool(tabled), "give a list, as in [138,140,142]"
-            problem = f"is a range, but coverage and beliefs have tables for each footprint: {remedy}"
-            checks.require(not ranged, "randomise.source.level_db", levels, problem)
-            radii = [*map(footprint_radius, (replace(source, level_db=level) for level in levels))]
-            scaled = torch.cat([airspace.points.flatten(0, 1) * (radii[0] / each) for each in radii])
-        self._radii = None if levels is None else torch.tensor(radii)
-        if "coverage" in self.names:
-            polygons, points = [region.polygon for region in airspace.regions], airspace.points.double().cpu()
-            footprints = tables_of_all(polygons, points.numpy(), radii)
-        grid = None
-        if observation.belief:
-            drawn = [{"level_db": each} for each in levels or ()] or [{}]
-            kinds = [replace(each, **level) for level in drawn for each in simulation.sources]
-            grid = build_source_grids(airspace, kinds, self.dt, observation.belief_cell)
-            grid = grid._replace(first=grid.first.view(len(drawn), -1))
-        gains = "belief_gain" in observation.belief
+        radii = [
+            footprint_radius(replace(simulation.config.source, level_db=level)) for level in levels or ()
+        ]
+        self._radii = torch.tensor(radii) if radii else None
+        makers = dict.fromkeys(make for name in self.names for make in feature_of(name).tables)
         self._context = ServerContext(
             now=torch.zeros(()),
             scale=torch.zeros(()),
             time_scale=time_scale,
-            battery=battery,
-            footprints=footprints,
             points=airspace.points.flatten(0, 1),
-            scaled_points=scaled,
             observation=observation,
             dt=simulation.dt,
-            readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
-            radius=simulation.radius,
-            kinds=simulation.vehicles.kinds(simulation.config.agents),
             n_points=airspace.max_points,
-            goals=simulation.candidates.goals() if gains else None,
-            places_inside=torch.cat([places_inside(airspace, r) for r in radii]) if surrounded else None,
-            grid=grid,
+            radius=simulation.radius,
+            readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
+            tables={make: make(simulation, observation) for make in makers},
         )
         # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.
-        self.remembers_coverage = footprints is not None and not simulation.vehicles.instant
+        self.remembers_coverage = "coverage" in self.names and not simulation.vehicles.instant
 
     def _read_terms(self) -> None:
         self.terms = terms_of(self.reward)
@@ -145,7 +126,7 @@ class Server:
     @property
     def grid(self) -> SourceGrid | None:
         """Cells of the belief; None if no feature reads it."""
-        return self._context.grid
+        return self._context.tables.get(source_grid)
 
     @property
     def rewards_belief(self) -> bool:
@@ -165,14 +146,6 @@ class Server:
         """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
         return messages.trail[..., : self.observation.window]
 
-    def action_columns(self, features: Features) -> slice | None:
-        """The columns of the actors' observations that hold ``belief_gain``; None if there are none."""
-        names = self.observation.actor
-        if "belief_gain" not in names:
-            return None
-        parts = [stack(features, [name]).shape[-1] for name in names[: names.index("belief_gain") + 1]]
-        return slice(sum(parts[:-1]), sum(parts))
-
     def region_of(self, messages: Messages) -> Tensor:
         """Index of the region to which each world's landing points belong, [*]."""
         return messages.region(self._context.n_points)
@@ -184,6 +157,7 @@ class Server:
         source_over: Tensor | None = None,
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
+        timeline: Tensor | None = None,
         observers: Collection[str] = ("actor", "critic"),
     ) -> ServerOutputs:
         """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and what ``observers`` observe.
@@ -192,11 +166,11 @@ class Server:
         """
         seen = {observer: getattr(self.observation, observer) for observer in observers}
         names = sorted({*self.reads, *itertools.chain(*seen.values())})
-        features = self.features(messages, steps, names, coverage, belief)
+        features = self.features(messages, steps, names, coverage, belief, timeline)
         if self.reward.detection == "truth":
             first, _ = self._context.readings[IN_REACH]
             messages = messages._replace(spotted=messages.readings[..., first] > 0.5)
-            judged = self.features(messages, steps, self.reads, coverage, belief)
+            judged = self.features(messages, steps, self.reads, coverage, belief, timeline)
         else:
             judged = features
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
@@ -217,44 +191,83 @@ class Server:
         names: list[str] | None = None,
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
+        timeline: Tensor | None = None,
     ) -> Features:
         """The features of these names, or all that an observation or a reward term needs (paper, Table 2)."""
-        context = self._known(messages, steps)._replace(coverage=coverage, belief=belief)
+        remembered = {"coverage": coverage, "belief": belief, "timeline": timeline}
+        context = self._known(messages, steps)._replace(**remembered)
         return observe(messages, context, self.names if names is None else names)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
         """Observations of the actors [*, N, F] and of the critic [*, N, G]."""
         return stack(features, self.observation.actor), stack(features, self.observation.critic)
 
+    def layouts(self, features: Features) -> tuple[Layout, Layout]:
+        """The layouts of the actors' and the critic's observations, from features of any worlds."""
+        return layout_of(features, self.observation.actor), layout_of(features, self.observation.critic)
+
     def observe_with_own_messages(
-        self, received: Tensor, sent: Tensor, steps: Tensor, belief: Tensor | None = None
+        self,
+        received: Tensor,
+        sent: Tensor,
+        steps: Tensor,
+        belief: Tensor | None = None,
+        timeline: Tensor | None = None,
+        own_timeline: Tensor | None = None,
     ) -> Tensor:
         """Observations of actors that know their own messages at once, [*, N, F].
 
         ``received`` and ``sent`` are packed messages [*, N, M] as the server holds them, and as the UAVs sent
-        them last. ``belief``: that of each UAV, [*, N, K, C].
+        them last; ``timeline`` and ``own_timeline`` [*, N, slots, 3] are what follows from those that have
+        arrived, and from all sent. ``belief``: that of each UAV, [*, N, K, C].
         """
-        own = torch.eye(received.shape[-2], dtype=torch.bool, device=received.device).unsqueeze(-1)
-        known = torch.where(own, sent.unsqueeze(-3), received.unsqueeze(-3))  # [*, N receivers, N senders]
-        return self.observe_each(self.messages(known), steps, belief)
+        known = self.messages(_own_or_others(sent, received, 1))
+        both = None
+        if timeline is not None and own_timeline is not None:
+            both = _own_or_others(own_timeline, timeline, 2)
+        return self.observe_each(known, steps, belief, both)
 
-    def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
-        """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K, C]."""
-        return stack(self.own_features(known, steps, self.observation.actor, belief), self.observation.actor)
+    def observe_each(
+        self,
+        known: Messages,
+        steps: Tensor,
+        belief: Tensor | None = None,
+        timeline: Tensor | None = None,
+    ) -> Tensor:
+        """Observations [*, N, F] from messages and timelines [*, N, N, ...] (receiver, sender), and beliefs."""
+        names = self.observation.actor
+        return stack(self.own_features(known, steps, names, belief, timeline), names)
 
     def own_features(
-        self, known: Messages, steps: Tensor, names: list[str], belief: Tensor | None = None
+        self,
+        known: Messages,
+        steps: Tensor,
+        names: list[str],
+        belief: Tensor | None = None,
+        timeline: Tensor | None = None,
     ) -> Features:
-        """Features of UAVs, [*, N] each, who know messages [*, N, N] and beliefs as in ``observe_each``."""
+        """Features of UAVs, [*, N, ...] each, who know messages [*, N, N] and more, as in ``observe_each``."""
         context = self._known(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
-        return observe_own(known, context._replace(belief=belief), names)
+        return observe_own(known, context._replace(belief=belief, timeline=timeline), names)
+
+    def stop_places(self, rows: Tensor) -> Tensor:
+        """Where the stops have been of which packed messages [*, M] tell [m], [*, S, 2]."""
+        return stop_places(self.messages(rows), self._context)
+
+    def stop_ages(self, rows: Tensor) -> Tensor:
+        """How long ago those were when the message was generated [steps], [*, S]; -1 for none."""
+        return stop_ages(self.messages(rows), self._context)
+
+    def first_timeline(self, rows: Tensor) -> Tensor:
+        """What first messages [*, M] tell of the stops of their senders, [*, slots, 3]."""
+        return first_timeline(self.messages(rows), self._context)
 
     def _known(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages now."""
         context = self._context._replace(now=steps * self.dt, scale=self.scales(messages))
         if self._radii is None:
             return context
-        return context._replace(radius=self._told_radius(messages), footprint=self.level(messages))
+        return context._replace(radius=self._told_radius(messages), level=self.level(messages))
 
     def level(self, messages: Messages) -> Tensor | None:
         """Number of the drawn level of the source in each world, [*]; None if none is drawn."""
@@ -271,3 +284,13 @@ class Server:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
         region, scales = self.region_of(messages), self._scales
         return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)
+
+
+def _own_or_others(own: Tensor, others: Tensor, inner: int) -> Tensor:
+    """What each receiver knows of each sender, [*, N, N, ...]: of itself ``own``, of others ``others``.
+
+    Both are [*, N, ...], with ``inner`` dimensions behind the senders.
+    """
+    n = own.shape[-1 - inner]
+    itself = torch.eye(n, dtype=torch.bool, device=own.device).view(n, n, *[1] * inner)
+    return torch.where(itself, own.unsqueeze(-2 - inner), others.unsqueeze(-2 - inner))

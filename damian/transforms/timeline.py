@@ -17,12 +17,25 @@ _NEVER = 2**31
 """Steps until the arrival of a message that never arrives."""
 
 
+def told_slots(facts: Tensor, ages: Tensor, slots: int) -> tuple[Tensor, Tensor]:
+    """Facts [*, S, D] by their ages [*, S] in steps: slot k holds that of age k, [*, K, D]; zeros if none has.
+
+    Also which slots a fact tells of, [*, K] bool. Ages below 0, or of ``slots`` or more, are left out.
+    """
+    slot = torch.where((ages < 0) | (ages >= slots), slots, ages)  # the last one is left out
+    table = facts.new_zeros(*slot.shape[:-1], slots + 1, facts.shape[-1])
+    table = table.scatter(-2, slot.unsqueeze(-1).expand_as(facts), facts)
+    told = torch.zeros(table.shape[:-1], dtype=torch.bool, device=slot.device).scatter(-1, slot, True)
+    return table[..., :slots, :], told[..., :slots]
+
+
 class ObservationTimeline(StatefulTransform):
     """Writes what is known of the latest steps, ordered by when it was true.
 
     It comes after ``ObservationDelay(..., delay_key=...)`` or ``Channel(..., delay_key=...)``, which draw the
-    delays. Slot k holds the message that was generated k steps ago, followed by 1, once that message has
-    arrived; until then, and before the reset, it holds zeros. What it holds depends on nothing else, whenever
+    delays. Slot k holds what was true k steps ago, followed by 1, once a message that tells it has arrived;
+    until then, and before the reset, it holds zeros. A message tells what was true when it was generated, and
+    with ``ages`` also what was true before; two messages about one step agree. What it holds depends on nothing else, whenever
     and in whichever order messages arrive, so that one policy can serve every delay. ``received`` and ``age``
     alone do not show overtaken messages, nor the second one to arrive in a step.
 
@@ -42,6 +55,9 @@ class ObservationTimeline(StatefulTransform):
             places relative to the observer (D is a multiple of P), and each slot moves them into its present
             frame, by its displacement since. Several rows of messages in order may belong to one observer.
         encode: function from messages [..., M] to the D numbers to keep; if not given, these are the message.
+            With ``ages``, to the S facts that a message tells, [..., S, D].
+        ages: function from messages [..., M] to the ages of these facts when the message is generated
+            [steps], [..., S] long; -1 for none.
         group: every agent gets the messages of all agents: its own first, then those of the agents after it.
         own: whether an agent knows its own messages as soon as they are sent.
 
@@ -62,14 +78,16 @@ class ObservationTimeline(StatefulTransform):
         sent_key: NestedKey | None = None,
         position_key: NestedKey | None = None,
         encode: Callable[[Tensor], Tensor] | None = None,
+        ages: Callable[[Tensor], Tensor] | None = None,
         group: bool = False,
         own: bool = False,
     ) -> None:
         checks.whole("slots", slots, 1)
-        should = "goes with messages of the observer alone: leave out group"
-        checks.require(position_key is None or not group, "position_key", position_key, should)
+        should = "goes with messages of the observer alone: leave out group and ages"
+        alone = not group and ages is None
+        checks.require(position_key is None or alone, "position_key", position_key, should)
         super().__init__(message_key)
-        self.slots, self.encode, self.group, self.own = slots, encode, group, own
+        self.slots, self.encode, self.ages, self.group, self.own = slots, encode, ages, group, own
         written, self.delay_key, self.sent_key, self.position_key = (
             sibling_key(self.row_key, key) for key in (out_key, delay_key, sent_key, position_key)
         )
@@ -77,8 +95,11 @@ class ObservationTimeline(StatefulTransform):
         self.step_keys = existing([self.row_key, self.delay_key, self.sent_key, self.position_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        first = self._sent(tensordict.get)
-        blank = {name: torch.zeros_like(value).unsqueeze(1) for name, value in self._by_row(first).items()}
+        first = self._by_row(self._sent(tensordict.get))
+        if self.ages is not None:
+            first["kept"] = first["kept"][:, 0]  # one fact for each slot
+            del first["ages"]
+        blank = {name: torch.zeros_like(value).unsqueeze(1) for name, value in first.items()}
         blank["due"] += _NEVER
         return {name: value.repeat_interleave(self.slots, 1) for name, value in blank.items()}
 
@@ -96,11 +117,11 @@ class ObservationTimeline(StatefulTransform):
     def _sent(self, entry: Callable[[NestedKey], Tensor]) -> dict[str, Tensor]:
         """The messages of a step, or of many, by the names of the memory; ``entry`` returns an entry.
 
-        ``kept`` [..., D], the steps until they are ``due`` at each of R receivers [..., R], whether one was
-        ``sent`` [...], and the ``position`` of the observer [..., P].
+        ``kept`` [..., D], or [..., S, D] with their ``ages`` [..., S]; the steps until they are ``due`` at
+        each of R receivers [..., R]; whether one was ``sent`` [...]; the ``position`` of the observer [..., P].
         """
-        kept = self.encoded(entry(self.row_key))
-        sent = torch.ones_like(kept[..., 0], dtype=torch.bool)
+        message = entry(self.row_key)
+        kept, sent = self.encoded(message), torch.ones_like(message[..., 0], dtype=torch.bool)
         if self.sent_key is not None:
             sent = entry(self.sent_key).view(sent.shape)
         due = torch.zeros_like(sent, dtype=torch.long).unsqueeze(-1)
@@ -109,6 +130,8 @@ class ObservationTimeline(StatefulTransform):
             delay = delay.transpose(-1, -2) if delay.shape[-1] > 1 else delay  # by sender and receiver
             due = torch.where(delay >= 0, delay, _NEVER)
         found = {"kept": kept, "due": due, "sent": sent}
+        if self.ages is not None:
+            found["ages"] = self.ages(message)
         return found if self.position_key is None else found | {"position": entry(self.position_key)}
 
     def _by_row(self, sent: dict[str, Tensor]) -> Memory:
@@ -124,7 +147,21 @@ class ObservationTimeline(StatefulTransform):
         """The memory with the messages of a step as the newest."""
         newest, older = self._by_row(sent), memory | {"due": memory["due"] - 1}
         newest["due"] = torch.where(newest["sent"].unsqueeze(-1), newest["due"], _NEVER)
-        return {name: torch.cat([new.unsqueeze(1), older[name][:, :-1]], 1) for name, new in newest.items()}
+        if self.ages is None:
+            return {
+                name: torch.cat([new.unsqueeze(1), older[name][:, :-1]], 1) for name, new in newest.items()
+            }
+        never = torch.full_like(older["due"][:, :1], _NEVER)
+        blank = {"due": never, **{name: torch.zeros_like(memory[name][:, :1]) for name in ("kept", "sent")}}
+        older = {name: torch.cat([blank[name], old[:, :-1]], 1) for name, old in older.items()}
+        facts, told = told_slots(newest["kept"], newest["ages"], self.slots)
+        told = told & newest["sent"].unsqueeze(-1)
+        due = torch.minimum(older["due"], newest["due"].unsqueeze(1))
+        return {
+            "kept": torch.where(told.unsqueeze(-1), facts, older["kept"]),
+            "due": torch.where(told.unsqueeze(-1), due, older["due"]),
+            "sent": older["sent"] | told,
+        }
 
     def _written(self, memory: Memory) -> Entries:
         """The timeline, from the memory."""
@@ -156,8 +193,12 @@ class ObservationTimeline(StatefulTransform):
         return found if self.group else found.squeeze(1)
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
-        """Writes the timeline again if it is among ``keys``, with all that has arrived by the latest step."""
-        return Correction(self._corrected, self.slots) if self.out_keys[0] in keys else None
+        """Writes the timeline again if it is among ``keys``, with all that has arrived by the latest step.
+
+        With ``ages``, what computes it again does so from the one before (``known_in_hindsight``).
+        """
+        wanted = self.out_keys[0] in keys and self.ages is None
+        return Correction(self._corrected, self.slots) if wanted else None
 
     def _corrected(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
         after, first = (self._sent(lambda key, at=at: steps[at(key)]) for at in (next_key, lambda key: key))
@@ -180,6 +221,20 @@ class ObservationTimeline(StatefulTransform):
         found = self._timeline(stacked, torch.stack(arrived, 1))
         return entries | {next_key(self.out_keys[0]): found.view(*after["sent"].shape, *found.shape[1:])}
 
+    def noted_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
+        """The memory with an agent's message [M] that arrives in the next step, ``lag`` >= 1 steps late."""
+        facts = self.encoded(message).view(1, -1, memory["kept"].shape[-1])
+        ages = torch.zeros(1, 1, dtype=torch.long) if self.ages is None else self.ages(message).view(1, -1)
+        # Slots are of the step before the next one.
+        kept, told = told_slots(facts, torch.where(ages < 0, -1, ages + lag - 1), self.slots)
+        memory = {name: value.clone() for name, value in memory.items()}
+        memory["kept"][agent] = torch.where(told[0].unsqueeze(-1), kept[0], memory["kept"][agent])
+        memory["due"][agent] = torch.where(
+            told[0].unsqueeze(-1), memory["due"][agent].clamp(max=1), memory["due"][agent]
+        )
+        memory["sent"][agent] |= told[0]
+        return memory
+
     def encoded(self, message: Tensor) -> Tensor:
         """The numbers to keep of messages, [..., D]."""
         return message if self.encode is None else self.encode(message)
@@ -187,7 +242,8 @@ class ObservationTimeline(StatefulTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         spec, rows = observation_spec[self.row_key], spec_rows(observation_spec, self.row_key)
         encoded = self.encoded(spec.zero())
-        shape = (*rows, *rows[-1:] * self.group, self.slots, encoded.shape[-1] + 1)
+        n_numbers = encoded.shape[-1]
+        shape = (*rows, *rows[-1:] * self.group, self.slots, n_numbers + 1)
         dtype = torch.promote_types(encoded.dtype, torch.float32)
         add_spec(observation_spec, self.out_keys[0], shape, dtype)
         return observation_spec

@@ -34,10 +34,10 @@ from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS, UavEnv
-from damian.learners.networks import ModelConfig, make_actor
+from damian.models.actor import make_actor
+from damian.models.config import MlpConfig
 from damian.recipes.cli import settings as composed_config
-from damian.server.config import BUILT_IN
-from damian.server.features import ObservationConfig
+from damian.server.config import BUILT_IN, ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
@@ -171,7 +171,7 @@ def rival(task: str, limit: int | None = None) -> str:
 def policy_for(env: EnvBase) -> torch.nn.Module:
     """A policy with two layers of 64 for an environment of ours, or of VMAS."""
     if isinstance(env, DelayedEnv):
-        return make_actor(env, ModelConfig(hidden=[64, 64]))
+        return make_actor(env, MlpConfig(hidden=[64, 64]))
     return vmas_actor(env, 3, [64, 64])
 
 

@@ -6,7 +6,7 @@
         "observation.global_features=[source_distance,source_bearing,features:spread]"
 
 A feature reads the fields of the messages that the server holds, [*, N], and returns values in [0, 1],
-[*, N]; with ``@feature(scope, width=2, low=-1.0)`` it returns [*, N, 2] in [-1, 1] (``sensor.py``).
+[*, N]; with ``@feature(scope, [2], low=-1.0)`` it returns [*, N, 2] in [-1, 1] (``sensor.py``).
 """
 
 import math

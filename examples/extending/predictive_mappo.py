@@ -26,9 +26,11 @@ from damian.common.fields import setting
 from damian.common.tensors import expand_mask, gather_rows, next_true
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
-from damian.learners.config import MappoConfig, ModelConfig
+from damian.learners.config import MappoConfig
 from damian.learners.mappo import LOSS_KEYS, Mappo
-from damian.learners.networks import hidden_layers, make_mlp, with_distribution
+from damian.models.config import ModelConfig
+from damian.models.distribution import with_distribution
+from damian.models.mlp import hidden_layers, make_mlp
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
 
@@ -200,7 +202,7 @@ class MessageEncoder(nn.Module):
             nn.ReLU(),
             nn.Linear(2 * width, heads * width, device=device),
         )
-        self.layers = hidden_layers(config, heads * width + n_known + n_code, config.hidden, device)
+        self.layers = hidden_layers(config, heads * width + n_known + n_code, config.hidden).to(device)
 
     def forward(self, observation: Tensor, history: Tensor, codes: Tensor) -> Tensor:
         """Encode observations [*, F] and timelines [*, S, K, C], for Q codes each [*, Q, E], into [*, Q, H].
@@ -335,7 +337,7 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
         encoder = MessageEncoder(n_features, history.shape[-1], n_code, config, heads, width, device)
         head = BeliefHead(encoder, n_encoding, n_targets, n_actions, n_code, device)
         read = [keys.OBSERVATION, *head.out_keys]
-        policy = make_mlp(config, n_features + n_encoding, n_out, device)
+        policy = make_mlp(config, n_features + n_encoding, n_out).to(device)
         module = Preference(policy, n_targets, device) if discrete else NormalPolicy(policy)
         parts = [head, TensorDictModule(module, read, list(out_keys))]
         return TensorDictSequential(parts)  # type: ignore[arg-type]

@@ -27,7 +27,8 @@ from damian import LearnerConfig, LearningSetup, keys
 from damian.common import checks
 from damian.common.fields import setting
 from damian.keys import next_key
-from damian.learners.networks import make_mlp, with_distribution
+from damian.models.distribution import with_distribution
+from damian.models.mlp import make_mlp
 
 VALUES, CHOSEN, JOINT = (keys.AGENTS, "action_value"), (keys.AGENTS, "chosen_action_value"), "joint"
 
@@ -62,7 +63,7 @@ class QmixConfig(LearnerConfig):
         n_features = env.observation_spec[keys.OBSERVATION].shape[-1]
 
         def make(n_actions: int, *out_keys: Any) -> TensorDictModule:
-            chooser = EpsilonGreedy(make_mlp(model, n_features, n_actions, env.device), self.epsilon)
+            chooser = EpsilonGreedy(make_mlp(model, n_features, n_actions).to(env.device), self.epsilon)
             return TensorDictModule(chooser, [keys.OBSERVATION, keys.ACTION_MASK], list(out_keys))
 
         return with_distribution(env, make)

@@ -40,7 +40,7 @@ def wind(state: State, world: Simulation, *, strength: float = 5.0, noise: float
     return strength * direction + noise * (2 * draw - 1)
 
 
-@feature("local", width=2, low=-1.0, high=1.0)
+@feature("local", [2], low=-1.0, high=1.0)
 def wind_felt(cache: FeatureCache) -> Tensor:
     """Wind in the UAV's message, east and north, over the strongest one, [*, N, 2]."""
     return (cache.reading("wind") / STRONGEST).clamp(-1, 1)

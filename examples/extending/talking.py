@@ -1,39 +1,36 @@
-"""Your own network: UAVs attend to what they have heard of each other, however late it came.
+"""Your own model: a UAV attends to what it knows of each other UAV, however late that came.
 
     cd examples/extending
-    damian train scenario=delaybench/crowded links=matrix links.delay=4 delay.obs=4 aware=backupdate \\
-        "observation.global_features=[talking:heard,coverage,coverage_map]" learner=talking:TalkingConfig
+    damian train scenario=delaybench/crowded delay.obs=4 aware=backupdate model=talking:AttentionConfig
+    ... links=matrix links.delay=4 "observation.global_features=[talking:heard,coverage,coverage_map]"
 
-Every UAV sends its message to every other one; what it says is encoded by a network that all UAVs share and
-that is learnt with the policy, and whoever hears it weighs it by attention, which reads its age (TarMAC, Das
-et al. 2019, with late messages). As the encoder is shared, whoever receives a message can encode it as well
-as its sender; so the gradient needs no way back through the link. Works with any number of UAVs.
+What is known of the others stands in blocks of rows of the UAV's own observation (``env.layout``): those of
+``others``, of ``requests``, or, where every UAV sends its message to every other one, of the feature ``heard``
+below, with the age of each message (TarMAC, Das et al. 2019, with late messages). One network encodes the
+rows of a block, and attention weighs them, so that it works with any number of UAVs, in any order. Whoever
+receives a message can encode it as well as its sender: the gradient needs no way back through a link.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 
-from damian import feature, keys
-from damian.common import checks
+from damian import ModelConfig, feature
+from damian.common.fields import setting
 from damian.common.tensors import gather_rows
-from damian.learners.config import MappoConfig, ModelConfig
-from damian.learners.networks import hidden_layers, make_mlp, with_distribution
-from damian.server.features import FeatureCache, feature_of, of_others
+from damian.models.mlp import hidden_layers, make_mlp
+from damian.server.features import FeatureCache
+from damian.server.features.others import of_others
+from damian.server.layout import Layout
 
-HEARD = "talking:heard"
 
-
-@feature("global", width=None, low=-1.0)
+@feature("global", [None, None], low=-1.0, rows=True)
 def heard(v: FeatureCache) -> Tensor:
-    """What the UAV holds of each other UAV, [*, N, (N - 1) K] with K = 2 ``observation.window`` + 4.
+    """What the UAV holds of each other UAV, [*, N, N - 1, K] with K = 2 ``observation.window`` + 5.
 
     The ways to its target and to its latest landing points, east and north, over half the largest vertex
-    distance of the region; whether it spots the source; and the age of the message, over ten seconds.
+    distance of the region; whether it spots the source; the age of the message, over ten seconds; and 1.
     """
     messages, own = v.messages, v.wanted(v.messages.target)
     landed = gather_rows(v.context.points, v.trail)  # [*, N, window, 2]
@@ -41,64 +38,45 @@ def heard(v: FeatureCache) -> Tensor:
     ways = places.unsqueeze(-4) - own[..., :, None, None, :]
     ways = (ways / (v.context.scale / 2)[..., None, None, None, None]).flatten(-2)  # [*, N, N, 2 + 2 window]
     age = messages.age(v.context.now) / v.context.observation.age_scale
-    rest = torch.stack([messages.spotted.float(), age], -1).unsqueeze(-3).expand(*ways.shape[:-1], 2)
-    return of_others(v, torch.cat([ways, rest], -1)).clamp(-1, 1).flatten(-2)
+    rest = torch.stack([messages.spotted.float(), age, torch.ones_like(age)], -1)
+    rest = rest.unsqueeze(-3).expand(*ways.shape[:-1], 3)
+    return of_others(v, torch.cat([ways, rest], -1)).clamp(-1, 1)
 
 
 @dataclass
-class TalkingConfig(MappoConfig):
-    """MAPPO whose actor attends to what it has heard."""
+class AttentionConfig(ModelConfig):
+    """A network that attends over each block of rows."""
 
-    heads: int = 4
-    """Heads of the attention."""
-    width: int = 64
-    """Width of what is said, over all heads."""
+    width: int = setting(32, "Width of what is read from a block of rows.", low=1, high=1024)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        should = f"is not divisible by learner.heads={self.heads}"
-        checks.require(self.width % self.heads == 0, "learner.width", self.width, should)
-
-    def make_actor(self, env: EnvBase, model: ModelConfig) -> Any:
-        observation = env.scenario.observation  # type: ignore[attr-defined]
-        names = observation.actor
-        should = f"must begin with {HEARD}"
-        checks.require(feature_of(names[0]) is heard, "observation.global_features", names, should)
-        n_agents, n_columns = env.observation_spec[keys.OBSERVATION].shape[-2:]
-        shape = (n_agents - 1, 2 * observation.window + 4)
-
-        def make(n_out: int, *out_keys: Any) -> TensorDictModule:
-            network = Attention(model, shape, n_columns, n_out, self.heads, self.width)
-            return TensorDictModule(network.to(env.device), [keys.OBSERVATION], list(out_keys))
-
-        return with_distribution(env, make)
+    def make_network(self, layout: Layout, n_out: int) -> nn.Module:
+        self.refuse(not any(block.rows for block in layout), "name", "needs a feature of rows, such as others")
+        return Attention(self, layout, n_out)
 
 
 class Attention(nn.Module):
-    """From observations [*, (N - 1) K + F] to the parameters of the actions' distribution, [*, A]."""
+    """From observations [*, F] to [*, n_out]."""
 
-    def __init__(
-        self,
-        model: ModelConfig,
-        shape: tuple[int, int],
-        n_columns: int,
-        n_out: int,
-        heads: int,
-        width: int,
-    ) -> None:
+    def __init__(self, model: AttentionConfig, layout: Layout, n_out: int) -> None:
         super().__init__()
-        self.shape, self.heads = shape, heads
-        n_own = n_columns - shape[0] * shape[1]
-        self.says = hidden_layers(model, shape[1], [width], None)
-        self.key_and_value = nn.Linear(width, 2 * width)
-        self.query = nn.Linear(n_own, width)
-        self.decides = make_mlp(model, n_own + width, n_out, None)
+        self.rows = [block for block in layout if block.rows]
+        self.rest = [block for block in layout if not block.rows]
+        n_rest = sum(block.width for block in self.rest)
+        sizes = [block.width // block.shape[0] for block in self.rows]
+        self.encode = nn.ModuleList(hidden_layers(model, size, [model.width]) for size in sizes)
+        self.query = nn.ModuleList(nn.Linear(n_rest, model.width) for _ in sizes)
+        self.decide = make_mlp(model, n_rest + len(sizes) * model.width, n_out)
 
     def forward(self, observation: Tensor) -> Tensor:
-        n_heard = self.shape[0] * self.shape[1]
-        rows = observation[..., :n_heard].unflatten(-1, self.shape)
-        own = observation[..., n_heard:]
-        key, value = self.key_and_value(self.says(rows)).unflatten(-1, (self.heads, -1)).chunk(2, -1)
-        query = self.query(own).unflatten(-1, (1, self.heads, -1))
-        weight = ((query * key).sum(-1, keepdim=True) / key.shape[-1] ** 0.5).softmax(-3)  # of each UAV heard
-        return self.decides(torch.cat([own, (weight * value).sum(-3).flatten(-2)], -1))
+        rest = torch.cat([observation[..., block.columns] for block in self.rest], -1)
+        read = [self.attended(i, observation, rest) for i in range(len(self.rows))]
+        return self.decide(torch.cat([rest, *read], -1))
+
+    def attended(self, i: int, observation: Tensor, rest: Tensor) -> Tensor:
+        """The mean of the encoded rows of a block, weighed by how well they match a query, [*, width]."""
+        rows = self.rows[i].of(observation).flatten(observation.dim())  # [*, R, K]
+        encoded, query = self.encode[i](rows), self.query[i](rest).unsqueeze(-1)
+        match = encoded @ query / encoded.shape[-1] ** 0.5  # [*, R, 1]
+        exists = (rows != 0).any(-1, keepdim=True)
+        weight = match.masked_fill(~exists, -1e4).softmax(-2) * exists
+        return (weight * encoded).sum(-2)

@@ -52,8 +52,8 @@ from damian.delays.laws import Uniform
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.config import BpqlConfig
-from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
+from damian.models.config import MlpConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
 from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline, set_seed
@@ -137,7 +137,7 @@ def make_learner(
     """The learner that also trains UAVs: SAC, or BPQL with a storage that learns of states as they arrive."""
     kind = BpqlConfig if bpql else SacConfig
     config = kind(lr=lr, alpha_lr=lr, gamma=GAMMA, tau=TAU, alpha_init=1.0)
-    model = ModelConfig(hidden=[hidden, hidden], activation="relu")
+    model = MlpConfig(hidden=[hidden, hidden], activation="relu")
     setup = LearningSetup(model, 1, 1, 1, critic_key=keys.OBSERVATION)
     if not bpql:
         return config.make(env, setup, ReplayBuffer(storage=TimeStorage(steps)))

@@ -63,7 +63,7 @@ from damian.delays.laws import Uniform
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.mappo import Mappo, MappoConfig
-from damian.learners.networks import ModelConfig
+from damian.models.config import MlpConfig, ModelConfig
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms.base import Correction
 from damian.transforms.entries import Entries
@@ -110,7 +110,7 @@ PUBLISHED = {"undelayed": (-33.1, -37.6, -48.8, -59.9, -67.2), "random": (-82.4,
 GAMES = {"spread": SimpleSpread, "tag": SimpleTag}
 
 WORLDS = 256  # an update learns from one episode of each
-MODEL = ModelConfig(hidden=[64, 64])
+MODEL = MlpConfig(hidden=[64, 64])
 LEARNER: dict[str, Any] = {"steps": HORIZON, "lr": 5e-3, "gamma": 0.9, "lmbda": 0.95, "minibatches": 8}
 LEARNER |= {"entropy_coeff": 0.003, "normalize_value": True}  # the bonus falls to 0 in the training
 SLOTS = 13  # of a timeline: as old as the longest delay that is evaluated

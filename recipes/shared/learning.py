@@ -12,6 +12,7 @@ from torchrl.envs import TransformedEnv
 
 from damian import keys
 from damian.common import checks
+from damian.common.compiling import COMPILE_OPTIONS
 from damian.common.devices import free_memory
 from damian.common.errors import naming_errors
 from damian.envs.delayed_env import DelayedEnv
@@ -19,9 +20,8 @@ from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.learners.base import Learner
-from damian.learners.networks import COMPILE_OPTIONS
-from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
+from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.time_storage import TimeStorage
 from damian.runs.metrics import HindsightReturns

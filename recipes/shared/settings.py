@@ -5,7 +5,7 @@ from damian.common import checks
 from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
 from damian.runs.metrics_log import read_logger
-from damian.server.features import check_features
+from damian.server.features.base import check_features
 from damian.server.rewards import terms_of
 from damian.world.regions.sources import REGION_SOURCES
 from damian.world.sensors import sensors_of

@@ -16,7 +16,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig, action_table, displacement

@@ -9,7 +9,7 @@ from damian.baselines.script import Searcher, script_policy
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.world.landing import ActionConfig
 from damian.world.regions.sources import RegionConfig

@@ -22,7 +22,7 @@ from torch import Tensor
 from damian.delays.line import DelayLine
 from damian.delays.samplers import ContextSampler, MessageContext
 from damian.envs.uav_env import UavEnv
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages
 

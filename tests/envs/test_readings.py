@@ -10,7 +10,7 @@ from torchrl.envs.utils import check_env_specs
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 

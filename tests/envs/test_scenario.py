@@ -10,7 +10,7 @@ from damian.common.errors import InputError
 from damian.delays.config import LinkConfig
 from damian.envs.config import ClockConfig
 from damian.envs.pipeline import make_env
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.world.motion import MotionConfig
 
 OWN = ObservationConfig(own=True)

@@ -9,7 +9,7 @@ from helpers import SQUARE, check_refused, everything
 
 from damian import make_env
 from damian.common.errors import InputError
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.world.regions.sources import RegionConfig
 

@@ -13,7 +13,7 @@ from damian import keys
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
-from damian.learners.networks import ModelConfig
+from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.runs.config import LoggerConfig
@@ -22,7 +22,7 @@ from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 
 NAME = "predictive_mappo:PredictiveMappoConfig"
-SMALL = ModelConfig(hidden=[16, 8])
+SMALL = MlpConfig(hidden=[16, 8])
 LATE = {"law": "uniform", "low": 0, "high": 3}
 
 

@@ -11,7 +11,7 @@ from torchrl.data import ReplayBuffer
 
 from damian import keys
 from damian.envs.uav_env import UavEnv
-from damian.learners.config import ModelConfig
+from damian.models.config import MlpConfig
 from damian.replay.time_storage import TimeStorage
 from damian.world.landing import ActionConfig
 
@@ -19,7 +19,7 @@ from damian.world.landing import ActionConfig
 def learner_of(example, env, **changed):
     buffer = ReplayBuffer(storage=TimeStorage(1000))
     config = example.QmixConfig(updates=2, batch_size=64, epsilon=0.4, epsilon_end=0.4)
-    return config.make(env, learning(ModelConfig(hidden=[8]), worlds=4, **changed), buffer)
+    return config.make(env, learning(MlpConfig(hidden=[8]), worlds=4, **changed), buffer)
 
 
 @pytest.mark.parametrize("mixer", ["qmix", "vdn"])
@@ -38,7 +38,7 @@ def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run,
 
 def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_the_legal_ones(example):
     env = UavEnv(everything(actions=ActionConfig(kind="discrete")), 4, 0)
-    actor = example.QmixConfig(epsilon=0.4).make_actor(env, ModelConfig(hidden=[8]))
+    actor = example.QmixConfig(epsilon=0.4).make_actor(env, MlpConfig(hidden=[8]))
     seen = env.reset().select(keys.OBSERVATION, keys.ACTION_MASK)
     legal, values = seen[keys.ACTION_MASK], actor[0].module.network(seen[keys.OBSERVATION])
     best = values.masked_fill(~legal, -torch.inf).argmax(-1)

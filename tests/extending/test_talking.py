@@ -10,11 +10,11 @@ from tensordict import TensorDict
 from damian import keys, make_env
 from damian.delays.config import LinkConfig
 from damian.envs.config import ScenarioConfig
-from damian.learners.config import ModelConfig
+from damian.models.actor import make_actor
 from damian.server.config import ObservationConfig
 
 WINDOW = 2
-WIDTH = 2 * WINDOW + 4
+WIDTH = 2 * WINDOW + 5
 
 
 def make(agents):
@@ -42,15 +42,15 @@ def test_what_a_uav_hears_equals_a_plain_loop_over_the_others(example, agents):
                     places = [known.target[i, j], *points[known.trail[i, j]]]
                     ways = torch.cat([(place - known.target[i, i]) / half for place in places])
                     age = (step + 1) * env.uav_env.scenario.clock.dt - known.time[i, j]
-                    rest = torch.stack([known.spotted[i, j].float(), age / 10])
+                    rest = torch.stack([known.spotted[i, j].float(), age / 10, torch.tensor(1.0)])
                     torch.testing.assert_close(row, torch.cat([ways, rest]).clamp(-1, 1))
-    assert seen[..., -1].unique().numel() > 2, "the ages differ"
+    assert seen[..., -2].unique().numel() > 2, "the ages differ"
 
 
 def test_attention_takes_the_others_in_any_order_and_number_and_reads_their_ages(example):
     torch.manual_seed(0)
-    model = ModelConfig(hidden=[8])
-    three, five = (example.TalkingConfig(width=8).make_actor(make(n), model) for n in (3, 5))
+    model = example.AttentionConfig(hidden=[8], width=8)
+    three, five = (make_actor(make(n), model) for n in (3, 5))
     five.load_state_dict(three.state_dict())
     n_actions = make(5).full_action_spec_unbatched[keys.ACTION].n
     heard, own = torch.randn(4, 5, 4, WIDTH), torch.rand(4, 5, 1)
@@ -62,12 +62,12 @@ def test_attention_takes_the_others_in_any_order_and_number_and_reads_their_ages
 
     torch.testing.assert_close(logits(heard.flip(-2)), logits(heard))
     older = heard.clone()
-    older[..., 0, -1] += 1
+    older[..., 0, -2] += 1
     assert not torch.allclose(logits(older), logits(heard), atol=1e-5)
 
 
 def test_who_talks_is_trained_and_flown_in_another_number(run):
-    words = ["observation.global_features=[talking:heard]", "learner=talking:TalkingConfig"]
+    words = ["observation.global_features=[talking:heard]", "model=talking:AttentionConfig"]
     first = run(*TINY, *words, "links=matrix", "links.delay=2", "aware=backupdate", "delay.obs=2")
     flown = run(f"checkpoint={first}", "agents=4", "trust=true", program="evaluate", name="flown")
     with (flown / "result.csv").open(newline="") as file:

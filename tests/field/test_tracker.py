@@ -18,8 +18,9 @@ from damian.field.advice import next_landings
 from damian.field.node import Node
 from damian.field.rows import Report
 from damian.field.tracker import Tracker
-from damian.learners.config import MappoConfig, ModelConfig
-from damian.learners.recurrent import add_recurrent_state
+from damian.learners.config import MappoConfig
+from damian.models.config import MlpConfig
+from damian.models.memory import add_recurrent_state
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.world.config import MotionConfig, RegionConfig, SourceConfig
 
@@ -66,7 +67,7 @@ def scenario_of(**changed) -> ScenarioConfig:
 def recurrent(env):
     """A policy with random weights and hidden states, the same for every environment of a scenario."""
     torch.manual_seed(7)
-    actor = MappoConfig().make_actor(env, ModelConfig(hidden=[16], rnn="gru"))
+    actor = MappoConfig().make_actor(env, MlpConfig(hidden=[16], rnn="gru"))
     add_recurrent_state(env, actor)
     return actor
 

@@ -15,12 +15,12 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.learners.config import BpqlConfig
-from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac
+from damian.models.config import MlpConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.server.termination import EpisodeConfig
 
-SMALL, LONGEST = ModelConfig(hidden=[16]), 5
+SMALL, LONGEST = MlpConfig(hidden=[16]), 5
 
 
 def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase, TensorDictBase]:

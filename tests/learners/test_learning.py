@@ -21,7 +21,9 @@ from damian.envs.recompute import server_recompute
 from damian.envs.uav_env import UavEnv
 from damian.learners.base import divergence
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
-from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.models.actor import make_actor
+from damian.models.config import MlpConfig
+from damian.models.critic import make_critic
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
@@ -30,7 +32,7 @@ from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
 from damian.world.regions.sources import RegionConfig
 
-SMALL = ModelConfig(hidden=[16])
+SMALL = MlpConfig(hidden=[16])
 REWARD = ("next", "agents", "reward")
 
 
@@ -161,7 +163,7 @@ def test_a_nan_counts_only_if_weights_are_wrong():
 @pytest.mark.parametrize("shared", [True, False])
 def test_uavs_that_see_the_same_choose_alike_only_with_a_shared_actor(shared):
     env = make_env(ScenarioConfig(agents=3), 4, 0)
-    actor = make_actor(env, ModelConfig(hidden=[16], shared=shared))
+    actor = make_actor(env, MlpConfig(hidden=[16], shared=shared))
     td = env.reset()
     td[keys.OBSERVATION] = td[keys.OBSERVATION][:, :1].expand_as(td[keys.OBSERVATION]).clone()
     td[keys.ACTION_MASK] = torch.ones_like(td[keys.ACTION_MASK])
@@ -172,4 +174,4 @@ def test_uavs_that_see_the_same_choose_alike_only_with_a_shared_actor(shared):
 
 def test_own_actors_have_no_memory():
     with pytest.raises(InputError, match=r"model.shared: False goes with model.rnn=none"):
-        ModelConfig(shared=False, rnn="gru")
+        MlpConfig(shared=False, rnn="gru")

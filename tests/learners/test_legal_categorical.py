@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.modules import MaskedCategorical
 
-from damian.learners.networks import LegalCategorical
+from damian.models.distribution import LegalCategorical
 
 
 def both(shape: tuple[int, ...], masked: bool) -> tuple[LegalCategorical, Categorical, Tensor]:

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.multiagent import MAPPOLoss
 
 from damian import keys
-from damian.common.compiling import compiled
+from damian.common.compiling import COMPILE_OPTIONS, compiled
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.learners.mappo import (
@@ -26,12 +26,12 @@ from damian.learners.mappo import (
     policy_terms,
     state_values,
 )
-from damian.learners.networks import COMPILE_OPTIONS, ModelConfig
-from damian.learners.recurrent import RECURRENT_KEYS, add_recurrent_state
+from damian.models.config import MlpConfig
+from damian.models.memory import RECURRENT_KEYS, add_recurrent_state
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
 
-SMALL = ModelConfig(hidden=[16, 8])
+SMALL = MlpConfig(hidden=[16, 8])
 CONFIG = MappoConfig(clip_epsilon=0.1, entropy_coeff=0.3, critic_coeff=0.7)
 CASES = {
     "discrete": (ActionConfig(kind="discrete"), SMALL),

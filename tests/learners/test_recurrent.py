@@ -16,12 +16,13 @@ from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
-from damian.learners.networks import ModelConfig, make_actor
+from damian.models.actor import make_actor
+from damian.models.config import MlpConfig
 from damian.recipes.shared.learning import make_collector
 from damian.replay.backupdate import BackupdateStorage
 from damian.server.termination import EpisodeConfig
 
-GRU = ModelConfig(hidden=[16, 8], rnn="gru")
+GRU = MlpConfig(hidden=[16, 8], rnn="gru")
 ROUNDING = 3e-5
 """Largest difference between numbers that are computed step by step and in one batch."""
 OBSERVATION, ACTION = (("agents", name) for name in ("observation", "action"))

@@ -24,10 +24,11 @@ from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.keys import PRIVILEGED_OBSERVATION as PRIVILEGED
-from damian.learners.config import MappoConfig, ModelConfig, SacConfig
+from damian.learners.config import MappoConfig, SacConfig
+from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.state import Truth
@@ -81,7 +82,7 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
 @pytest.mark.parametrize("learner", [MappoConfig(steps=12, minibatches=2), SacConfig()])
 def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(learner, kind):
     late = vars(everything(delay=DelayConfig(obs=UNIFORM, history=2), actions=ActionConfig(kind=kind)))
-    tiny = {"worlds": 4, "learner": learner, "model": ModelConfig([16])}
+    tiny = {"worlds": 4, "learner": learner, "model": MlpConfig([16])}
     config = TrainConfig(**late, **tiny, critic="privileged")
     env = learning_env(config)
     actor = make_learner(config, env, replay_buffer(config, env)).actor

@@ -14,7 +14,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor
 
 from damian.envs.pipeline import make_env
-from damian.learners.networks import make_actor, make_critic
+from damian.models.actor import make_actor
+from damian.models.critic import make_critic
 from damian.recipes import evaluate
 from damian.recipes import train as train_recipe
 from damian.recipes.cli import settings as composed_config

@@ -20,7 +20,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.termination import EpisodeConfig
 
 STEPS, WORLDS, LONGEST = 40, 4, 5
@@ -94,6 +94,10 @@ CASES: dict[str, dict[str, Any]] = {
         "delay": DelayConfig(obs=LATE),
         "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7),
     },
+    "late messages of two stops, timeline": {
+        "delay": DelayConfig(obs=LATE),
+        "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7, stops=2, own=True),
+    },
     "links": {
         "delay": DelayConfig(obs=LATE, rew=LATE),
         "clock": ClockConfig(server="2s"),
@@ -101,7 +105,7 @@ CASES: dict[str, dict[str, Any]] = {
     },
 }
 FLYING = {
-    "timeline",
+    "late messages of two stops, timeline",
     "late messages",
     "late messages, slow server",
     "late and summed rewards",

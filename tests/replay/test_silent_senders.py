@@ -8,7 +8,7 @@ from damian import keys
 from damian.delays.config import DelayConfig
 from damian.keys import next_key
 from damian.learners.mappo import MappoConfig
-from damian.learners.networks import ModelConfig
+from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, replay_buffer
 from damian.runs.config import LoggerConfig
@@ -29,7 +29,7 @@ def test_the_programs_learn_the_same_rewards_from_flights_in_any_order_of_arriva
     config = TrainConfig(
         **vars(scenario),
         learner=MappoConfig(steps=5),
-        model=ModelConfig(hidden=[8]),
+        model=MlpConfig(hidden=[8]),
         logger=LoggerConfig(tensorboard=False),
         worlds=24,
         backupdate=True,

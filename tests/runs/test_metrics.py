@@ -24,7 +24,7 @@ from damian.replay.backupdate import BackupdateStorage
 from damian.runs.checkpoint import plain
 from damian.runs.metrics import EpisodeLog, HindsightReturns, evaluation
 from damian.runs.metrics_log import MetricsLog, TensorBoard
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig

@@ -12,7 +12,9 @@ from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import places, predict
-from damian.server.features import BELIEF_RINGS, BELIEF_SECTORS, ObservationConfig, feature
+from damian.server.config import ObservationConfig
+from damian.server.features import feature
+from damian.server.features.belief import BELIEF_RINGS, BELIEF_SECTORS
 from damian.world.config import SourceConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
@@ -104,7 +106,7 @@ def test_a_uavs_own_features_are_those_of_its_own_belief():
     messages, steps = server.messages(td["agents", "message"]), torch.full((3,), 5)
     for uav in range(env.uav_env.n_agents):
         features = server.features(messages, steps, ALL, belief=td["agents", "belief"][:, uav])
-        own = torch.cat([features[name][:, uav] for name in ALL], -1)
+        own = torch.cat([features[name][:, uav].flatten(1) for name in ALL], -1)
         torch.testing.assert_close(td["agents", "observation"][:, uav, 1:], own)
 
 

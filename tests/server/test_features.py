@@ -8,9 +8,9 @@ from helpers import SCALE, TIME_SCALE, messages_of, random_worlds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import damian.server.surroundings  # noqa: F401 (registers features)
 from damian.common.fields import rules
-from damian.server.features import FEATURES, ObservationConfig, observe
+from damian.server.config import ObservationConfig
+from damian.server.features import FEATURES, observe
 
 NAMES = [name for name in (*twin.LOCAL, *twin.GLOBAL) if name != "coverage"]
 shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])

@@ -8,7 +8,7 @@ from twin import GLOBAL, LOCAL
 
 from damian.common.tensors import tree_map
 from damian.envs.uav_env import UavEnv
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.world.messages import Messages
 from damian.world.regions.sources import RegionConfig
 

@@ -10,7 +10,8 @@ from damian import keys, make_env
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.server.config import ObservationConfig
-from damian.server.surroundings import OTHERS, RINGS, SECTORS
+from damian.server.features.coverage import RINGS, SECTORS
+from damian.server.features.others import OTHERS
 from damian.world.config import MotionConfig, RegionConfig
 
 REST = ["coverage_map", "place", "time_left", "number"]

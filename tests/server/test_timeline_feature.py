@@ -10,12 +10,11 @@ from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
 from damian.server.config import ObservationConfig
-from damian.server.surroundings import OTHERS
+from damian.server.features.others import OTHERS
 from damian.server.termination import EpisodeConfig
 from damian.world.config import RegionConfig
 
 SLOTS, AGENTS = 4, 3
-AGES = ("agents", "received_age")
 UNIFORM = {"law": "uniform", "low": 0, "high": 6}
 CASES = {
     "no delay": {},
@@ -25,48 +24,56 @@ CASES = {
 }
 
 
-def scenario(own: bool = True, **changed) -> ScenarioConfig:
+def scenario(own: bool = True, stops: int | None = None, **changed) -> ScenarioConfig:
     """UAVs that move at once and observe their own places and the timeline, in short episodes."""
     sections = {
         "agents": AGENTS,
         "region": RegionConfig(kind="random", pool=2, lattice_step=60.0),
-        "observation": ObservationConfig(["place"], [], own=own, window=1, timeline=SLOTS),
+        "observation": ObservationConfig(["place"], [], own=own, window=1, timeline=SLOTS, stops=stops),
         "episode": EpisodeConfig(max_steps=9),
     }
     return ScenarioConfig(**(sections | changed))
 
 
+@pytest.mark.parametrize("stops", [1, None])
 @pytest.mark.parametrize(("name", "own"), [*((name, True) for name in CASES), ("held back", False)])
-def test_a_slot_tells_where_a_uav_stood_then_if_a_message_since_has_arrived(name, own):
-    case = scenario(own and name != "links", **CASES[name])
+def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arrived(name, own, stops):
+    case = scenario(own and name != "links", stops, **CASES[name])
     env = make_env(case, 4, seed=1, extras=["message"])
-    if name == "links":
-        env.transform[0].age_key = AGES
+    env.transform[-1].dropped_keys = []
     torch.manual_seed(0)
     steps = env.rollout(25, break_when_any_done=False)
     server, after, seen = env.server, steps["next"], 0
-    if name != "links":  # the ages of what each UAV knows of each, [B, T, N, N]
-        age = after.get(keys.AGE, torch.zeros_like(after[keys.REWARD])).squeeze(-1)
-        age = age.unsqueeze(-2).repeat(1, 1, AGENTS, 1)
-        after[AGES] = age.masked_fill(torch.eye(AGENTS, dtype=torch.bool) & case.observation.own, 0)
+    delay = after.get(keys.LINK_DELAY if name == "links" else keys.DELAY, None)
+    delay = torch.zeros(4, 25, AGENTS, 1) if delay is None else delay
+    if name != "links":  # by receiver and sender
+        delay = delay.transpose(-1, -2).repeat(1, 1, AGENTS, 1)
+        delay = delay.masked_fill(torch.eye(AGENTS, dtype=torch.bool) & own, 0)
     sent, first = server.messages(after[keys.MESSAGE]), server.messages(steps[keys.MESSAGE])
     half = server.scales(sent) / 2
-    observed = after[keys.OBSERVATION][..., 2:].unflatten(-1, (OTHERS, 3 * SLOTS + 3))
+    observed = env.layout["observation"]["timeline"].of(after[keys.OBSERVATION]).flatten(-2)
     for world, t, i in itertools.product(range(4), range(25), range(AGENTS)):
         ended = after[keys.DONE][world, :t].flatten().nonzero()
         begin = int(ended[-1]) + 1 if len(ended) else 0
         places = [first.position[world, begin], *sent.position[world, begin : t + 1]]  # in this episode
-        ages = after[AGES][world, t, i].long().tolist()
-        here, expected = places[-1 - ages[i]][i], []
+        now, targets = len(places) - 1, []
+        rows = torch.zeros(AGENTS, SLOTS + 1, 3)
         for j in range(AGENTS):
-            if j != i:
-                rows = torch.zeros(SLOTS + 1, 3)
-                for k in range(ages[j], min(SLOTS, len(places))):
-                    way = ((places[-1 - k][j] - here) / half[world, t]).clamp(-1, 1)
-                    rows[k] = torch.tensor([*way, 1.0])
+            arrived = [0]  # the message of the reset
+            for g in range(1, now + 1):
+                d = int(delay[world, begin + g - 1, i, j])
+                arrived += [g] * (0 <= d <= now - g)
+            targets.append(places[max(arrived)][j])
+            for told in {g - older for g in arrived for older in range(min(stops or SLOTS, g + 1))}:
+                if now - told < SLOTS:
+                    rows[j, now - told] = torch.tensor([*places[told][j], 1.0])
                     seen += 1
-                expected.append((float((places[-1 - ages[j]][j] - here).norm()), rows.flatten().tolist()))
-        expected.sort()
+        rows[..., :2] = (rows[..., :2] - targets[i]) / half[world, t] * rows[..., 2:]
+        expected = sorted(
+            (float((targets[j] - targets[i]).norm()), rows[j].clamp(-1, 1).flatten().tolist())
+            for j in range(AGENTS)
+            if j != i
+        )
         assert not observed[world, t, i, AGENTS - 1 :].any()
         if expected[1][0] - expected[0][0] > 1e-2:  # else in any order
             values = torch.tensor([row for _, row in expected])

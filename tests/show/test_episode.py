@@ -13,7 +13,7 @@ from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.termination import EpisodeConfig
 from damian.show.episode import COLUMNS, Episode, record
 from damian.world.config import BatteryConfig

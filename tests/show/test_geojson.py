@@ -13,7 +13,7 @@ from damian.baselines.random import random_policy
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.show.episode import record
 from damian.show.geojson import feature_collection
 from damian.world.regions.geodesy import to_local

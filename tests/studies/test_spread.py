@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from damian import keys, set_seed
-from damian.learners.networks import ModelConfig
+from damian.models.config import MlpConfig
 
 WORLDS = 3
 LATE = (3, 9)
@@ -88,7 +88,7 @@ def test_what_is_registered_stands_where_it_was_as_seen_from_where_the_agent_is_
 def small(monkeypatch) -> None:
     """Few worlds and small networks."""
     monkeypatch.setattr(spread, "WORLDS", 4)
-    monkeypatch.setattr(spread, "MODEL", ModelConfig(hidden=[8]))
+    monkeypatch.setattr(spread, "MODEL", MlpConfig(hidden=[8]))
 
 
 def corrected(method: str) -> list[TensorDictBase]:

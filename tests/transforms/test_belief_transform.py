@@ -20,7 +20,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.replay.backupdate import BackupdateStorage
 from damian.server.belief import SourceGrid, build_source_grid
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
 from damian.world.signal_source import footprint_radius

@@ -24,7 +24,7 @@ from damian.delays.laws import Burst, Law, Uniform
 from damian.delays.samplers import ContextSampler, Sampler
 from damian.envs.nodes import Belief, ServerNode
 from damian.envs.uav_env import UavEnv
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.transforms import (
     ActionDelay,
     ActionHistory,

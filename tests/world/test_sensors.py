@@ -8,7 +8,7 @@ from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.world.messages import Messages, Widths
 
 

@@ -10,7 +10,7 @@ from helpers import KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messa
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.features import ObservationConfig
+from damian.server.config import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.world.motion import MotionConfig
 

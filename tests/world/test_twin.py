@@ -11,8 +11,7 @@ from twin import GLOBAL, LOCAL
 
 from damian.envs.config import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.config import BUILT_IN
-from damian.server.features import ObservationConfig
+from damian.server.config import BUILT_IN, ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig, action_table

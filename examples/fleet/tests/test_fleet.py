@@ -9,8 +9,9 @@ from field import FLIGHTS, SEEN, flights, scenario_of
 from damian import keys
 from damian.baselines.script import script_policy
 from damian.delays.config import DelayConfig
-from damian.learners.config import MappoConfig, ModelConfig
-from damian.learners.recurrent import add_recurrent_state
+from damian.learners.config import MappoConfig
+from damian.models.config import MlpConfig
+from damian.models.memory import add_recurrent_state
 from damian.server.config import ObservationConfig
 
 LATE = {"law": "uniform", "low": 0, "high": 4}
@@ -19,7 +20,7 @@ LATE = {"law": "uniform", "low": 0, "high": 4}
 def recurrent(env):
     """A policy with random weights and hidden states, the same for every environment of a scenario."""
     torch.manual_seed(7)
-    actor = MappoConfig().make_actor(env, ModelConfig(hidden=[16], rnn="gru"))
+    actor = MappoConfig().make_actor(env, MlpConfig(hidden=[16], rnn="gru"))
     add_recurrent_state(env, actor)
     return actor
 

@@ -25,12 +25,10 @@ class AgentGRU(TensorDictModuleBase):
     ``is_init`` [B, T, 1] marks a new episode.
     """
 
-    def __init__(
-        self, encoder: nn.Module, n_features: int, n_hidden: int, device: torch.device | None = None
-    ) -> None:
+    def __init__(self, encoder: nn.Module, n_features: int, n_hidden: int) -> None:
         super().__init__()
         self.in_keys, self.out_keys = [keys.OBSERVATION, keys.HIDDEN], [keys.HIDDEN, keys.HIDDEN_BEFORE]  # type: ignore[assignment]
-        self.encoder, self.cell = encoder, nn.GRUCell(n_features, n_hidden, device=device)
+        self.encoder, self.cell = encoder, nn.GRUCell(n_features, n_hidden)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         features = self.encoder(tensordict[keys.OBSERVATION])

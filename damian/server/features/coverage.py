@@ -1,0 +1,100 @@
+"""Features of the ground that has been covered: the paper's share, and a map about the UAV."""
+
+import math
+
+import numpy as np
+import shapely
+import torch
+from torch import Tensor
+
+from damian.common import devices
+from damian.common.tensors import distances, gather_rows
+from damian.server.config import ObservationConfig
+from damian.server.features.base import FeatureCache, feature, footprint_radii
+from damian.world.airspace import Airspace
+from damian.world.coverage import (
+    FootprintTables,
+    covered_share,
+    own_covered_share,
+    tables_of_all,
+    updated_share,
+)
+from damian.world.simulation import Simulation
+
+RINGS = (0.6, 1.25, 2.5)
+"""Distances of the places of ``coverage_map`` from the UAV, in footprint radii."""
+SECTORS = 8
+"""Number of places on each ring; the first one lies north, the others follow clockwise."""
+_OLDEST = 0.5
+"""How new ground in the oldest footprint of the window nearly is, in [0, 1]; in the newest one it is 0."""
+
+
+def footprint_tables(simulation: Simulation, _: ObservationConfig) -> tuple[FootprintTables, Tensor]:
+    """Masks of all footprints, and the landing points, each for every radius, in the unit of the first one."""
+    airspace, radii = simulation.airspace, footprint_radii(simulation)
+    polygons = [region.polygon for region in airspace.regions]
+    tables = tables_of_all(polygons, airspace.points.double().cpu().numpy(), radii)
+    points = airspace.points.flatten(0, 1)
+    return tables, torch.cat([points * (radii[0] / radius) for radius in radii])
+
+
+def map_places_inside(simulation: Simulation, _: ObservationConfig) -> Tensor:
+    """Whether the places of ``coverage_map`` lie in the region, for every radius, [V*R*L, 24] of 0 and 1."""
+    radii = footprint_radii(simulation)
+    return torch.cat([places_inside(simulation.airspace, radius) for radius in radii])
+
+
+def ring_places(radius: float | Tensor, device: torch.device | None = None) -> Tensor:
+    """Offsets of the places of ``coverage_map`` from a UAV [m], [24, 2]; the inner ring first.
+
+    For radii [*, 1, 1], [*, 24, 2].
+    """
+    angle = torch.arange(SECTORS, device=device) * (2 * math.pi / SECTORS)
+    ring = torch.stack([angle.sin(), angle.cos()], -1)
+    return torch.cat([ring * distance * radius for distance in RINGS], -2)
+
+
+def places_inside(airspace: Airspace, radius: float) -> Tensor:
+    """Whether the places about each landing point lie in its region, by flat id, [R*L, 24] of 0 and 1."""
+    points = airspace.points.nan_to_num(posinf=0.0).double().cpu().numpy()
+    places = points[:, :, None] + ring_places(radius).double().numpy()
+    inside = [
+        shapely.contains_xy(region.polygon, *np.moveaxis(places[i], -1, 0))
+        for i, region in enumerate(airspace.regions)
+    ]
+    return torch.from_numpy(np.stack(inside)).float().flatten(0, 1)
+
+
+@feature("global", name="coverage", tables=[footprint_tables])
+def _coverage(v: FeatureCache) -> Tensor:
+    """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
+    footprints, points = v.table(footprint_tables)
+    trail, known = v.tabled(v.trail), v.context.coverage
+    if v.own_only:
+        return own_covered_share(footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
+    if known is not None and devices.data_dependent(trail.device):
+        known = known._replace(trail=v.tabled(known.trail))
+        return updated_share(footprints, trail, points, known)
+    return covered_share(footprints, trail, gather_rows(points, trail))
+
+
+@feature("global", [len(RINGS) * SECTORS], name="coverage_map", tables=[map_places_inside])
+def _coverage_map(v: FeatureCache) -> Tensor:
+    """How new the ground at the places about the UAV is, from 0 (just covered, or outside) to 1, [*, N, 24].
+
+    It is the distance of a place from the nearest of all UAVs' latest landing points, over the diameter of a
+    footprint; older landing points of ``observation.window`` count as further away.
+    """
+    context, trail = v.context, v.trail
+    standing, radius = v.wanted(trail[..., 0]), context.radius
+    if isinstance(radius, Tensor):
+        radius = radius[..., None, None]
+    offsets = ring_places(radius, standing.device).unsqueeze(-3)
+    places = gather_rows(context.points, standing).unsqueeze(-2) + offsets
+    n_agents, window = trail.shape[-2:]
+    landed = gather_rows(context.points, trail.transpose(-2, -1)).flatten(-3, -2)  # [*, n N, 2]
+    distance = distances(landed, places.flatten(-3, -2))  # places last, over which minima are fast
+    nearest = distance.unflatten(-2, (window, n_agents)).amin(-2)  # of all UAVs, [*, n, N 24]
+    age = torch.arange(window, device=trail.device).unsqueeze(-1) / window
+    new = (nearest / (2 * radius) + _OLDEST * age).amin(-2).view(places.shape[:-1])
+    return new.clamp(max=1) * gather_rows(v.table(map_places_inside), v.tabled(standing))

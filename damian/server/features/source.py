@@ -1,0 +1,93 @@
+"""Features of the paper's Table 2 about the source, as messages tell of it."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from damian.server.features.base import FeatureCache, feature
+
+
+def _any_has_detected(v: FeatureCache) -> Tensor:
+    """Whether any UAV has ever detected a source, [*, 1]."""
+    return (v.messages.detected_time >= 0).flatten(-2).any(-1, keepdim=True)
+
+
+def _to_source(v: FeatureCache) -> Tensor:
+    """Vector from each UAV to the estimated position of the nearest known source [m], [*, N, 2]."""
+    counts = v.messages.detected_time >= 0  # [*, N, K]
+    weight = counts.to(v.messages.position.dtype)
+    total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-3, keepdim=True)
+    estimate = total / weight.sum(-2).clamp(min=1)[..., None, :, None]
+    ways = estimate - v.messages.position.unsqueeze(-2)  # [*, N, K, 2]
+    return nearest_way(ways, counts.any(-2, keepdim=True))
+
+
+def nearest_way(ways: Tensor, known: Tensor | None = None) -> Tensor:
+    """The shortest of ways [*, K, 2], of those that are ``known`` [*, K] if there are any, [*, 2]."""
+    if ways.shape[-2] == 1:
+        return ways.squeeze(-2)
+    length = ways.square().sum(-1)
+    length = length if known is None else length.masked_fill(~known, torch.inf)
+    best = length.argmin(-1)[..., None, None]
+    return ways.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+
+
+def _raw_source_distance(v: FeatureCache) -> Tensor:
+    return torch.linalg.vector_norm(v(_to_source), dim=-1) / v.scale
+
+
+def _bearing(v: FeatureCache) -> Tensor:
+    """Bearing of the source, clockwise from north, [*, N] in (-pi, pi]."""
+    east, north = v(_to_source).unbind(-1)
+    # Within a millimetre of the source the bearing would be a rounding error: it is set to 0 (north).
+    return torch.atan2(east, north) * (east.abs() + north.abs() > 1e-3)
+
+
+@feature("global", name="source_distance")
+def _source_distance(v: FeatureCache) -> Tensor:
+    """Distance to the estimated source, over the largest vertex distance; 1 if it is unknown, [*, N]."""
+    return torch.where(v(_any_has_detected), v(_raw_source_distance).clamp(max=1), 1.0)
+
+
+@feature("global", name="source_bearing")
+def _source_bearing(v: FeatureCache) -> Tensor:
+    """Bearing of the estimated source, clockwise from north, in turns; 1 if it is unknown, [*, N]."""
+    return torch.where(v(_any_has_detected), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
+
+
+@feature("global", name="source_drift")
+def _source_drift(v: FeatureCache) -> Tensor:
+    """((bearing - track) wrapped to [-pi, pi) + pi) / 2 pi: 0.5 if the UAV flies straight at the source."""
+    turn = (v(_bearing) - v.messages.track) / (2 * math.pi)
+    return torch.where(v(_any_has_detected), torch.remainder(turn + 0.5, 1.0), 1.0)
+
+
+@feature("global", name="source_time")
+def _source_time(v: FeatureCache) -> Tensor:
+    """Time since any UAV detected the source, over ``observation.time_scale``; 1 if unknown, [*, N]."""
+    latest = v.messages.detected_time.flatten(-2).amax(-1, keepdim=True)
+    since = (v.context.now.unsqueeze(-1) - latest) / v.context.time_scale
+    return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)
+
+
+@feature("global", name="mean_distance_spotting")
+def _mean_distance_spotting(v: FeatureCache) -> Tensor:
+    """Mean distance of the spotting UAVs to the source; 0 if no UAV spots."""
+    spotting = v.messages.spotted.to(v.scale.dtype)
+    total = (v(_raw_source_distance) * spotting).sum(-1, keepdim=True)
+    mean = total / spotting.sum(-1, keepdim=True).clamp(min=1)
+    return mean.clamp(max=1).expand_as(spotting)
+
+
+@feature("global", name="spotting_agents")
+def _spotting_agents(v: FeatureCache) -> Tensor:
+    """Share of the UAVs that spot the source, N_ss / N."""
+    spotting = v.messages.spotted.to(v.scale.dtype)
+    return spotting.mean(-1, keepdim=True).expand_as(spotting)
+
+
+@feature("local", name="spotted")
+def _spotted(v: FeatureCache) -> Tensor:
+    """Whether the UAV detects the source, 0 or 1, [*, N]."""
+    return v.messages.spotted.to(v.scale.dtype)
