@@ -81,7 +81,7 @@ WORLDS = {
 LEADERBOARD = """# Leaderboard
 
 Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by
-damian's own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-learner);
+damian's own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-method);
 tasks and delays are those of [delaybench](delaybench.md).
 """
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
