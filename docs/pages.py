@@ -205,7 +205,7 @@ def public_names() -> str:
     """The names that ``import damian`` offers."""
     parts = ["# damian", "`import damian` offers these names, and loads each when it is first used.", ""]
     for name in sorted(damian._MODULE_OF):
-        path = PROGRAM_FUNCTIONS.get(name, f"{getattr(damian, name).__module__}.{name}")
+        path = PROGRAM_FUNCTIONS.get(name) or f"{getattr(damian, name).__module__}.{name}"
         parts.append(f"- [`{name}`][{path}]")
     parts += ["", *(f"::: {path}" for path in PROGRAM_FUNCTIONS.values()), "", "::: damian.keys"]
     return "\n".join(parts)

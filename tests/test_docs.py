@@ -7,14 +7,16 @@ from pathlib import Path
 
 import pytest
 import yaml
+from sites import ROOT, anchors, links
 
 import damian
 from damian.recipes.command import FOLDERS, PROGRAMS
 from damian.recipes.known import check_words
 
-ROOT = Path(damian.__file__).parents[1]
-DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]
-DOCUMENTS += [*sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples" / "fleet").rglob("*.md"))]
+DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+DOCUMENTS = sorted(
+    [*DOCUMENTS, *(ROOT / "examples").rglob("*.md"), *(ROOT / "damian" / "data").rglob("*.md")]
+)
 FILES = [file for file in DOCUMENTS if file.name != "CHANGELOG.md"]  # which names commands of older versions
 FILES += [*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.py")]
 FILES += sorted((ROOT / "recipes").glob("*.py"))
@@ -47,10 +49,15 @@ def test_every_command_that_a_file_names_exists(file):
             check_words(name, own)
 
 
-@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)
-def test_every_file_that_a_document_links_to_exists(file):
-    links = re.findall(r"\]\(([^)#:]+)\)|src=\"([^\"]+)\"", file.read_text())
-    assert all((file.parent / (link or image)).exists() for link, image in links)
+@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
+def test_every_link_and_anchor_of_a_document_leads_somewhere(file):
+    nowhere = []
+    for link in links(file.read_text(encoding="utf-8")):
+        path, _, anchor = link.partition("#")
+        target = file.parent / path if path else file
+        there = target.exists() and (not anchor or anchor in anchors(target.read_text(encoding="utf-8")))
+        nowhere += [] if there else [link]
+    assert nowhere == []
 
 
 def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
