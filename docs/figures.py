@@ -3,7 +3,6 @@
 python docs/figures.py    (make pictures)
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,10 +162,7 @@ def plot_world(path: Path, words: list[str], step: int, worlds: int) -> None:
     with matplotlib.rc_context({**STYLE, "font.size": 8}):
         figure = Figure(figsize=(2.2 + 3.2 * worlds, 3.2), layout="constrained")
         axes = np.atleast_1d(figure.subplots(1, worlds))
-        for axis, flown in zip(axes, record(rollout, env.uav_env, {}), strict=True):
-            sought = env.uav_env.scenario.seeks_source
-            nowhere = {"source": None, "emits": None, "spotted": np.zeros_like(flown.spotted)}
-            episode = flown if sought else replace(flown, **nowhere)
+        for axis, episode in zip(axes, record(rollout, env.uav_env, {}), strict=True):
             MapView(axis, episode).draw(frame_of(episode, min(step, episode.n_steps)))
             wind = episode.about.get("wind")
             if worlds > 1 and wind:
