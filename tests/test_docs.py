@@ -1,6 +1,7 @@
 """The documents keep their word: their Python runs, their commands exist, their links lead somewhere."""
 
 import re
+import runpy
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,6 +67,16 @@ def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
     numbers = {*re.findall(r"-?\d+\.\d|-\d{3,}", guide)}
     assert len(numbers) > 20
     assert [number for number in numbers if not re.search(rf"(?<![\d.]){number}(?![\d.]\d)", results)] == []
+
+
+def test_the_leaderboard_is_that_of_the_stored_results():
+    page = runpy.run_path(str(ROOT / "docs" / "figures.py"))["leaderboard_page"]()
+    assert (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8") == page
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for method in ("timeline", "timeline+gru", "naive+timeline", "backupdate+gru", "naive+gru"):
+        row = next(line for line in page.splitlines() if line.startswith(f"| {method} |"))
+        (published,) = re.findall(rf"^\| \*{re.escape(method)}\* \|.*", readme, re.MULTILINE)
+        assert {*re.findall(r"[\d.]+ \[[^]]+\]", published)} <= {*re.findall(r"[\d.]+ \[[^]]+\]", row)}
 
 
 def test_the_citation_names_this_version():
