@@ -9,10 +9,9 @@ import html
 import json
 import posixpath
 import re
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
-
-from mkdocs.structure.files import File, Files
 
 import damian
 from damian.recipes.command import PROGRAMS
@@ -81,8 +80,17 @@ def listed(folder: str) -> list[Any]:
     return [{path.removeprefix(inside): f"examples/{path}.md"} for path in names]
 
 
-def on_files(files: Files, config: Any) -> Files:
+def on_files(files: Any, config: Any) -> Any:
     """Add the made pages, and the pictures in the outputs of notebooks."""
+    from mkdocs.structure.files import File  # noqa: PLC0415 (tests make the pages without MkDocs)
+
+    for name, content in made().items():
+        files.append(File.generated(config, name, content=content))
+    return files
+
+
+def made() -> dict[str, str | bytes]:
+    """The pages that are not files of docs/, and pictures, by their names in the site."""
     pages: dict[str, str | bytes]
     pages = {name: (ROOT / source).read_text(encoding="utf-8") for source, name in TEXTS.items()}
     pages |= {"commands/index.md": commands(), **{f"commands/{name}.md": settings(name) for name in SHOWN}}
@@ -90,14 +98,16 @@ def on_files(files: Files, config: Any) -> Files:
     pages |= {f"examples/{path}.md": example(path) for path in examples()} | {"features.md": features()}
     for path in NOTEBOOKS:
         pages |= notebook(path)
-    for name, content in pages.items():
-        files.append(File.generated(config, name, content=content))
-    return files
+    return pages
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """The text of a page with the links and pictures of the site."""
+    return led(markdown, page.file.src_uri)
+
+
+def led(markdown: str, page_name: str) -> str:
     """Lead the links of the project's texts, which lead to its files, to pages of the site; mend pictures."""
-    page_name = page.file.src_uri
     if page_name.startswith(("api/", "commands/", "examples/")):
         return markdown
     markdown = re.sub(r"<img\s[^>]*>", picture, markdown)
@@ -165,7 +175,8 @@ def group_rows(program: str) -> list[tuple[str, ...]]:
 def row(key: str, setting: Setting) -> tuple[str, ...]:
     """A setting in a table."""
     meaning = " ".join(setting.text.replace("``", "`").split())
-    return code(key), code(setting.kind), code(setting.shown), meaning.replace("|", "&#124;")
+    default = "" if setting.default is MISSING else repr(setting.default)
+    return code(key), code(setting.kind), code(default), meaning.replace("|", "&#124;")
 
 
 def code(text: str) -> str:
@@ -194,7 +205,7 @@ def public_names() -> str:
     """The names that ``import damian`` offers."""
     parts = ["# damian", "`import damian` offers these names, and loads each when it is first used.", ""]
     for name in sorted(damian._MODULE_OF):
-        path = PROGRAM_FUNCTIONS.get(name, f"{getattr(damian, name).__module__}.{name}")
+        path = PROGRAM_FUNCTIONS.get(name) or f"{getattr(damian, name).__module__}.{name}"
         parts.append(f"- [`{name}`][{path}]")
     parts += ["", *(f"::: {path}" for path in PROGRAM_FUNCTIONS.values()), "", "::: damian.keys"]
     return "\n".join(parts)

@@ -34,7 +34,7 @@ def save_recording(episode: Episode, path: Path) -> None:
     recording.log("region", rr.LineStrips3D(rings), static=True)
     points = rr.Points3D(on_ground(episode.landing_points), radii=size / 5)
     recording.log("landing_points", points, static=True)
-    if episode.source is not None:
+    if episode.source is not None and episode.has_source:
         emits = np.zeros((len(episode.time), 1)) if episode.emits is None else episode.emits
         columns = {"positions": on_ground(episode.source[:, 0]), "radii": size * (1 + emits[:, 0])}
         recording.send_columns("source", [time], rr.Points3D.columns(**columns))

@@ -101,13 +101,13 @@ def compare(config: CompareConfig, folder: Path) -> None:
         and has_rows
         and not any((folder / each).exists() for each in config.experiment.tasks)
     ):
-        kept, runs = stored_results(folder), []
+        kept, runs = stored_results(folder, "hydra.run.dir"), []
     else:
         if config.report_only and config.seeds is None:  # all up to the last one with a run
             names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
             last = max((int(name) for name in names if name.isdecimal()), default=-1)
             config = replace(config, seeds=max(last - config.experiment.first_seed + 1, 0) or None)
-        kept = stored_results(folder) if config.keep and has_rows else NO_RESULTS
+        kept = stored_results(folder, "hydra.run.dir") if config.keep and has_rows else NO_RESULTS
         runs = _not_kept(plan(config, folder), kept)
     for run in runs:
         not_linked(run.folder, below=folder)

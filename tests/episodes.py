@@ -27,6 +27,11 @@ def flight(n_steps: int = 3, **changes) -> Episode:
     return Episode(**{**fixed, **columns, **changes})
 
 
+NO_SOURCE = {"source": np.zeros((4, 0, 2)), "emits": np.zeros((4, 0), bool)}
+UNKNOWN_SOURCE = {"source": None, "emits": None}
+"""Changes of a flight of three steps whose task has no source, and whose source nobody knows."""
+
+
 def crowd(n_steps: int = 3, **changes) -> Episode:
     """An episode of 20 UAVs, ten at each of two places."""
     few, names = flight(n_steps), "position target battery believed track age reward spotted sent delay"

@@ -1,20 +1,23 @@
 """The documents keep their word: their Python runs, their commands exist, their links lead somewhere."""
 
 import re
+import runpy
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
+from sites import ROOT, anchors, links
 
 import damian
 from damian.recipes.command import FOLDERS, PROGRAMS
 from damian.recipes.known import check_words
 
-ROOT = Path(damian.__file__).parents[1]
-DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]
-DOCUMENTS += [*sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples" / "fleet").rglob("*.md"))]
+DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+DOCUMENTS = sorted(
+    [*DOCUMENTS, *(ROOT / "examples").rglob("*.md"), *(ROOT / "damian" / "data").rglob("*.md")]
+)
 FILES = [file for file in DOCUMENTS if file.name != "CHANGELOG.md"]  # which names commands of older versions
 FILES += [*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.py")]
 FILES += sorted((ROOT / "recipes").glob("*.py"))
@@ -47,10 +50,15 @@ def test_every_command_that_a_file_names_exists(file):
             check_words(name, own)
 
 
-@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)
-def test_every_file_that_a_document_links_to_exists(file):
-    links = re.findall(r"\]\(([^)#:]+)\)|src=\"([^\"]+)\"", file.read_text())
-    assert all((file.parent / (link or image)).exists() for link, image in links)
+@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
+def test_every_link_and_anchor_of_a_document_leads_somewhere(file):
+    nowhere = []
+    for link in links(file.read_text(encoding="utf-8")):
+        path, _, anchor = link.partition("#")
+        target = file.parent / path if path else file
+        there = target.exists() and (not anchor or anchor in anchors(target.read_text(encoding="utf-8")))
+        nowhere += [] if there else [link]
+    assert nowhere == []
 
 
 def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
@@ -59,6 +67,16 @@ def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
     numbers = {*re.findall(r"-?\d+\.\d|-\d{3,}", guide)}
     assert len(numbers) > 20
     assert [number for number in numbers if not re.search(rf"(?<![\d.]){number}(?![\d.]\d)", results)] == []
+
+
+def test_the_leaderboard_is_that_of_the_stored_results():
+    page = runpy.run_path(str(ROOT / "docs" / "figures.py"))["leaderboard_page"]()
+    assert (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8") == page
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for method in ("timeline", "timeline+gru", "naive+timeline", "backupdate+gru", "naive+gru"):
+        row = next(line for line in page.splitlines() if line.startswith(f"| {method} |"))
+        (published,) = re.findall(rf"^\| \*{re.escape(method)}\* \|.*", readme, re.MULTILINE)
+        assert {*re.findall(r"[\d.]+ \[[^]]+\]", published)} <= {*re.findall(r"[\d.]+ \[[^]]+\]", row)}
 
 
 def test_the_citation_names_this_version():

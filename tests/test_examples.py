@@ -1,5 +1,6 @@
 """The examples run from any folder, do what their text says, and learn under delay (slow)."""
 
+import ast
 import importlib
 import os
 import re
@@ -20,6 +21,15 @@ from damian.delays.laws import Uniform
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
+PROGRAMS = [path for folder in ("docs", "examples") for path in sorted((ROOT / folder).rglob("*.py"))]
+ELSEWHERE = {
+    "docs/upstream/test_": "is one of TorchRL's own tests",
+    "examples/benchmarl/": "needs BenchMARL, which asks for another TorchRL",
+    "examples/benchmarks/bench_jaxmarl": "needs JaxMARL, which asks for other versions",
+    "examples/fleet/": "is a distribution of its own, with tests of its own",
+    "examples/tune": "needs Optuna, which is no extra of tests",
+}
+"""How the paths of programs begin that are not imported here, and why; what they import of damian is."""
 DOCUMENT = (ROOT / "docs" / "backupdating.md").read_text()
 
 
@@ -31,6 +41,16 @@ def load(name: str) -> dict[str, Any]:
 def run(name: str) -> dict[str, Any]:
     """The names that an example about transforms defines when its program runs."""
     return runpy.run_path(str(EXAMPLES / "transforms" / f"{name}.py"), run_name="__main__")
+
+
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_a_program_is_imported(path):
+    if not path.relative_to(ROOT).as_posix().startswith(tuple(ELSEWHERE)):
+        runpy.run_path(str(path))
+        return
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "damian":
+            exec(ast.unparse(node), {})
 
 
 def test_back_updated_rewards_and_ends_are_the_true_ones_wherever_the_message_has_arrived(capsys):

@@ -11,16 +11,26 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
+from damian.common import checks
 from damian.common.errors import InputError
 
 MAX_LINE = 1000
 """Characters of an error; the middle of a longer one is left out."""
 
 
-def data_file(path: str) -> str:
-    """The file of a path; one that begins with ``damian:`` is among the package's own."""
+def data_file(path: str, key: str) -> str:
+    """The file of a path; one that begins with ``damian:`` is among the package's own.
+
+    Raises:
+        InputError: the package has no policy, or no file, of this name; ``key`` is the setting of the path.
+    """
     shipped = path.removeprefix("damian:")
-    return path if shipped == path else str(files("damian") / "data" / shipped)
+    if shipped == path:
+        return path
+    folder, name = Path(str(files("damian") / "data")), shipped.partition("/")[0]
+    alike = [each.name for each in sorted(folder.iterdir()) if each.suffix == Path(name).suffix]
+    checks.one_of(key, f"damian:{name}", [f"damian:{each}" for each in alike])
+    return str(folder / shipped)
 
 
 def read_text(file: Path) -> str:

@@ -79,7 +79,10 @@ def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
         runs = rows[rows["method"] == method]
         cells = [_mean(runs[runs["delay"] == delay]) for delay in present]
         one, steps = runs.iloc[0], f"{runs['frames'].max() / 1e6:.2g}"
-        size, version = f"{int(one['parameters']):,}", f"{one['damian']} ({str(one['commit'])[:7]})"
+        size, version = (
+            f"{int(one['parameters']):,}",
+            f"{one['damian']} ({str(one['commit'])[:7]})".removesuffix(" (several)"),
+        )
         lines.append((method, *cells, one["authors"], steps, size, version))
     return markdown_table(["method", *present, "authors", "million steps", "parameters", "damian"], lines)
 

@@ -225,8 +225,9 @@ class Trace(Law):
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
+        file = Path(data_file(str(self.path), f"{key}.path"))
         with named(str(self.path)):
-            rows = parse_table(read_text(Path(data_file(str(self.path)))), ["delay"])
+            rows = parse_table(read_text(file), ["delay"])
             checks.require(bool(rows), "delay", "the column", "is empty")
             written = {f"line {row.line}: delay": row.cells["delay"] for row in rows}
             delays = [-1 if d == LOST else in_steps(at, _number(d), dt) for at, d in written.items()]

@@ -29,7 +29,8 @@ from damian.world.state import Truth
 
 
 def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, Any]) -> list[Episode]:
-    """The flight of a journal as episodes; ``source`` and ``emits`` are None.
+    """The flight of a journal as episodes; ``source`` and ``emits`` are None if the task has one or a UAV
+    has spotted one.
 
     An episode begins when all UAVs of the fleet have reported; when UAVs join or leave, another one does.
     ``node_of`` gives a node for a number of UAVs, which writes the terms of the reward.
@@ -81,7 +82,9 @@ def _episode(tracker: Tracker, rows: Rows, steps: Sequence[int], about: Mapping[
     instants[keys.STATE] = Truth(position, battery, unknown[..., 0], unknown, *nothing).pack()
     told = {**about, "uavs": tracker.uavs, "began": written(tracker.start + steps[0] * node.dt)}
     episode = episode_of(instants, node.worlds, told)
-    return replace(episode, **columns, instant=False, source=None, emits=None)
+    is_sought = episode.has_source or columns["spotted"].any()
+    unknown_source = {"source": None, "emits": None} if is_sought else {}
+    return replace(episode, **columns, **unknown_source, instant=False)
 
 
 def _hindsight(

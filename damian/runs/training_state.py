@@ -105,7 +105,7 @@ def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> Non
 
 def checkpoint_file(written: Path) -> Path:
     """The file that a run folder, a file in one, or ``damian:NAME`` of the package's own, stands for."""
-    written = Path(data_file(str(written)))
+    written = Path(data_file(str(written), "checkpoint"))
     return written if written.is_file() else written / CHECKPOINT
 
 

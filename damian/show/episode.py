@@ -66,7 +66,9 @@ class Episode:
     battery: Annotated[Floats, "battery levels [%], [T + 1, N]"]
     spotted: Annotated[Flags, "whether the UAV spots a source, [T + 1, N]"]
     source: Annotated[
-        Floats | None, "positions of the sources: east, north [m]; null if nobody knows them, [T + 1, K, 2]"
+        Floats | None,
+        "positions of the sources, none if the task has none: east, north [m]; null if nobody knows them, "
+        "[T + 1, K, 2]",
     ]
     emits: Annotated[Flags | None, "whether each source emits; null if nobody knows it, [T + 1, K]"]
     sent: Annotated[Flags, "whether the UAV sent a message in the step; not at the reset, [T + 1, N]"]
@@ -100,6 +102,11 @@ class Episode:
     def names(self) -> list[str]:
         """The UAVs in a text: their IDs if they are real ones, else as in ``UAV 0``."""
         return self.ids if self.about.get("uavs") else [f"UAV {uav}" for uav in self.ids]
+
+    @property
+    def has_source(self) -> bool:
+        """Whether the task has a source, be it known or not."""
+        return self.source is None or self.source.shape[1] > 0
 
     @property
     def true(self) -> Floats:
@@ -226,6 +233,7 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         charges = vehicles.chargers.view(airspace.points.shape[:2])[region].cpu()
         about["charging_points"] = _listed(points[charges[: len(points)].numpy()])
     level, source = about.get("drawn", {}).get("source.level_db"), env.scenario.source
+    n_sources = source.count if env.scenario.seeks_source else 0
     return Episode(
         about={**about, "region": over.name, "damian": damian.__version__},
         region=over.polygon,
@@ -239,9 +247,9 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         target=np.asarray(own.target),
         track=np.asarray(own.track),
         battery=np.asarray(truth.battery),
-        spotted=np.asarray(own.spotted),
-        source=np.asarray(truth.source),
-        emits=np.asarray(truth.emits),
+        spotted=np.asarray(own.spotted) & (n_sources > 0),
+        source=np.asarray(truth.source)[:, :n_sources],
+        emits=np.asarray(truth.emits)[:, :n_sources],
         sent=np.asarray(sent),
         delay=np.asarray(delay[..., 0]),
         believed=np.asarray(held.position),

@@ -104,12 +104,14 @@ class Film:
         frame = frame_of(self.episode, step, self.chosen)
         with matplotlib.rc_context(_STYLE):
             self._moving = [*self.view.draw(frame), *self._now(frame.time)]
-        won = f"return {self.episode.reward[: step + 1].mean(-1).sum():.2f}"
-        which = "a" if len(frame.sources) > 1 else "the"
-        spots = f"{sum(uav.spots for uav in frame.uavs)} of {len(frame.uavs)} UAVs spot {which} source"
+        told = [f"{frame.time:g} s", f"return {self.episode.reward[: step + 1].mean(-1).sum():.2f}"]
+        if self.episode.has_source:
+            which = "a" if len(frame.sources) > 1 else "the"
+            n_spotting = sum(uav.spots for uav in frame.uavs)
+            told.append(f"{n_spotting} of {len(frame.uavs)} UAVs spot {which} source")
         if self.episode.belief is not None:
-            spots += f"   ·   belief {self.episode.entropy(step):.1f} bit"
-        self.figure.suptitle(f"{frame.time:g} s   ·   {won}   ·   {spots}", x=0.085, ha="left", fontsize=10)
+            told.append(f"belief {self.episode.entropy(step):.1f} bit")
+        self.figure.suptitle("   ·   ".join(told), x=0.085, ha="left", fontsize=10)
         return self._moving
 
     def frame(self, step: int) -> NDArray[np.uint8]:

@@ -235,7 +235,7 @@ def legend_marks(episode: Episode, n_chosen: int | None = None) -> list[Any]:
     ]
     if others:
         marks.insert(1, _mark(f"{others} other UAVs", color=OTHER, marker=DART, markersize=_SMALL))
-    if episode.source is not None:
+    if episode.source is not None and episode.has_source:
         for does, style in (("emits", {}), ("silent", {"markerfacecolor": "white"})):
             marks.append(_mark(f"source, {does}", marker="*", color=INK, markersize=11, **style))
     if _zones(episode):

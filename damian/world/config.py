@@ -113,7 +113,8 @@ class MotionConfig(Settings):
 
     kind: str = setting(
         "instant",
-        "instant (at the target when the step ends), polynomial, or package.module:Class, a MotionModel.",
+        "instant (at the target when the step ends, even across a no-fly zone), polynomial, or "
+        "package.module:Class, a MotionModel.",
         choices=("instant", "polynomial"),
         paths=True,
     )

@@ -25,7 +25,6 @@ from damian.baselines.random import random_policy
 from damian.baselines.script import script_policy
 from damian.common.fields import nested
 from damian.common.tables import markdown_table, write_csv
-from damian.common.text_files import data_file
 from damian.recipes.known import CONF
 from damian.recipes.shared.runs import stored_config
 from damian.runs.checkpoint import read_checkpoint, write_checkpoint
@@ -87,7 +86,7 @@ def returns(name: str, law: tuple[str, ...]) -> dict[str, list[float]]:
 
 def ship(name: str, run: Path) -> None:
     """Store the policy of a run in the package, fly it, and write its card."""
-    folder, (words, limits) = Path(data_file(f"damian:{name}")), POLICIES[name]
+    folder, (words, limits) = Path(damian.__file__).parent / "data" / name, POLICIES[name]
     folder.mkdir(exist_ok=True)
     actor = read_checkpoint(run / "checkpoint.pt", "checkpoint")["components"]["actor"]
     half = {key: each.half() if isinstance(each, torch.Tensor) else each for key, each in actor.items()}

@@ -239,8 +239,15 @@ def _of_run(run: Run, methods: Mapping[str, Method]) -> Results:
     return Results(rows, points)
 
 
-def stored_results(folder: Path) -> Results:
-    """Read the results that a folder stores, but no curves of a version that drew perceived returns."""
+def stored_results(folder: Path, key: str = "folder") -> Results:
+    """Read the results that a folder stores, but no curves of a version that drew perceived returns.
+
+    Raises:
+        InputError: it is not the folder of a comparison; ``key`` is the setting that names it.
+    """
+    is_whole = all((folder / name).is_file() for name in (ROWS, POINTS))
+    problem = f"has no {ROWS} beside {POINTS}: give the folder of damian compare, not one of a run or a sweep"
+    checks.require(is_whole, key, folder, problem)
     check_no_links(folder)
     rows, points = (read_results(folder / name) for name in (ROWS, POINTS))
     return Results(rows, points if LABELS.keys() <= {*points} else NO_RESULTS.points)

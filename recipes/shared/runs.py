@@ -140,6 +140,12 @@ def check_stored(config: TrainConfig, folder: Path) -> None:
             )
 
 
+CROSSES_ZONES = (
+    "with motion=instant nobody lands in a no-fly zone, but ways cross it (motion=polynomial: around it)"
+)
+"""What is said of jumps, which take no way at all."""
+
+
 def perform(config: TrainConfig, folder: Path, work: Work, key: str = "hydra.run.dir") -> None:
     """Do the work of a program in one thread with the seed of its settings; a run goes on that has begun.
 
@@ -148,6 +154,8 @@ def perform(config: TrainConfig, folder: Path, work: Work, key: str = "hydra.run
     torch.set_num_threads(1)
     keep_freed_memory()
     seed_generators(config.seed)
+    if config.region.zones and config.motion.kind == "instant":
+        print(f"note: {CROSSES_ZONES}")
     with locked(folder, key):
         if (folder / CONFIG).exists() and (folder / CHECKPOINT).exists() and _same_policy(config, folder):
             config = replace(config, resume=str(folder))

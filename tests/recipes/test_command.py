@@ -31,6 +31,10 @@ def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
 
 
 LATE = "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, 3s..7s)"
+FILES = "is not one of damian:fir.csv, damian:queue_trace.csv"
+POLICIES = (
+    "is not one of damian:convoy, damian:crowded-any-delay, damian:flights, damian:requests, damian:tracking"
+)
 RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order"
 
 
@@ -55,7 +59,15 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
         (["train", "clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
         (["train", "region=geojson"], "region.path: it is missing: region.kind=geojson needs it"),
         (["train", "delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
+        (["train", "delay.obs={law: trace, path: damian:x.csv}"], f"delay.obs.path: damian:x.csv {FILES}"),
+        (["train", "region=geojson", "region.path=damian:x.csv"], f"region.path: damian:x.csv {FILES}"),
         (["train", "checkpoint=nowhere"], "checkpoint: nowhere holds no config.yaml"),
+        (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
+        (["export", "damian:crowded/best.pt"], f"checkpoint: damian:crowded {POLICIES}"),
+        (
+            ["submit", "folder=.", "method=x", "authors=x"],
+            "folder: . has no results.csv beside curves.csv: give the",
+        ),
         (["train", "resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
         (["compare", "experiment=usecases", "agents=3"], "agents: it is a setting of the runs"),
         (["compare", "-m", "experiment=usecases"], "-m: not with damian compare, which has many runs anyway"),

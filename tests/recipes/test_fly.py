@@ -47,6 +47,12 @@ def test_a_run_folder_holds_configuration_episode_film_and_figure(fly, capsys):
         assert film.size == (720, 660)
 
 
+@pytest.mark.parametrize(("motion", "crosses"), [("instant", True), ("polynomial", False)])
+def test_a_note_says_that_instant_ways_cross_no_fly_zones(fly, capsys, motion, crosses):
+    fly("region.zones=1", "episode.max_steps=2", f"motion={motion}", *FLYING[1:])
+    assert ("note: with motion=instant nobody lands in a no-fly zone" in capsys.readouterr().out) == crosses
+
+
 @pytest.mark.slow
 def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run, fly):
     words = ["agents=2", "frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "eval_episodes=2"]

@@ -14,6 +14,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.server.config import ObservationConfig
+from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.show.episode import COLUMNS, Episode, record
 from damian.world.config import BatteryConfig
@@ -58,6 +59,17 @@ def test_rewards_and_beliefs_are_those_of_the_rollout_after_each_step(flown):
         assert episode.belief.shape[2] == len(episode.cells)
         assert replace(episode, belief=np.full((1, 2, 8), 1 / 8)).entropy(0) == 6
         assert episode.perceived_return == pytest.approx(reward.mean(-1).sum())
+
+
+@pytest.mark.parametrize(("weight", "n_sources"), [(0.0, 0), (1.0, 1)])
+def test_an_episode_of_a_task_without_a_source_has_none(weight, n_sources, tmp_path):
+    scenario = ScenarioConfig(reward=RewardConfig(coverage=1.0, spotted=weight))
+    env = make_env(scenario, 1, seed=5, extras=["message", "state"])
+    (episode,) = record(env.rollout(20, random_policy(env)), env.uav_env, {})
+    episode.save(tmp_path / "episode.json")
+    for each in (episode, Episode.load(tmp_path / "episode.json")):
+        assert each.source.shape[1] == each.emits.shape[1] == n_sources
+        assert each.has_source == each.spotted.any() == bool(n_sources)
 
 
 def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(flown, tmp_path):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from episodes import crowd, flight
+from episodes import NO_SOURCE, UNKNOWN_SOURCE, crowd, flight
 from matplotlib.colors import to_rgb
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 from PIL import Image
@@ -23,6 +23,16 @@ def test_a_film_has_a_frame_for_each_instant_that_differs(tmp_path, changes, tit
         film.seek(3)
         assert film.info["duration"] == 1500
     assert Film(flight(**changes)).charts[1].get_title("left").startswith(title)
+
+
+@pytest.mark.parametrize("view", ["2d", "3d"])
+@pytest.mark.parametrize(("changes", "n_marks"), [({}, 2), (NO_SOURCE, 0), (UNKNOWN_SOURCE, 0)])
+def test_a_film_tells_of_a_source_only_if_the_task_has_one(view, changes, n_marks):
+    film = Film(flight(**changes), view)
+    film.draw(0)
+    assert ("0 of 2 UAVs spot the source" in film.figure.get_suptitle()) == (changes is not NO_SOURCE)
+    labels = [text.get_text() for text in film.figure.legends[0].get_texts()]
+    assert sum(label.startswith("source") for label in labels) == n_marks
 
 
 def test_a_film_of_the_space_shows_a_uav_above_the_place_where_it_stands():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import shapely
 from chromium import chromium, problems, resize
-from episodes import SQUARE, crowd, flight
+from episodes import NO_SOURCE, SQUARE, crowd, flight
 
 from damian import compose_scenario
 from damian.baselines.random import random_policy
@@ -207,6 +207,13 @@ def test_of_many_uavs_the_list_chooses_the_one_that_is_told_apart(opened):
         page.press("ESCAPE")
         assert page.run("return document.querySelector('#tools select').value") == ""
         assert (page.map(), page.all("[data-shown=chosen]")) == (before, [])
+
+
+def test_a_page_tells_of_a_source_only_if_the_task_has_one(opened):
+    for changes in (NO_SOURCE, {}):
+        with opened(flight(**changes)) as page:
+            assert len(page.all("p [data-shown=spots]")) == (changes is not NO_SOURCE)
+            assert len(page.all("td[data-shown=spots]")) == 2 * (changes is not NO_SOURCE)
 
 
 def test_zones_are_hatched_and_charging_places_marked(opened):

@@ -30,7 +30,8 @@ export class Card {
     const [west, south, east, north] = episode.limits;
     this.view.style.setProperty("--aspect", Math.min(Math.max((east - west) / (north - south), 0.8), 2));
     this.layers = ["map", "space", "marks"].map((name) => make(this.view, "canvas", name));
-    const described = `where UAVs and source are in ${episode.title}; the table below has the numbers`;
+    const shown = episode.hasSource ? "UAVs and source" : "UAVs";
+    const described = `where ${shown} are in ${episode.title}; the table below has the numbers`;
     for (const canvas of this.layers.slice(0, 2)) describe(canvas, described);
     this.layers[2].setAttribute("aria-hidden", "true");
     this.hint = make(this.view, "p", "hint");

@@ -40,6 +40,8 @@ export class Episode {
     /** Borders of what a view shows [m]: footprints are not cut, unless they are large. */
     this.limits = withMargin(this.borders, this.radius);
     this.usesBattery = this.battery.some((row) => row.some((level, uav) => level !== this.battery[0][uav]));
+    /** Whether the task has a source, be it known or not. */
+    this.hasSource = this.source === null || this.source[0].length > 0;
     this.highest = this.position.flat().reduce((most, place) => Math.max(most, place[2]), 0);
     this.messages = this.#messages();
     const mean = (row) => row.reduce((sum, each) => sum + each, 0) / row.length;

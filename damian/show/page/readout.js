@@ -15,7 +15,8 @@ export class Readout {
    */
   constructor(line, table, episode, choose) {
     Object.assign(this, { line, episode });
-    this.columns = [...Object.keys(UNITS), "spots"].filter((name) => name !== "up" || episode.highest > 0);
+    const isShown = { up: episode.highest > 0, spots: episode.hasSource };
+    this.columns = [...Object.keys(UNITS), "spots"].filter((name) => isShown[name] ?? true);
     const head = table.createTHead().insertRow();
     for (const name of ["UAV", ...this.columns]) {
       const cell = document.createElement("th");
@@ -38,8 +39,10 @@ export class Readout {
       const numbers = { east, north, up, age: episode.age[step][uav], battery: episode.battery[step][uav] };
       for (const [name, cell] of cells) if (name in numbers) cell.textContent = written(numbers[name]);
       const spots = episode.spotted[step][uav];
-      cells.get("spots").textContent = spots ? FILLED : HOLLOW;
-      cells.get("spots").setAttribute("aria-label", spots ? "yes" : "no");
+      if (cells.has("spots")) {
+        cells.get("spots").textContent = spots ? FILLED : HOLLOW;
+        cells.get("spots").setAttribute("aria-label", spots ? "yes" : "no");
+      }
       cells.get("UAV").style.setProperty("--uav", theme.uav(uav));
       cells.get("UAV").firstChild.setAttribute("aria-pressed", String(theme.chosen === uav));
       cells.get("age").classList.toggle("old", numbers.age > 0);
@@ -53,7 +56,7 @@ export class Readout {
     const parts = [
       ["time", `${plain(episode.time[step])} s`],
       ["return", `return ${episode.returns[step].toFixed(2)}`],
-      ["spots", `${spots} of ${episode.nAgents} spot ${which} source`],
+      ["spots", episode.hasSource ? `${spots} of ${episode.nAgents} spot ${which} source` : ""],
       ["age", `mean age ${episode.meanAge[step].toFixed(1)} s`],
       ["wind", wind ? `wind ${arrow} ${wind[0].toFixed(1)} m/s from ${Math.round(wind[1])}°` : ""],
       ["belief", episode.belief ? `belief ${episode.entropy(step).toFixed(1)} bit` : ""],

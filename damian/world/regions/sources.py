@@ -46,12 +46,12 @@ def _region_of_vertices(config: RegionConfig, rng: np.random.Generator) -> list[
 
 @REGION_SOURCES.register("fir")
 def _region_of_fir_table(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    return [read_fir(data_file(config.path), config.id)]
+    return [read_fir(data_file(config.path, "region.path"), config.id)]
 
 
 @REGION_SOURCES.register("geojson")
 def _region_of_map(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    return [read_area(data_file(config.path), config.index, config.where)]
+    return [read_area(data_file(config.path, "region.path"), config.index, config.where)]
 
 
 def _without_zones(region: Region, config: RegionConfig, rng: np.random.Generator) -> Region:
@@ -77,7 +77,7 @@ def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
     """All areas of a map, in local metres of a region."""
     problem = f"is a map, but {region.name} has no position on Earth: give corners in metres"
     checks.require(region.origin is not None, "region.zones", path, problem)
-    area = read_area(data_file(path), every=True)
+    area = read_area(data_file(path, "region.zones"), every=True)
     origins = cast(tuple[float, float], area.origin), cast(tuple[float, float], region.origin)
 
     def moved(places: Floats) -> Floats:
