@@ -367,7 +367,11 @@ def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], NDArray[np.float32],
 def _copied(infos: ByName) -> ByName:
     """A copy of infos down to their arrays; what else they hold cannot always be copied."""
     return {
-        name: _copied(each) if isinstance(each, dict) else each.copy() if isinstance(each, np.ndarray) else each
+        name: _copied(each)
+        if isinstance(each, dict)
+        else each.copy()
+        if isinstance(each, np.ndarray)
+        else each
         for name, each in infos.items()
     }
 
