@@ -19,6 +19,7 @@ from damian import (
     ActionDelay,
     ActionHistory,
     ContextSampler,
+    CumulativeReward,
     ObservationDelay,
     ObservationTimeline,
     RewardDelay,
@@ -456,9 +457,9 @@ class Relay(ParallelEnv):
     b may come ``again``, and ``tells`` of its death, or not.
     """
 
-    def __init__(self, again=None, tells=True):
+    def __init__(self, again=None, tells=True, names="abc"):
         self.again, self.tells = again, tells
-        self.metadata, self.possible_agents = {"name": "relay"}, ["a", "b", "c"]
+        self.metadata, self.possible_agents = {"name": "relay"}, [*names]
         self.observation_spaces = dict.fromkeys(self.possible_agents, Box(-99.0, 99.0, (2,), np.float32))
         self.action_spaces = dict.fromkeys(self.possible_agents, Discrete(50))
 
@@ -470,12 +471,13 @@ class Relay(ParallelEnv):
 
     def reset(self, seed=None, options=None):
         self.t, self.agents = 0, ["a", "b"]
-        return {agent: np.zeros(2, np.float32) for agent in self.agents}, {"a": {}, "b": {}}
+        infos = {agent: {"t": 0} for agent in self.agents}
+        return {agent: np.zeros(2, np.float32) for agent in self.agents}, infos
 
     def step(self, actions):
-        assert [*actions] == self.agents
+        actions = {agent: actions[agent] for agent in self.agents}  # TorchRL sends those of the dead, too
         self.t += 1
-        present = [*self.agents, *["c"] * (self.t == 3), *["b"] * (self.t == self.again)]
+        present = [*self.agents, *self.possible_agents[2:] * (self.t == 3), *["b"] * (self.t == self.again)]
         ends = {agent: self.t == 9 or (self.t == 5 and agent == "b") for agent in present}
         told = {agent: np.array([self.t, actions.get(agent, -1)], np.float32) for agent in present}
         rewards = {agent: float(10**self.t) for agent in present}
@@ -531,6 +533,42 @@ def test_who_comes_again_begins_anew(again, tells):
         ]
     paid = [sum(each for each in part if each) for part in (rewards[:5], rewards[5:])]
     assert paid == [sum(10**t for t in range(1, 6)), sum(10**t for t in range(again, 10))]
+
+
+@pytest.mark.parametrize("again", [6, 7, 8])
+def test_who_comes_again_begins_anew_in_the_transforms_too(again):
+    observation, action, reward = (("agents", each) for each in ("observation", "action", "reward"))
+    delays = Compose(
+        ActionDelay(1, action),
+        ObservationDelay(LOSSY, observation, ("agents", "held"), delay_key="delay"),
+        RewardDelay(by_time, reward),
+        CumulativeReward(2, reward_key=reward),
+        ActionHistory(3, action),
+        ObservationTimeline(5, observation, delay_key="delay"),
+    )
+    inner, env = (Relay(again, names="ab") for _ in range(2))
+    groups = {"agents": inner.possible_agents}
+    relay = PettingZooWrapper(inner, use_mask=True, done_on_any=False, group_map=groups)
+    reference = TransformedEnv(relay, delays)
+    env = DelayParallelWrapper(env, LOSSY, 1, by_time, history=3, timeline=5)
+    now, earned = reference.reset(), dict.fromkeys("ab", 0.0)
+    env.reset()
+    while env.agents:
+        chosen = env.unwrapped.t + 1
+        now["agents", "action"] = torch.full((2,), chosen)
+        now = reference.step(now)["next"]
+        told, rewards, *_ = env.step(dict.fromkeys(env.agents, chosen))
+        for agent in told:
+            i = env.possible_agents.index(agent)
+            for key in ("held", "age", "timeline"):
+                assert np.array_equal(told[agent][WRITTEN[key]], now["agents", key][i].numpy()), key
+            history = told[agent]["action_history"].reshape(3, 50).argmax(-1)
+            assert np.array_equal(history, (49 * now["agents", "action_history"][i]).round().numpy())
+            expected = rewards[agent] + 0.9 * (
+                0 if env.unwrapped.t == again and agent == "b" else earned[agent]
+            )
+            assert now["agents", "reward"][i].item() == pytest.approx(expected, rel=1e-5)
+        earned |= rewards
 
 
 def test_only_those_who_are_there_send():
