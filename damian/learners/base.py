@@ -94,7 +94,7 @@ def undelayed_talk(actor: ProbabilisticActor, env: EnvBase) -> bool:
 
 def _random_entries(env: EnvBase, worlds: int) -> TensorDictBase:
     """Random outputs of an environment, [worlds]; all actions are legal, and no episode begins."""
-    entries = env.observation_spec_unbatched.rand([worlds])
+    entries = env.observation_spec_unbatched.rand(torch.Size([worlds]))
     for key, flag in ((keys.ACTION_MASK, True), (keys.IS_INIT, False)):
         if key in entries.keys(True):
             entries[key] = torch.full_like(entries[key], flag)
