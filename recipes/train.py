@@ -49,6 +49,7 @@ from .shared.learning import (
     own_code,
     read_by,
     replay_buffer,
+    require_delayed_talk,
     require_memory,
     ticks,
 )
@@ -64,6 +65,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     require_memory(config, env, buffer)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compiles)
+    require_delayed_talk(config, collector.env, learner)
     hindsight = hindsight_returns(config, env)
     state = TrainingState(folder, learner.components(), collector, clock, buffer, hindsight)
     begin(config, state)

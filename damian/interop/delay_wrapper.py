@@ -82,7 +82,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         return told[""], info | more[""]
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        executed = self._delays.actions.send({"": action})[""]
+        executed = self._delays.act({"": action})[""]
         observation, reward, terminated, truncated, info = self.env.step(executed)
         ended = [""] if terminated or truncated else []
         observed = observation if self._in_parts else {"": observation}
@@ -132,7 +132,7 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         chosen, begin = self._by_world(self.action_space, actions), self._over
         going = {world: action for world, action in chosen.items() if world not in begin}
-        executed = self._batch(self.env.single_action_space, chosen | self._delays.actions.send(going))
+        executed = self._batch(self.env.single_action_space, chosen | self._delays.act(going))
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         now = self._by_world(self.env.observation_space, observations)
         over = [self._worlds[i] for i in np.flatnonzero(terminated | truncated)]
@@ -145,14 +145,14 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
             begin, infos = over, self._with(infos, last)
         else:
             self._over = over
-        first, at_first = self._delays.begin({w: now[w] for w in begin}, begin) if begin else ({}, {})
+        first, at_first = self._delays.begin({w: now[w] for w in begin}) if begin else ({}, {})
         rewards = np.array([*(paid | received).values()], rewards.dtype)
         observations = self._batch(self.single_observation_space, told | first)
         return observations, rewards, terminated, truncated, self._with(infos, more | at_first)
 
     def _by_world(self, space: Space[Any], things: Any) -> ByName:
-        """A batch as a dict by world; environments may write over what they return."""
-        return dict(zip(self._worlds, iterate(space, copy.deepcopy(things)), strict=True))
+        """A batch as a dict by world."""
+        return dict(zip(self._worlds, iterate(space, things), strict=True))
 
     def _batch(self, space: Space[Any], things: ByName) -> Any:
         """Things of all worlds in one batch."""
@@ -160,7 +160,8 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         return concatenate(space, [things[world] for world in self._worlds], empty)
 
     def _with(self, infos: ByName, more: ByName) -> ByName:
-        """Infos of the batch with those of some worlds."""
+        """Infos of the batch, which the environment may keep, with those of some worlds."""
+        infos = _copied(infos)
         for world, info in more.items():
             infos = self._add_info(infos, info, int(world))
         return infos
@@ -170,7 +171,8 @@ class Delays:
     """What some agents observe, do and earn, late: the wrappers pass it through here in each step.
 
     ``acting`` has the spaces of the actions by agent; ``observed`` those of the observations by agent, or by
-    part if these are messages of their own; ``told`` the arguments of a wrapper, ``default`` by agent.
+    part if these are messages of their own; ``told`` the arguments of a wrapper, ``default`` by agent. An
+    agent that joins, or joins again, begins anew. Others may write over what they give or get.
     """
 
     def __init__(self, observed: ByName, acting: ByName, told: ByName) -> None:
@@ -182,7 +184,10 @@ class Delays:
         self.actions, self._rewards = (_Link(name, acting, told) for name in ("action", "reward"))
         checks.require(not self._rewards.sampler.loses, "reward", told["reward"], LOSES)
         needed, given = self.actions.sampler.late or self._history, told["default"]
-        self._default = {a: given[a] if a in given else _zero(acting[a]) if needed else None for a in acting}
+        default = {a: given[a] if a in given else _zero(acting[a]) if needed else None for a in acting}
+        self._default = copy.deepcopy(default)
+        self.present: set[str] = set()
+        """Agents whose episode goes on."""
         self._messages = {n: _flat("timeline", each) for n, each in observed.items() if self._timeline}
         self._chosen = {a: _flat("history", each) for a, each in acting.items() if self._history}
 
@@ -198,31 +203,49 @@ class Delays:
         """What agents are told first, and their infos; a seed decides all later delays."""
         for link in (self._observations, self.actions, self._rewards):
             link.reset(seed)
-        return self.begin(observations, self._default)
+        self.present = set()
+        return self.begin(observations)
 
-    def begin(self, observations: ByName, agents: Collection[str]) -> tuple[ByName, ByName]:
+    def begin(self, observations: ByName) -> tuple[ByName, ByName]:
         """The same where the episodes of some agents begin."""
+        agents = self._agents(observations)
+        self.present |= {*agents}
         self._observations.begin(observations)
         self.actions.begin({agent: self._default[agent] for agent in agents})
         self._rewards.begin(dict.fromkeys(agents, 0.0))
-        return self._told(observations)
+        return self._told(agents)
+
+    def act(self, actions: ByName) -> ByName:
+        """What is executed when agents choose these actions."""
+        sent = {agent: action for agent, action in actions.items() if agent in self.present}
+        self.actions.send(sent)
+        return {**actions, **{agent: self.actions.held(agent) for agent in sent}}
 
     def step(self, observations: ByName, rewards: ByName, ended: list[str]) -> tuple[ByName, ByName, ByName]:
         """What agents are told, receive, and their infos; the episodes of some have ``ended``."""
-        (told, infos), rewards = self._told(self._observations.send(observations)), dict(rewards)
+        agents, rewards = self._agents(observations), dict(rewards)
+        self._observations.send(observations)
+        if joining := {*agents} - self.present:
+            self.begin({part: observations[part] for agent in joining for part in self._parts[agent]})
+        told, infos = self._told(agents)
         if self._rewards.sampler.late:
             self._rewards.send(rewards)
             for agent in rewards:
                 sent = self._rewards.recent(agent).items()
                 due = [(age, r) for age, (r, wait) in sent if wait == 0 or (wait > 0 and agent in ended)]
                 infos[agent]["received"], rewards[agent] = due, float(sum(reward for _, reward in due))
+        self.present -= {*ended}
         return told, rewards, infos
 
-    def _told(self, held: ByName) -> tuple[ByName, ByName]:
-        """What the agents are told of whom something is ``held``, and their infos."""
+    def _agents(self, observations: ByName) -> list[str]:
+        """The agents of whom there are observations."""
+        return [agent for agent, parts in self._parts.items() if observations.keys() >= {*parts}]
+
+    def _told(self, agents: list[str]) -> tuple[ByName, ByName]:
+        """What agents are told, and their infos."""
         told, infos = {}, {}
-        for agent in [agent for agent, parts in self._parts.items() if held.keys() >= {*parts}]:
-            found: Any = {part: copy.deepcopy(held[part]) for part in self._parts[agent]}
+        for agent in agents:
+            found: Any = {part: self._observations.held(part) for part in self._parts[agent]}
             age: Any = {part: self._observations.age[part] for part in found}
             if agent in found:
                 found, age = found[agent], age[agent]
@@ -255,7 +278,10 @@ class Delays:
 
 
 class _Link:
-    """The messages of some senders; a ``DelayLine`` delays their times, so that they may be anything."""
+    """The messages of some senders; a ``DelayLine`` delays their times, so that they may be anything.
+
+    It keeps copies, and gives copies, because environments and agents may write over their arrays.
+    """
 
     def __init__(self, name: str, senders: Collection[str], told: ByName) -> None:
         laws: list[Any] = [told[name], told["loss"] if name == "observation" else 0.0]
@@ -294,14 +320,15 @@ class _Link:
         """Begin the episodes of some senders, whose ``firsts`` are known at once."""
         mask = torch.tensor([sender in firsts for sender in self.age])
         self._memory, _ = self._line.reset(cast(Memory, self._memory), [], mask)
-        self._sent |= {sender: {self._now: (first, self._now)} for sender, first in firsts.items()}
+        for sender, first in copy.deepcopy(firsts).items():
+            self._sent[sender] = {self._now: (first, self._now)}
         self.age |= dict.fromkeys(firsts, 0)
 
-    def send(self, things: ByName) -> ByName:
-        """Send the things of some senders; returns what is held of them then. New ones begin an episode."""
+    def send(self, things: ByName) -> None:
+        """Send the things of some senders."""
         if self._memory is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        self._now, delays = self._now + 1, [0] * len(self.age)
+        self._now, delays, things = self._now + 1, [0] * len(self.age), copy.deepcopy(things)
         if self.sampler.late:
             sends = torch.tensor([sender in things for sender in self.age])
             sent = None if sends.all() else sends
@@ -316,9 +343,10 @@ class _Link:
             # What is neither recent nor held is never asked for again.
             recent, held = now - self._kept, now - self.age[sender]
             self._sent[sender] = {t: each for t, each in sent.items() if t >= recent or t == held}
-        if new := {s: each for s, each in things.items() if self._now - self.age[s] not in self._sent[s]}:
-            self.begin(new)
-        return {sender: self._sent[sender][self._now - self.age[sender]][0] for sender in things}
+
+    def held(self, sender: str) -> Any:
+        """What is held of a sender."""
+        return copy.deepcopy(self._sent[sender][self._now - self.age[sender]][0])
 
     def recent(self, sender: str) -> dict[int, tuple[Any, float]]:
         """What a sender sent lately, and the time until it arrives, by age [steps]."""
@@ -334,6 +362,18 @@ def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], NDArray[np.float32],
         low, width = np.float32(flat.low), np.float32(flat.high) - np.float32(flat.low)
     bounded = np.isfinite(width)
     return space, np.where(bounded, low, np.float32(0)), np.where(bounded & (width > 0), width, np.float32(1))
+
+
+def _copied(infos: ByName) -> ByName:
+    """A copy of infos down to their arrays; what else they hold cannot always be copied."""
+    return {
+        name: _copied(each)
+        if isinstance(each, dict)
+        else each.copy()
+        if isinstance(each, np.ndarray)
+        else each
+        for name, each in infos.items()
+    }
 
 
 def _by_name(given: Any) -> bool:

@@ -134,6 +134,6 @@ def actions_in(space: Space[Any], key: str, given: Any) -> Array:
 
 
 def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:
-    """The infos of one UAV; flags are Python's, because Gymnasium's vector environments know no others."""
+    """The infos of one UAV, copied; flags are Python's: Gymnasium's vector environments know no others."""
     found = {n: each[world] if n == "is_success" else each[world, agent] for n, each in infos.items()}
-    return {name: each if each.ndim else each.item() for name, each in found.items()}
+    return {name: each.copy() if each.ndim else each.item() for name, each in found.items()}

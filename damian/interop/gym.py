@@ -35,21 +35,21 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
         self.observation_space = self.flight.observation_space(0)
         self.action_space = self.flight.action_space()
-        self._info: dict[str, Any] = {}
+        self._infos: dict[str, Array] = {}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         super().reset(seed=seed)
         instant = self.flight.reset(seed)
-        self._info = row(instant.infos, 0, 0)
-        return instant.observation[0, 0], self._info
+        self._infos = instant.infos
+        return instant.observation[0, 0], row(instant.infos, 0, 0)
 
     def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
         instant, _ = self.flight.step(actions_in(self.action_space, "action", action)[None, None])
-        self._info = row(instant.infos, 0, 0)
+        self._infos, info = instant.infos, row(instant.infos, 0, 0)
         ends = bool(instant.terminated[0]), bool(instant.truncated[0])
-        return instant.observation[0, 0], float(instant.reward[0, 0]), *ends, self._info
+        return instant.observation[0, 0], float(instant.reward[0, 0]), *ends, info
 
     def render(self) -> Any:
         return self.flight.render()
@@ -57,7 +57,7 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
     def action_masks(self) -> Array:
         """Which discrete actions are legal now, [A] bool; all of them if nothing is masked."""
         space = cast(gymnasium.spaces.Discrete, self.action_space)
-        return self._info.get("action_mask", np.ones(space.n)).astype(bool)
+        return row(self._infos, 0, 0).get("action_mask", np.ones(space.n)).astype(bool)
 
 
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):

@@ -84,7 +84,8 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
 class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
     """Delays what the agents of any ``ParallelEnv`` observe, do and earn, each as ``DelayWrapper`` does.
 
-    An agent may leave the episode, with all its rewards, or join it, with an observation that is not late.
+    An agent may leave the episode, with all its rewards, or join it (again), with an observation that is not
+    late and nothing of its former life.
     ``state()`` is not late.
 
     Args:
@@ -123,8 +124,8 @@ class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
         return told, {agent: infos.get(agent, {}) | info for agent, info in more.items()}
 
     def step(self, actions: ByName) -> tuple[ByName, ByName, ByName, ByName, ByName]:
-        executed = self._delays.actions.send(actions)
-        observations, rewards, terminated, truncated, infos = self.env.step(executed)
+        observations, rewards, terminated, truncated, infos = self.env.step(self._delays.act(actions))
         ended = [agent for agent in rewards if terminated[agent] or truncated[agent]]
+        ended += self._delays.present.difference(self.env.agents, ended)  # some leave without a flag
         told, rewards, more = self._delays.step(observations, rewards, ended)
         return told, rewards, terminated, truncated, {a: infos.get(a, {}) | info for a, info in more.items()}

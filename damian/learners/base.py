@@ -1,12 +1,14 @@
 """The interface of a learner: its settings, its actor, and its updates from collected batches."""
 
+import copy
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import nn
+from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
 from damian import keys
@@ -54,3 +56,46 @@ def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> s
         if not largest <= LARGEST_WEIGHT:  # true also for nan
             return f"a weight of {name} is {largest:.3g}, not at most {LARGEST_WEIGHT:g}"
     return None
+
+
+@torch.no_grad()
+def undelayed_talk(actor: ProbabilisticActor, env: EnvBase) -> bool:
+    """Whether what an actor computes for one UAV changes with the row of another one.
+
+    That is, the parameters of the actions' distribution, or the next hidden state. The actor is tried in
+    evaluation mode with random weights, because a last layer of zeros hides what it reads, on random entries
+    of the environment.
+    """
+    device = torch.device(env.device or "cpu")
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(0)
+        tried = copy.deepcopy(actor).eval()
+        for weight in tried.parameters():
+            weight.normal_(0, weight.shape[-1:].numel() ** -0.5)
+        run = getattr(tried, "get_dist_params", tried)
+        entries, others = _random_entries(env, 8).split(4)
+
+        def outputs(changed: int | None) -> TensorDictBase:
+            """What is computed of all UAVs, [4, N], when the row of one of them has changed."""
+            read = entries.clone()
+            if changed is not None:
+                read[keys.AGENTS][:, changed] = others[keys.AGENTS][:, changed]
+            torch.manual_seed(0)
+            return run(read)[keys.AGENTS]
+
+        before = outputs(None)
+        for uav in range(before.shape[1]):
+            same = cast(TensorDictBase, outputs(uav) == before)
+            same[:, uav] = True
+            if not same.all():
+                return True
+    return False
+
+
+def _random_entries(env: EnvBase, worlds: int) -> TensorDictBase:
+    """Random outputs of an environment, [worlds]; all actions are legal, and no episode begins."""
+    entries = env.observation_spec_unbatched.rand(torch.Size([worlds]))
+    for key, flag in ((keys.ACTION_MASK, True), (keys.IS_INIT, False)):
+        if key in entries.keys(True):
+            entries[key] = torch.full_like(entries[key], flag)
+    return entries

@@ -84,6 +84,9 @@ class LearnerConfig(Settings):
     steps: int = setting(
         32, "Steps between two updates, if clock.system is not set.", low=1, high=checks.STEPS
     )
+    talks: bool = setting(
+        False, "Whether an actor may read the rows of other UAVs, who then talk without delay."
+    )
 
     reads: ClassVar[tuple[str, ...]] = ()
     """Optional outputs of the environment that the learner needs in its batches: ``message``, ``state``,

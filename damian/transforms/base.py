@@ -26,7 +26,7 @@ from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.delays.line import Memory
 from damian.delays.samplers import Sampler, streams_for
-from damian.keys import STEPPED
+from damian.keys import DONE, STEPPED
 from damian.transforms.entries import (
     Entries,
     as_rows,
@@ -66,6 +66,8 @@ class StatefulTransform(Transform):
     reset and kept in buffers, which ``state_dict`` saves by reference: clone them before the next step, as
     some are written in place.
 
+    An agent whose own flag ``done`` falls in the middle of an episode has joined it again, and begins anew.
+
     A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before the
     environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform; ``DelayedEnv``
     calls them for several, which compile into one graph. No gradient flows through the memory.
@@ -81,6 +83,8 @@ class StatefulTransform(Transform):
     """One of ``STAGES``."""
     flushes_at_end: bool = False
     """Whether it delivers what is still in transit in the last step of an episode."""
+    is_of_rewards: bool = False
+    """Whether it changes rewards; that of the step in which an agent joins again is of its new life."""
     action_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
@@ -259,10 +263,38 @@ class StatefulTransform(Transform):
         self.require_memory()
         entries = select_entries(next_tensordict, self.step_keys)
         stepped = tensordict.get(STEPPED, None)
-        change = self.on_step(self.memory, entries if stepped is None else entries | {STEPPED: stepped})
+        sent = entries if stepped is None else entries | {STEPPED: stepped}
+        rejoined = self._rejoined_rows(tensordict, next_tensordict)
+        if rejoined is None:
+            change = self.on_step(self.memory, sent)
+        elif self.is_of_rewards:
+            change = self.on_step(self.on_reset(self.memory, entries, rejoined)[0], sent)
+        else:
+            change = self._begin_again(self.on_step(self.memory, sent), entries, rejoined)
         if stepped is not None:
             change = self._only_stepped(change, stepped, tensordict, next_tensordict)
         return self._write(next_tensordict, change)
+
+    @cached_property
+    def _own_done_key(self) -> NestedKey | None:
+        """Key of the flag of each agent that its episode has ended; None if only worlds have one."""
+        path = path_of(self.row_key)
+        return (*path, DONE) if path and (*path, DONE) in self.env.done_keys else None
+
+    def _rejoined_rows(self, before: TensorDictBase, after: TensorDictBase) -> Tensor | None:
+        """The rows whose agents have joined again in a step, [M] bool; None if none can."""
+        key = self._own_done_key
+        ended = None if key is None else before.get(key, None)
+        return None if ended is None else (ended & ~after.get(key)).reshape(-1)
+
+    def _begin_again(self, change: Change, entries: Entries, rows: Tensor) -> Change:
+        """A change after which these rows [M] hold what they send in this step as their first message."""
+        memory, first = self.on_reset(change[0], entries, rows)
+        merged = dict(change[1])
+        for key, new in first.items():
+            begun, old = self.to_rows(new), self.to_rows(merged[key])
+            merged[key] = self.from_rows(torch.where(expand_mask(rows, begun), begun, old))
+        return memory, merged
 
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase

@@ -53,6 +53,7 @@ class RewardDelay(StatefulTransform):
     """
 
     flushes_at_end = True
+    is_of_rewards = True
 
     def __init__(
         self,
@@ -209,6 +210,8 @@ class CumulativeReward(StatefulTransform):
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), CumulativeReward(5, gamma=0.9))
         >>> rollout = env.rollout(200)  # each reward is a discounted sum of the last five
     """
+
+    is_of_rewards = True
 
     def __init__(self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward") -> None:
         checks.whole("steps", steps, 1)

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
 from damian import keys
 from damian.common import checks
@@ -19,7 +19,7 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
-from damian.learners.base import Learner
+from damian.learners.base import Learner, undelayed_talk
 from damian.learners.schedule import SystemClock
 from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage, corrections_of
@@ -62,6 +62,21 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
     checks.require(has_actor, f"{name}: components", [*learner.components()], should)
     return learner
+
+
+def require_delayed_talk(config: TrainConfig, env: EnvBase, learner: Learner) -> None:
+    """Refuse an actor by which UAVs read at once in each other's rows what these know late or never."""
+    own, links = config.observation.own and config.delays.obs.late, config.links.kind
+    if config.learner.talks or not (own or links != "server"):
+        return
+    known = "observation.own=true" if own else f"links={links}"
+    should = (
+        f"has an actor that reads other UAVs' rows, which with {known} hold what each knows at once: attend "
+        "over blocks of a UAV's own row (docs/extending.md), or give learner.talks=true to let UAVs talk so"
+    )
+    with own_code(config.learner.name):
+        talk = undelayed_talk(learner.actor, env)
+    checks.require(not talk, "learner", config.learner.name, should)
 
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:

@@ -5,12 +5,16 @@ import csv
 import pytest
 import torch
 from extensions import TINY
+from helpers import check_refused
 from tensordict import TensorDict
 
 from damian import keys, make_env
+from damian.common.errors import InputError
 from damian.delays.config import LinkConfig
 from damian.envs.config import ScenarioConfig
 from damian.models.actor import make_actor
+from damian.recipes import cli
+from damian.recipes.shared import learning
 from damian.server.config import ObservationConfig
 
 WINDOW = 2
@@ -72,3 +76,50 @@ def test_who_talks_is_trained_and_flown_in_another_number(run):
     flown = run(f"checkpoint={first}", "agents=4", "trust=true", program="evaluate", name="flown")
     with (flown / "result.csv").open(newline="") as file:
         assert float(next(csv.DictReader(file))["return"]) >= 0
+
+
+ROWS, OWN = "learner=extensions:RowsConfig", "observation.own=true"
+
+
+@pytest.mark.parametrize(
+    ("words", "refused"),
+    [
+        ([ROWS, OWN], True),
+        ([ROWS, OWN, "learner.hidden=true"], True),
+        ([ROWS, "links=matrix"], True),
+        ([ROWS, "links=updown", "links.delay=1"], True),
+        ([ROWS], False),
+        ([ROWS, OWN, "delay.obs=0"], False),
+        ([ROWS, OWN, "learner.talks=true"], False),
+        ([OWN], False),
+        ([OWN, "actions.kind=continuous"], False),
+        ([OWN, "model.rnn=gru"], False),
+        ([OWN, "model.shared=false"], False),
+        ([OWN, "observation.belief=[belief_gain]", "model.skip=true"], False),
+        ([OWN, "learner=sac"], False),
+        (
+            ["links=matrix", "observation.global_features=[talking:heard]", "model=talking:AttentionConfig"],
+            False,
+        ),
+    ],
+    ids=str,
+)
+def test_an_actor_by_which_uavs_talk_without_delay_is_refused(example, words, refused):
+    config = cli.settings(*TINY, "delay.obs=3", *words)
+    env = learning.learning_env(config)
+    learner = learning.make_learner(config, env, learning.replay_buffer(config, env))
+    learning.make_collector(env, learner.actor, 64)
+    before = torch.get_rng_state(), [each.clone() for each in learner.actor.parameters()]
+    if refused:
+        with pytest.raises(InputError, match=r"reads other UAVs' rows, .* or give learner\.talks=true"):
+            learning.require_delayed_talk(config, env, learner)
+    else:
+        learning.require_delayed_talk(config, env, learner)
+    after = torch.get_rng_state(), learner.actor.parameters()
+    assert before[0].equal(after[0])
+    assert all(old.equal(new) for old, new in zip(before[1], after[1], strict=True))
+
+
+def test_undelayed_talk_is_refused_before_anything_is_written(run, folder, capsys):
+    check_refused(lambda: run(*TINY, ROWS, OWN, "delay.obs=3"), "observation.own=true hold what each", capsys)
+    assert not [each for each in (folder / "run").rglob("*") if each.is_file()]

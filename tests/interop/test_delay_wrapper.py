@@ -1,5 +1,6 @@
 """Delays of environments of Gymnasium and PettingZoo: as the transforms delay those of TorchRL."""
 
+import copy
 from functools import partial
 
 import gymnasium
@@ -18,6 +19,7 @@ from damian import (
     ActionDelay,
     ActionHistory,
     ContextSampler,
+    CumulativeReward,
     ObservationDelay,
     ObservationTimeline,
     RewardDelay,
@@ -227,6 +229,99 @@ def test_the_losses_of_parts_are_their_own():
         assert info["age"] == {"place": 0, "word": t}
 
 
+LINE = Box(-99, 99, (1,), np.float32)
+
+
+class Overwrites(gymnasium.Env):
+    """Counts its steps in arrays that it keeps and returns, and writes over the actions that it executes."""
+
+    action_space, observation_space = LINE, Dict({"gps": LINE, "camera": LINE})
+
+    def __init__(self):
+        self.count, self.paid, self.executed = np.zeros(1, np.float32), np.zeros(()), []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count[:] = 0
+        return {"gps": self.count, "camera": self.count}, {}
+
+    def step(self, action):
+        self.count += 1
+        self.paid += 1
+        self.executed.append(float(action[0]))
+        action[:] = -5
+        return {"gps": self.count, "camera": self.count}, self.paid, False, False, {}
+
+
+class OneOverwrites(ParallelEnv):
+    """The same for PettingZoo, of one agent."""
+
+    metadata, agents, possible_agents = {"name": "one"}, ["a"], ["a"]
+
+    def __init__(self):
+        self.inner = Overwrites()
+
+    def action_space(self, agent):
+        return LINE
+
+    def observation_space(self, agent):
+        return Overwrites.observation_space
+
+    def reset(self, seed=None, options=None):
+        return tuple({"a": each} for each in self.inner.reset())
+
+    def step(self, actions):
+        return tuple({"a": each} for each in self.inner.step(actions["a"]))
+
+
+class KeepsInfos(gymnasium.vector.VectorWrapper):
+    """Returns the same dict of infos in each step."""
+
+    def step(self, actions):
+        *found, infos = super().step(actions)
+        self.infos = getattr(self, "infos", {})
+        self.infos.update(infos)
+        return *found, self.infos
+
+
+@pytest.mark.parametrize("kind", ["whole", "in parts", "vector", "agent"])
+def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
+    default = np.full(1, 4, np.float32)
+    late = {"observation": 2, "action": 2, "reward": 3, "history": 3, "timeline": 4, "default": default}
+    if kind == "agent":
+        inner = OneOverwrites()
+        env, inner = DelayParallelWrapper(inner, **late | {"default": {"a": default}}), inner.inner
+    elif kind == "vector":
+        vector = SyncVectorEnv([Overwrites] * 2, copy=False)
+        env, inner = DelayVectorWrapper(KeepsInfos(vector), **late), vector.envs[1]
+    else:
+        inner = Overwrites()
+        env = DelayWrapper(inner, **late | ({"observation": {"camera": 2}} if kind == "in parts" else {}))
+    of_agent = {"agent": lambda each: each["a"], "vector": lambda each: each}.get(kind, lambda each: each)
+    shape = (2, 1) if kind == "vector" else (1,)
+    default[:], action, rows = 9, np.zeros(shape, np.float32), []
+    told = of_agent(env.reset(seed=0)[0])
+    for step in range(1, 7):
+        for each in told.values():
+            each[...] = -9
+        action[...] = step
+        found = env.step({"a": action} if kind == "agent" else action)
+        told, reward, info = (of_agent(found[i]) for i in (0, 1, -1))
+        rows.append((copy.deepcopy(told), float(np.max(reward)), info))
+    last = (1,) if kind == "vector" else ()  # the last world
+    seen, rewards, infos = zip(*rows, strict=True)
+    held, now = [0, 0, 1, 2, 3, 4], [1, 2, 3, 4, 5, 6]
+    assert [each["camera"][last].item() for each in seen] == held
+    assert [each["gps"][last].item() for each in seen] == (now if kind == "in parts" else held)
+    assert seen[-1]["timeline"][last][2:, -2 if kind == "in parts" else 0].tolist() == [4, 3]
+    of_actions = [(each["action_history"][last] * 198 - 99).round().tolist() for each in seen]
+    assert of_actions == [[4, 4, 1], [4, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5], [4, 5, 6]]
+    assert inner.executed == [4, 4, 1, 2, 3, 4]
+    assert list(rewards) == [0, 0, 0, 1, 2, 3]
+    ages = [info["age"]["camera"] if kind == "in parts" else info["age"] for info in infos]
+    assert [np.max(age) for age in ages] == [1, 2, 2, 2, 2, 2]
+
+
 DRAWN = {"observation": Uniform(1, 4), "action": 1, "reward": Uniform(0, 3), "loss": 0.2}
 BY_TIME = {"observation": LOSSY, "action": 2, "reward": by_time}  # without chance
 
@@ -357,10 +452,14 @@ def test_the_delays_of_agents_are_those_of_the_transforms(law, given):
 
 
 class Relay(ParallelEnv):
-    """Agents observe the step and what they have executed; b dies in step 5, c comes in step 3."""
+    """Agents observe the step and what they have executed; b dies in step 5, c comes in step 3.
 
-    def __init__(self):
-        self.metadata, self.possible_agents = {"name": "relay"}, ["a", "b", "c"]
+    b may come ``again``, and ``tells`` of its death, or not.
+    """
+
+    def __init__(self, again=None, tells=True, names="abc"):
+        self.again, self.tells = again, tells
+        self.metadata, self.possible_agents = {"name": "relay"}, [*names]
         self.observation_spaces = dict.fromkeys(self.possible_agents, Box(-99.0, 99.0, (2,), np.float32))
         self.action_spaces = dict.fromkeys(self.possible_agents, Discrete(50))
 
@@ -372,16 +471,18 @@ class Relay(ParallelEnv):
 
     def reset(self, seed=None, options=None):
         self.t, self.agents = 0, ["a", "b"]
-        return {agent: np.zeros(2, np.float32) for agent in self.agents}, {"a": {}, "b": {}}
+        infos = {agent: {"t": 0} for agent in self.agents}
+        return {agent: np.zeros(2, np.float32) for agent in self.agents}, infos
 
     def step(self, actions):
-        assert [*actions] == self.agents
+        actions = {agent: actions[agent] for agent in self.agents}  # TorchRL sends those of the dead, too
         self.t += 1
-        present = [*self.agents, *["c"] * (self.t == 3)]
+        present = [*self.agents, *self.possible_agents[2:] * (self.t == 3), *["b"] * (self.t == self.again)]
         ends = {agent: self.t == 9 or (self.t == 5 and agent == "b") for agent in present}
         told = {agent: np.array([self.t, actions.get(agent, -1)], np.float32) for agent in present}
         rewards = {agent: float(10**self.t) for agent in present}
         self.agents = [agent for agent in present if not ends[agent]]
+        ends |= {agent: ended and (self.tells or agent != "b") for agent, ended in ends.items()}
         return told, rewards, ends, dict.fromkeys(present, False), {agent: {"t": self.t} for agent in present}
 
 
@@ -409,6 +510,65 @@ def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
         assert [row[1]["a"] for row in rows] == [0, *(10**t for t in range(1, 8)), 10**8 + 10**9]
         assert rows[4][0]["c"]["timeline"][:, -1].tolist() == [0, 0, 1, 0]
         assert rows[4][0]["a"]["timeline"][:, 0].tolist() == [0, 4, 3, 2]
+
+
+@pytest.mark.parametrize("tells", [True, False])
+@pytest.mark.parametrize("again", [6, 7, 8])
+def test_who_comes_again_begins_anew(again, tells):
+    env = DelayParallelWrapper(Relay(again, tells), {"b": 2}, {"b": 1}, {"b": 3}, history=4, timeline=4)
+    env.reset()
+    rows = []
+    while env.agents:
+        rows.append([of.get("b") for of in env.step(dict.fromkeys(env.agents, 7))])
+    told, rewards = ([row[i] for row in rows] for i in (0, 1))
+    for t in range(again, 10):  # it executes nothing in the step in which it comes, and then its default
+        seen = told[t - 1]
+        last = max(again, t - 2)
+        assert seen["observation"].tolist() == [last, -1 if last == again else 0]
+        assert seen["age"] == t - last
+        chosen = [7 if age < t - again else 0 for age in (3, 2, 1, 0)]
+        assert seen["action_history"].reshape(4, 50).argmax(-1).tolist() == chosen
+        assert seen["timeline"][:, -1].tolist() == [
+            t - age in {again, *range(again, t - 1)} for age in range(4)
+        ]
+    paid = [sum(each for each in part if each) for part in (rewards[:5], rewards[5:])]
+    assert paid == [sum(10**t for t in range(1, 6)), sum(10**t for t in range(again, 10))]
+
+
+@pytest.mark.parametrize("again", [6, 7, 8])
+def test_who_comes_again_begins_anew_in_the_transforms_too(again):
+    observation, action, reward = (("agents", each) for each in ("observation", "action", "reward"))
+    delays = Compose(
+        ActionDelay(1, action),
+        ObservationDelay(LOSSY, observation, ("agents", "held"), delay_key="delay"),
+        RewardDelay(by_time, reward),
+        CumulativeReward(2, reward_key=reward),
+        ActionHistory(3, action),
+        ObservationTimeline(5, observation, delay_key="delay"),
+    )
+    inner, env = (Relay(again, names="ab") for _ in range(2))
+    groups = {"agents": inner.possible_agents}
+    relay = PettingZooWrapper(inner, use_mask=True, done_on_any=False, group_map=groups)
+    reference = TransformedEnv(relay, delays)
+    env = DelayParallelWrapper(env, LOSSY, 1, by_time, history=3, timeline=5)
+    now, earned = reference.reset(), dict.fromkeys("ab", 0.0)
+    env.reset()
+    while env.agents:
+        chosen = env.unwrapped.t + 1
+        now["agents", "action"] = torch.full((2,), chosen)
+        now = reference.step(now)["next"]
+        told, rewards, *_ = env.step(dict.fromkeys(env.agents, chosen))
+        for agent in told:
+            i = env.possible_agents.index(agent)
+            for key in ("held", "age", "timeline"):
+                assert np.array_equal(told[agent][WRITTEN[key]], now["agents", key][i].numpy()), key
+            history = told[agent]["action_history"].reshape(3, 50).argmax(-1)
+            assert np.array_equal(history, (49 * now["agents", "action_history"][i]).round().numpy())
+            expected = rewards[agent] + 0.9 * (
+                0 if env.unwrapped.t == again and agent == "b" else earned[agent]
+            )
+            assert now["agents", "reward"][i].item() == pytest.approx(expected, rel=1e-5)
+        earned |= rewards
 
 
 def test_only_those_who_are_there_send():

@@ -56,7 +56,11 @@ def test_gymnasiums_environment_is_pettingzoos_of_one_uav():
         observation, *told, info = env.step(action)
         observations, *others, infos = other.step({"uav_0": action})
         assert told == [each["uav_0"] for each in others]
-        assert info["action_mask"].tolist() == infos["uav_0"]["action_mask"].tolist()
+        legal = infos["uav_0"]["action_mask"]
+        assert info["action_mask"].tolist() == legal.tolist()
+        info["action_mask"][0] ^= 1  # an agent may write over what it is told
+        assert env.action_masks().tolist() == legal.tolist()
+        info["action_mask"][0] ^= 1
     assert told[1:] == [False, True]
 
 
