@@ -124,7 +124,7 @@ def report(
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
     succeeds = config.episode.can_succeed
-    table = save_results(rows, folder, succeeds, config.delays.obs.late, MEANING)
+    table = save_results(rows, folder, succeeds, env.delays.obs.late, MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
     return rows
 

@@ -145,7 +145,10 @@ def update(
     try:
         torch.set_num_threads(config.threads)
         with own_code(config.learner.name):
-            losses = {name: float(number) for name, number in learner.learn(read_by(config, batch)).items()}
+            losses = {
+                name: float(number)
+                for name, number in learner.learn(read_by(config, env.delays, batch)).items()
+            }
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan
         check_convergence(config, state, {})
         raise

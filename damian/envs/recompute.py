@@ -27,6 +27,7 @@ def server_recompute(
     """
     own = "actor" in corrected and server.observation.own
     observers = {"critic", "actor"}.intersection(corrected) - ({"actor"} if own else set())
+    kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
     believes = server.grid is not None and (own or bool(observers) or server.rewards_belief)
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
@@ -41,7 +42,6 @@ def server_recompute(
         if own:
             sent, own_belief = steps[next_key(keys.MESSAGE)], steps.get(next_key(keys.OWN_BELIEF), None)
             entries[keys.OBSERVATION] = server.observe_with_own_messages(messages, sent, elapsed, own_belief)
-        kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
         return {next_key(key): value for key, value in entries.items() if key not in kept}
 
     return recompute

@@ -1,5 +1,6 @@
 """Settings of the networks and of the learners. A learner's settings name the class that learns with them."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -150,7 +151,7 @@ class LearnerConfig(Settings):
             buffer: replay buffer of ``buffer_size`` steps, on a ``TimeStorage``, or with back-updating on a
                 ``BackupdateStorage``, which corrects what is stored; None if ``buffer_size`` is None.
         """
-        return resolved(self.learner)(env, self, setup, buffer)
+        return resolved(self.learner)(env, copy.deepcopy(self), copy.deepcopy(setup), buffer)
 
     def make_actor(self, env: "EnvBase", model: ModelConfig) -> "ProbabilisticActor":
         """Build an actor as the learner has it, for evaluations, which load its weights."""

@@ -14,6 +14,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.devices import free_memory
 from damian.common.errors import naming_errors
+from damian.delays.scenario import ScenarioDelays
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
@@ -37,7 +38,7 @@ BASE_MEMORY, COPIES = 0.6, 2.6
 def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment of the training, [B], with what the learner and the logs need."""
     triggered = config.clock.trigger is not None
-    messages = backupdates(config) or measures_hindsight(config) or triggered
+    messages = measures_hindsight(config.make_delays()) or triggered
     privileged = config.critic == "privileged"
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
@@ -57,7 +58,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     """The learner, with the replay buffer that it needs."""
     name = config.learner.name
     with own_code(name):
-        learner = config.learner.make(env, learning_setup(config), buffer)
+        learner = config.learner.make(env, learning_setup(config, env.delays), buffer)
         has_actor = "actor" in learner.components()
     should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
     checks.require(has_actor, f"{name}: components", [*learner.components()], should)
@@ -66,12 +67,12 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
-    setup = learning_setup(config)
+    setup = learning_setup(config, env.delays)
     with own_code(config.learner.name):
         size = config.learner.buffer_size(setup)
     if size is None:
         return None
-    if not backupdates(config):
+    if not setup.backupdate:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
     least = setup.least_buffer
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
@@ -84,7 +85,7 @@ def corrected_storage(
     config: TrainConfig, env: DelayedEnv, corrected: Collection[str], size: int, worlds: int
 ) -> BackupdateStorage:
     """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct steps."""
-    late_messages = config.delays.obs.late
+    late_messages = env.delays.obs.late
     corrected = corrected if late_messages else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
     # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
@@ -93,7 +94,7 @@ def corrected_storage(
     return BackupdateStorage(
         size + sum(correction.lookback for correction in corrections) * worlds,
         server_recompute(env.server, corrected) if late_messages else None,
-        config.delays.longest,
+        env.delays.longest,
         corrections=corrections,
         hindsight_key=keys.HINDSIGHT if hindsight else None,
         device=config.device,
@@ -112,10 +113,11 @@ def require_memory(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | 
 
 def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:
     """The returns of the learning curve; None if they are those perceived."""
-    if not measures_hindsight(config):
+    if not measures_hindsight(env.delays):
         return None
     worlds = min(config.worlds, HindsightReturns.WORLDS)
-    size = (learning_setup(config).longest_period + 2 * config.delays.longest) * worlds
+    period = learning_setup(config, env.delays).longest_period
+    size = (period + 2 * env.delays.longest) * worlds
     return HindsightReturns(corrected_storage(config, env, ["reward"], size, worlds), worlds)
 
 
@@ -148,9 +150,9 @@ def ticks(collector: Collector, clock: SystemClock, server: Server) -> Iterator[
         yield batch
 
 
-def read_by(config: TrainConfig, batch: TensorDictBase) -> TensorDictBase:
+def read_by(config: TrainConfig, delays: ScenarioDelays, batch: TensorDictBase) -> TensorDictBase:
     """The entries of a batch [B, T] for the learner, whose replay buffer would keep messages in vain."""
-    if backupdates(config) or "message" in config.learner.reads:
+    if backupdates(config, delays) or "message" in config.learner.reads:
         return batch
     sent = (keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.REWARD_DELAY, keys.EARNED_REWARD)
     return batch.exclude(*sent, *map(keys.next_key, sent))

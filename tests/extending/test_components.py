@@ -65,6 +65,11 @@ def radians(cache):
 def leaks(cache):
     return cache.messages.track.mean(-1, keepdim=True).expand(cache.messages.track.shape) / 7
 
+@feature("local")
+def meets(cache):
+    stops = cache.messages.trail[..., 0]
+    return (stops.sum(-1, keepdim=True).expand(stops.shape) % 7) / 7
+
 @reward_term(reads=["spotted"], scope="system")
 def shared(features, counters):
     return features["spotted"].T
@@ -89,6 +94,7 @@ def seen(name: str) -> dict[str, ObservationConfig]:
     [
         (seen("radians"), r"feature lies:radians: 4 is not between 0 and 1"),
         (seen("leaks"), "lies:leaks: local changes with the messages of other UAVs: make it glob"),
+        (seen("meets"), "lies:meets: local changes with the messages of other UAVs"),
         (
             {"reward": RewardConfig(custom=[{"term": "lies:shared"}])},
             r"reward term shared: shape: \[3, 20\] is not \[20, 3\]",

@@ -82,7 +82,7 @@ def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, m
     found = [config.frames, config.seed, *config.model.hidden, config.worlds, config.episode.max_steps]
     assert found == [1_000_000, 7, 100, 64, 20, 30]
     assert {type(number) for number in found} == {int}
-    assert config.delays.obs.longest == 3
+    assert config.make_delays().obs.longest == 3
     assert damian.ClockConfig(simulation="50ms").steps("agents") == 1
 
 
