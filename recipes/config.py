@@ -1,5 +1,6 @@
 """All settings of the programs but ``damian compare``: those of ``damian train``, which the others extend."""
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,7 +73,9 @@ class TrainConfig(ScenarioConfig):
         checks.require(matches, "learner.name", self.learner.name, problem)
         checks.names("corrected", self.corrected, ("reward", "critic", "actor"))
         self.refuse(not self.corrected, "corrected", "is empty: choose reward, critic or actor")
-        if not self.seeks_source:  # aware=belief suits any task: observe no belief by which nothing is won
+        if self.observation.belief and not self.seeks_source:  # aware=belief suits any task
+            keys = "observation.belief" + " and model.skip" * self.model.skip
+            warnings.warn(f"{keys}: left out, because nothing is won by finding the source", stacklevel=2)
             self.observation = replace(self.observation, belief=[])
             self.model = replace(self.model, skip=False)
 

@@ -131,7 +131,7 @@ def report(
 
 def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
     """The actor, with its prior, as a training of the same seed begins with it."""
-    with torch.random.fork_rng(devices=[]), own_code(config.learner.name):
+    with torch.random.fork_rng(devices=[]), own_code(config.learner):
         torch.manual_seed(config.seed)
         return config.learner.make_actor(env, config.model)
 

@@ -144,7 +144,7 @@ def update(
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(config.threads)
-        with own_code(config.learner.name):
+        with own_code(config.learner):
             losses = {
                 name: float(number)
                 for name, number in learner.learn(read_by(config, env.delays, batch)).items()

@@ -120,8 +120,9 @@ class LearnerConfig(Settings):
 
     reads: ClassVar[tuple[str, ...]] = ()
     """Optional outputs of the environment that the learner needs in its batches: ``message``, ``state``,
-    ``reward_terms`` or ``privileged`` (``damian.make_env``); and ``hindsight``: with back-updating, stored
-    steps then also hold the newest message that has arrived since (``keys.HINDSIGHT``)."""
+    ``reward_terms`` or ``privileged`` (``damian.make_env``); ``timeline``: what ``delay.messages`` adds; and
+    ``hindsight``: with back-updating, stored steps then also hold the newest message that has arrived since
+    (``keys.HINDSIGHT``)."""
     actor_follows_critic: ClassVar[bool] = False
     """Whether the sizes of the actor's layers also follow from what the critic observes."""
     learner: ClassVar[str] = ""

@@ -20,6 +20,7 @@ from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.learners.base import Learner
+from damian.learners.config import LearnerConfig
 from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
@@ -40,7 +41,7 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     triggered = config.clock.trigger is not None
     messages = measures_hindsight(config.make_delays()) or triggered
     privileged = config.critic == "privileged"
-    reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
+    reads = {*config.learner.reads} - {"hindsight", "timeline"}  # from the storage, and delay.messages
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config, config.worlds, config.seed, config.device, extras)
     if config.compiles:
@@ -49,15 +50,16 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     return env
 
 
-def own_code(learner: str) -> AbstractContextManager[None]:
+def own_code(learner: LearnerConfig) -> AbstractContextManager[None]:
     """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
-    return naming_errors(learner) if ":" in learner else nullcontext()
+    built_in = type(learner).__module__ == LearnerConfig.__module__
+    return nullcontext() if built_in else naming_errors(learner.name)
 
 
 def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
     """The learner, with the replay buffer that it needs."""
     name = config.learner.name
-    with own_code(name):
+    with own_code(config.learner):
         learner = config.learner.make(env, learning_setup(config, env.delays), buffer)
         has_actor = "actor" in learner.components()
     should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
@@ -68,7 +70,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
     setup = learning_setup(config, env.delays)
-    with own_code(config.learner.name):
+    with own_code(config.learner):
         size = config.learner.buffer_size(setup)
     if size is None:
         return None

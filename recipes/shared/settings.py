@@ -70,8 +70,8 @@ def check_learning(config: TrainConfig) -> None:
     config.learner.check(learning_setup(config, delays))
     _check_backupdate(config, delays.obs.late)
     messages, name = config.delay.messages, config.learner.name
-    problem = f"is not read by learner={name}, only by a learner of your own: leave it out"
-    checks.require(not messages or ":" in name, "delay.messages", messages, problem)
+    problem = f"is not read by learner={name}, whose reads have no timeline: leave it out"
+    checks.require(not messages or "timeline" in config.learner.reads, "delay.messages", messages, problem)
 
 
 def _check_backupdate(config: TrainConfig, late_messages: bool) -> None:
