@@ -6,10 +6,11 @@ from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, rules, setting
-from damian.compare.config import SCORES, STORED
+from damian.compare.config import STORED
 from damian.envs.config import ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.runs.config import LoggerConfig
+from damian.runs.measures import check_score
 
 FORMATS = ("gif", "mp4", "png", "html", "geojson")
 FILMS = FORMATS[:2]
@@ -36,6 +37,7 @@ class TrainConfig(ScenarioConfig):
         None, "Stop after this number of episodes, if that comes before ``frames``.", low=1, high=1e12
     )
     eval_episodes: int = setting(200, "Episodes of each evaluation.", low=1, high=checks.WORLDS)
+    metrics: list[str] = setting([], "Further metrics of evaluations, such as package.module:name.")
     eval_every: int | None = setting(None, "Updates between two evaluations on the way.", low=1, high=1e12)
     checkpoint_every: int = setting(
         20, "Updates between two checkpoints: what a killed run loses at most.", low=1, high=1e12
@@ -193,10 +195,11 @@ class ResultsConfig(Settings):
     """All settings of ``damian results``."""
 
     folders: list[str] = setting([], "Folder of a run, a sweep or a comparison; or two folders to compare.")
-    score: str = setting("return", "Measure whose differences the table of two folders has.", choices=SCORES)
+    score: str = setting("return", "Metric whose differences the table of two folders has.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_score(self.score)
         self.refuse(len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare")
 
 

@@ -112,7 +112,7 @@ def report(
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
         env.set_seed(config.eval_seed)  # the same episodes for every policy
-        return evaluate(env, policy, config.horizon, sample)
+        return evaluate(env, policy, config.horizon, sample, config.metrics)
 
     random, rows = fly(random_policy(env)), {}
     for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():

@@ -5,6 +5,7 @@ from damian.common import checks
 from damian.delays.scenario import ScenarioDelays
 from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
+from damian.runs.measures import METRICS
 from damian.runs.metrics_log import read_logger
 from damian.server.features import check_features
 from damian.server.rewards import terms_of
@@ -59,6 +60,8 @@ def check_components(config: TrainConfig) -> ScenarioDelays:
     check_features(config.observation)
     terms_of(config.reward)
     sensors_of(config.sensors)
+    for name in config.metrics:
+        METRICS.get(name, "metrics")
     for written in config.logger.custom:
         read_logger(written)
     return delays

@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from damian.compare.comparison import MEASURED, RANDOM, TRAINED, UNTRAINED, Comparison, Method, shown
+from damian.compare.comparison import RANDOM, TRAINED, UNTRAINED, Comparison, Method, shown
 from damian.compare.report import markdown
+from damian.runs.measures import BUILT_IN
 
 LIKELIEST = f"{TRAINED}, deterministic"
 METHODS = {
@@ -22,7 +23,11 @@ def row(task: str, delay: str, method: str, seed: int, value: float, policy: str
     """A row of results in which every measure has the same value."""
     labels = {"task": task, "delay": delay, "method": method, "regime": "late data"}
     labels |= {"seed": seed, "policy": policy}
-    return labels | {"frames": 400, "seconds": 36.0} | dict.fromkeys((*MEASURED, "episodes"), value)
+    return (
+        labels
+        | {"frames": 400, "seconds": 36.0}
+        | dict.fromkeys(("backupdated", "episodes", *BUILT_IN), value)
+    )
 
 
 def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
