@@ -127,7 +127,7 @@ class Comparison:
     @property
     def measured(self) -> list[str]:
         """Measures whose means over seeds are shown: the score, other metrics, ``CORRECTED``."""
-        return [*sorted(measured_in(self.rows), key=lambda name: name != self.score), CORRECTED]
+        return [*measured_in(self.rows, self.score), CORRECTED]
 
     @cached_property
     def curves(self) -> dict[tuple[Any, ...], list[pd.DataFrame]]:

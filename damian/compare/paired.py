@@ -23,10 +23,9 @@ DIFFERENCE = (
 def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> pd.DataFrame:
     """A line for each policy of each group: means over seeds, and differences to the first value."""
     succeeds, lines = (rows["success_rate"] > 0).any(), []
-    known = {name: declared(name) for name in measured_in(rows)}
-    shown_here = [name for name, each in known.items() if "sweep" in each.tables]
-    measures = [score, *(n for n in shown_here if succeeds or known[n].where != "success")]
-    measures = list(dict.fromkeys(measures))
+    known = {name: declared(name) for name in measured_in(rows, score)}
+    measures = [name for name, each in known.items() if name == score or "sweep" in each.tables]
+    measures = [name for name in measures if name == score or succeeds or known[name].where != "success"]
     for names, runs in rows.groupby([*groups, "policy"], sort=False):
         labels = dict(zip([*groups, "policy"], names, strict=True))
         group = ", ".join(f"{key}={labels[key]}" for key in groups) or "all runs"

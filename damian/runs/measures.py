@@ -5,22 +5,20 @@ Nothing here imports torch, so that settings can name metrics.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from damian.common import checks
 from damian.common.registry import Registry
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from damian.runs.metrics import Flights
+Compute = Callable[[Any], Any]
+"""Function from ``damian.runs.metrics.Flights`` to a tensor of numbers, or a number."""
 
 
 @dataclass(frozen=True)
 class Metric:
     """A number of an evaluation; ``damian.metric`` declares one of your own."""
 
-    compute: "Callable[[Flights], Tensor | float]"
+    compute: Compute
     """Function from the flights to numbers, whose mean is the metric."""
     better: str = ""
     """``higher`` or ``lower``; with neither, methods cannot be compared by it."""
@@ -36,7 +34,7 @@ METRICS = Registry[Metric]("metric", Metric, "is not a metric: decorate a functi
 """Metrics by name; those outside the package as ``package.module:name``."""
 
 
-def metric(better: str = "", **declared: Any) -> Callable[["Callable[[Flights], Tensor | float]"], Metric]:
+def metric(better: str = "", **declared: Any) -> Callable[[Compute], Metric]:
     """Decorator of a function from ``Flights`` to numbers; the others are fields of ``Metric``."""
     checks.one_of("better", better, ("", "higher", "lower"))
     return lambda compute: Metric(compute, better, **declared)
@@ -58,9 +56,7 @@ def check_score(name: str) -> None:
 _UNKNOWN = Metric(lambda _: float("nan"))
 
 
-def _add(
-    name: str, compute: "Callable[[Flights], Tensor | float]", better: str = "", **declared: Any
-) -> None:
+def _add(name: str, compute: Compute, better: str = "", **declared: Any) -> None:
     METRICS.register(name)(Metric(compute, better, **declared))
 
 

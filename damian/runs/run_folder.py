@@ -7,6 +7,7 @@ from pathlib import Path
 import pandas as pd
 from filelock import FileLock, Timeout
 
+from damian.common import checks
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError
 from damian.common.tables import markdown_table, read_csv, write_csv
@@ -92,10 +93,12 @@ def read_results(path: Path) -> pd.DataFrame:
     return table.reindex(columns=list(dict.fromkeys((*table, *BUILT_IN)))) if len(table) else table
 
 
-def measured_in(table: pd.DataFrame) -> list[str]:
-    """Metrics of a table of evaluations: the columns behind the number of episodes."""
+def measured_in(table: pd.DataFrame, score: str) -> list[str]:
+    """Metrics of a table of evaluations, the columns behind the number of episodes, first the score."""
     names = [*map(str, table)]
-    return names[names.index("episodes") + 1 :]
+    metrics = names[names.index("episodes") + 1 :]
+    checks.require(score in metrics, "score", score, f"is not stored, only {', '.join(metrics)}")
+    return [score, *(name for name in metrics if name != score)]
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:

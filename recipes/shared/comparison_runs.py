@@ -25,6 +25,7 @@ from damian.common.errors import InputError, RunError
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, OF_METHOD, RUN, Method, regime
 from damian.compare.config import CompareConfig, HeldOut
 from damian.compare.figures import LABELS
+from damian.runs.measures import BUILT_IN
 from damian.runs.metrics_log import read_metrics
 from damian.runs.processes import each_in_processes
 from damian.runs.run_folder import RESULTS, read_results
@@ -92,6 +93,9 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
     succeeds = any(run.config.episode.can_succeed for run in runs)
     should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
     checks.require(succeeds or "success" not in config.score, "score", config.score, should)
+    measured = all(config.score in (*BUILT_IN, *run.config.metrics) for run in runs)
+    should = f"is not measured by every run: add overrides=['metrics=[{config.score}]']"
+    checks.require(measured, "score", config.score, should)
     return sorted(runs, key=lambda run: (run.stage, run.config.seed))
 
 
