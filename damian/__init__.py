@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from damian.recipes.results import results as results  # type: ignore[import-not-found]
     from damian.recipes.shared.environments import compose_scenario as compose_scenario  # type: ignore[import-not-found]
     from damian.replay.backupdate import BackupdateStorage as BackupdateStorage
+    from damian.runs.measures import metric as metric
     from damian.server.features import feature as feature
     from damian.server.rewards import reward_term as reward_term
     from damian.transforms import ActionDelay as ActionDelay
@@ -60,6 +61,7 @@ _MODULES = {
     "damian.models.config": ["ModelConfig"],
     "damian.envs.uav_env": ["UavEnv"],
     "damian.recipes.evaluate": ["load"],
+    "damian.runs.measures": ["metric"],
     "damian.recipes.results": ["results"],
     "damian.recipes.shared.environments": ["compose_scenario"],
     "damian.replay.backupdate": ["BackupdateStorage"],

@@ -1,15 +1,17 @@
 """All settings of the programs but ``damian compare``: those of ``damian train``, which the others extend."""
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, rules, setting
-from damian.compare.config import SCORES, STORED
+from damian.compare.config import STORED
 from damian.envs.config import ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig
 from damian.models.config import MODELS, MlpConfig, ModelConfig
 from damian.runs.config import LoggerConfig
+from damian.runs.measures import check_score
 
 FORMATS = ("gif", "mp4", "png", "html", "geojson")
 FILMS = FORMATS[:2]
@@ -36,6 +38,7 @@ class TrainConfig(ScenarioConfig):
         None, "Stop after this number of episodes, if that comes before ``frames``.", low=1, high=1e12
     )
     eval_episodes: int = setting(200, "Episodes of each evaluation.", low=1, high=checks.WORLDS)
+    metrics: list[str] = setting([], "Further metrics of evaluations, such as package.module:name.")
     eval_every: int | None = setting(None, "Updates between two evaluations on the way.", low=1, high=1e12)
     checkpoint_every: int = setting(
         20, "Updates between two checkpoints: what a killed run loses at most.", low=1, high=1e12
@@ -75,7 +78,9 @@ class TrainConfig(ScenarioConfig):
             checks.require(matches, f"{key}.name", section.name, problem)
         checks.names("corrected", self.corrected, ("reward", "critic", "actor"))
         self.refuse(not self.corrected, "corrected", "is empty: choose reward, critic or actor")
-        if not self.seeks_source:  # aware=belief suits any task: observe no belief by which nothing is won
+        if self.observation.belief and not self.seeks_source:  # aware=belief suits any task
+            keys = "observation.belief" + " and model.skip" * self.model.skip
+            warnings.warn(f"{keys}: left out, because nothing is won by finding the source", stacklevel=2)
             self.observation = replace(self.observation, belief=[])
             self.model = replace(self.model, skip=False)
 
@@ -193,10 +198,11 @@ class ResultsConfig(Settings):
     """All settings of ``damian results``."""
 
     folders: list[str] = setting([], "Folder of a run, a sweep or a comparison; or two folders to compare.")
-    score: str = setting("return", "Measure whose differences the table of two folders has.", choices=SCORES)
+    score: str = setting("return", "Metric whose differences the table of two folders has.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_score(self.score)
         self.refuse(len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare")
 
 

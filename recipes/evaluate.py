@@ -112,7 +112,7 @@ def report(
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
         env.set_seed(config.eval_seed)  # the same episodes for every policy
-        return evaluate(env, policy, config.horizon, sample)
+        return evaluate(env, policy, config.horizon, sample, config.metrics)
 
     random, rows = fly(random_policy(env)), {}
     for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():
@@ -124,14 +124,14 @@ def report(
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
     succeeds = config.episode.can_succeed
-    table = save_results(rows, folder, succeeds, config.delays.obs.late, MEANING)
+    table = save_results(rows, folder, succeeds, env.delays.obs.late, MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
     return rows
 
 
 def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
     """The actor, with its prior, as a training of the same seed begins with it."""
-    with torch.random.fork_rng(devices=[]), own_code(config.learner.name):
+    with torch.random.fork_rng(devices=[]), own_code(config.learner):
         torch.manual_seed(config.seed)
         return config.learner.make_actor(env, config.model)
 

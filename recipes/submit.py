@@ -7,7 +7,6 @@ The runs come from `damian compare` with the experiment delaybench, or one of yo
 """
 
 import shlex
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from damian.runs.run_folder import CHECKPOINT, RESULTS, read_results
 from damian.runs.run_record import read_record
 
 from . import cli
-from .config import SubmitConfig
+from .config import SubmitConfig, TrainConfig
 from .known import key_of
 from .shared.comparison_runs import stored_results
 from .shared.runs import changed_settings
@@ -46,6 +45,7 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
     checks.one_of("method", method, [*rows["method"].unique()])
     rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
     words = words_of_tasks(experiment)
+    composed = cache(cli.settings)  # the same for all runs of a task
     facts, trained = list[dict[str, object]](), dict[tuple[str, str], Path]()
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
         run = folder / task / delay / method / f"seed_{seed}"
@@ -56,7 +56,7 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
         told = {name: record.get(name) for name in ("damian", "commit")}
         facts.append({"return": found[TRAINED], "settings": shlex.join(settings), **told})
         if (task, delay) in words:
-            check_task(run, words[task, delay])
+            check_task(run, composed(*words[task, delay]))
         if (run / CHECKPOINT).exists():  # flights elsewhere have no networks
             trained[task, delay] = run  # those of all seeds have the same sizes
     known = rows.drop(columns=["return"]).join(pd.DataFrame(facts))
@@ -70,14 +70,11 @@ def words_of_tasks(experiment: Experiment) -> dict[tuple[str, str], list[str]]:
     return {(task, delay): [*tasks[task], *delays[delay]] for task in tasks for delay in delays}
 
 
-def check_task(run: Path, words: Sequence[str]) -> None:
+def check_task(run: Path, asked_for: TrainConfig) -> None:
     """Require that a run was in the task, under the delay, and for the steps that these settings state."""
-    for key, found, asked in changed_settings(_composed(*words), run, "folder"):
+    for key, found, asked in changed_settings(asked_for, run, "folder"):
         of_task = f"{key}.".startswith(OF_TASKS)
         checks.require(not of_task, f"{run}: {key}", found, f"is not {asked}, as the task has it")
-
-
-_composed = cache(cli.settings)  # the same for all runs of a task
 
 
 def parameters(run: Path) -> int:

@@ -83,7 +83,7 @@ def train(config: TrainConfig, folder: Path) -> None:
                 frames = state.progress.frames
                 log.show(frames, {"steps_per_second": batch.numel() / (time.perf_counter() - began)})
                 if eval_env and state.progress.updates % cast(int, config.eval_every) == 0:
-                    log.show(frames, evaluate_meanwhile(config, eval_env, learner).row("eval/"))
+                    log.show(frames, grouped("eval/", evaluate_meanwhile(config, eval_env, learner)))
                 began = time.perf_counter()
                 bar.set_postfix({name: f"{mean:.2f}" for name, mean in state.episodes.means().items()})
                 bar.update(counted(config, state) - bar.n)
@@ -92,8 +92,9 @@ def train(config: TrainConfig, folder: Path) -> None:
         if interrupt.asked:
             end_interrupted(f"continue with resume={folder}", interrupt.asked)
         evaluations = report(config, folder, eval_env or make_eval_env(config), learner.actor)
-        log.show(state.progress.frames, evaluations[TRAINED].row("eval/"))
-        log.show(state.progress.frames, evaluations[TRAINED + DETERMINISTIC].row("eval_deterministic/"))
+        log.show(state.progress.frames, grouped("eval/", evaluations[TRAINED]))
+        likeliest = evaluations[TRAINED + DETERMINISTIC]
+        log.show(state.progress.frames, grouped("eval_deterministic/", likeliest))
     module, _, name = config.learner.name.partition(":")
     title = f"{config.agents} UAVs, {name or module.upper()}"
     plot_learning_curve(log.rows, evaluations, folder / FIGURE, title)
@@ -101,11 +102,16 @@ def train(config: TrainConfig, folder: Path) -> None:
     print(f"fly this policy: damian fly checkpoint={shlex.quote(str(folder))}")
 
 
+def grouped(group: str, evaluation: Evaluation) -> dict[str, float]:
+    """An evaluation with the name of a group before each of its names."""
+    return {group + name: number for name, number in evaluation.items()}
+
+
 def evaluate_meanwhile(config: TrainConfig, env: DelayedEnv, learner: Learner) -> Evaluation:
     """Evaluate the policy during its training, which afterwards draws the same as without."""
     kept = RandomState().state_dict()
     env.set_seed(config.eval_seed)
-    found = evaluate(env, learner.actor, config.horizon)
+    found = evaluate(env, learner.actor, config.horizon, metrics=config.metrics)
     RandomState().load_state_dict(kept)
     return found
 
@@ -146,8 +152,11 @@ def update(
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(config.threads)
-        with own_code(config.learner.name):
-            losses = {name: float(number) for name, number in learner.learn(read_by(config, batch)).items()}
+        with own_code(config.learner):
+            losses = {
+                name: float(number)
+                for name, number in learner.learn(read_by(config, env.delays, batch)).items()
+            }
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan
         check_convergence(config, state, {})
         raise

@@ -8,7 +8,7 @@ from torch import nn
 import damian
 from damian import keys
 from damian.learners.config import MappoConfig
-from damian.models.XX import with_distribution
+from damian.models.distribution import with_distribution
 
 TINY = ["frames=128", "worlds=4", "learner.steps=16", "eval_episodes=3", "model.hidden=[8]", "logger=csv"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]

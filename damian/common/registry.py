@@ -61,7 +61,7 @@ class Registry(Generic[T]):
 
     def __init__(self, kind: str, fits: type | Callable[[Any], bool], problem: str) -> None:
         self.kind, self._fits, self._problem = kind, fits, problem
-        self._components: dict[str, T] = {}  # also imported ones: a compiled step cannot import anything
+        self._components: dict[str, T] = {}  # registered ones, and those that ``get`` has imported last
 
     def register(self, name: str) -> Callable[[Component], Component]:
         """Decorator that adds a component under a name."""
@@ -76,18 +76,18 @@ class Registry(Generic[T]):
 
     def get(self, name: Any, key: str) -> T:
         """The component with this name or path; errors name the setting ``key``."""
-        if isinstance(name, str) and ":" not in name and name not in self:
-            load_plugins()
-        if name in self:
-            return self._components[name]
         if not isinstance(name, str) or ":" not in name:
+            if name not in self:
+                load_plugins()
+            if name in self:
+                return self._components[name]
             known = f"one of {', '.join(self)}, nor " if [*self] else ""
             raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
         door = _door.get()
-        if door and not door.trust and name not in door.named:
+        if door and not door.trust and name not in door.named and name not in self:
             remedy = "repeat that override, or add trust=true if you know where the run comes from"
             raise InputError(f"{key}: this run uses code outside DAMIAN ({name}): {remedy}")
-        component = _import_path(name, key)
+        component = _import_path(name, key)  # each time, because a module may have been loaded again
         fits = self._fits
         good = isinstance(component, fits) if isinstance(fits, type) else fits(component)
         checks.require(good, key, name, self._problem)
@@ -101,6 +101,10 @@ class Registry(Generic[T]):
         path = written[entry]
         parameters = {str(name): value for name, value in written.items() if name != entry}
         return path, self.get(path, f"{key}.{entry}"), parameters
+
+    def __getitem__(self, name: str) -> T:
+        """The component that ``get`` has found last: a compiled step cannot import anything."""
+        return self._components[name]
 
     def __iter__(self) -> Iterator[str]:
         """Registered names, in order of registration."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from damian.compare.config import LESS_IS_BETTER, SCORES, Method
+from damian.compare.config import Method
 from damian.compare.statistics import (
     Floats,
     bootstrap,
@@ -17,7 +17,8 @@ from damian.compare.statistics import (
     probability_of_improvement,
     recovery,
 )
-from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED
+from damian.runs.measures import declared
+from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, measured_in
 
 SCRIPTED = (RANDOM, SCRIPT)
 """Policies that fly the same episodes beside each method, and learn nothing."""
@@ -27,10 +28,8 @@ HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed method."""
-MEASURED = (*SCORES, "age", "late", "lost", "backupdated")
-"""Measures whose means over seeds are shown: most are of an ``Evaluation``."""
-SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
-"""Measures whose intervals end at 0 and at 1."""
+CORRECTED = "backupdated"
+"""Share of the steps of a training whose rewards late messages have changed."""
 COMPARED = ("J_norm", "recovery", "improvement")
 """Statistics of a method under a delay (``normalised``, ``recovery``, ``probability_of_improvement``). The
 naive method in them is the strongest of the same track: late data only, or simulator allowed."""
@@ -40,9 +39,8 @@ RUN = ["task", "delay", "method", "seed"]
 """Columns of results that name a run."""
 ENDS = ("", "_low", "_high")
 """Endings of the columns that hold a value and the ends of its 95 % interval."""
-COLUMNS = ["task", "delay", "method", "regime", "policy", "seeds", "compared_seeds"]
-COLUMNS += [name + end for name in (*MEASURED, *COMPARED) for end in ENDS]
-"""Columns of ``Comparison.table``."""
+LABELLED = ["task", "delay", "method", "regime", "policy", "seeds", "compared_seeds"]
+"""First columns of ``Comparison.table``."""
 
 
 def regime(methods: Mapping[str, Method], name: str) -> str:
@@ -75,7 +73,7 @@ def _estimates(
 def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
     """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for each seed."""
     found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1), _scores(runs))
-    shares = [name + end for name in SHARES for end in ENDS if name in runs]
+    shares = [n + end for n in map(str, runs) for end in ENDS if declared(n).share or n == CORRECTED]
     return found | {name: float(np.clip(found[name], 0, 1)) for name in shares}
 
 
@@ -84,6 +82,11 @@ def improvement(scores: Floats, others: Floats) -> dict[str, float]:
     probability = float(probability_of_improvement(scores, others))
     ends = (probability, *improvement_interval(probability, len(scores)))
     return {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
+
+
+def sign_of(score: str) -> int:
+    """1 if higher values of a metric are better, -1 if lower ones are."""
+    return -1 if declared(score).better == "lower" else 1
 
 
 def _scores(runs: pd.DataFrame) -> Floats:
@@ -96,7 +99,7 @@ class Comparison:
     """Results of all runs, and the statistics that follow from them.
 
     ``rows`` has an evaluation of each run and policy: task, delay, method, regime, seed, policy, episodes,
-    ``MEASURED``, and of the run ``frames`` (environment steps in training) and ``seconds``. ``points`` are
+    its metrics, and of the run ``frames`` (environment steps in training) and ``seconds``. ``points`` are
     those of learning curves: task, delay, method, seed, frames, episodes, and measures in training. Unknown
     or meaningless numbers are nan.
     """
@@ -121,6 +124,11 @@ class Comparison:
         found = self.rows.loc[self.rows["task"] == task, "delay"].unique()
         return [name for name in found if name != NOT_LATE]
 
+    @property
+    def measured(self) -> list[str]:
+        """Measures whose means over seeds are shown: the score, other metrics, ``CORRECTED``."""
+        return [*measured_in(self.rows, self.score), CORRECTED]
+
     @cached_property
     def curves(self) -> dict[tuple[Any, ...], list[pd.DataFrame]]:
         """Points of the learning curves by task, delay and method, a table for each seed."""
@@ -135,8 +143,12 @@ class Comparison:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A line for each task, delay, method and policy, with ``COLUMNS``; first the undelayed method."""
-        return pd.DataFrame(self._lines(), columns=COLUMNS)
+        """A line for each task, delay, method and policy, first the undelayed method.
+
+        Behind the columns ``LABELLED`` stand those of ``measured`` and ``COMPARED``, three each (``ENDS``).
+        """
+        columns = [name + end for name in (*self.measured, *COMPARED) for end in ENDS]
+        return pd.DataFrame(self._lines(), columns=[*LABELLED, *columns])
 
     def _lines(self) -> Iterator[dict[str, Any]]:
         for task in self.tasks():
@@ -154,7 +166,7 @@ class Comparison:
                     line |= {"seeds": len(runs), "regime": known, "compared_seeds": 0}
                     if name == method and policy == self.policy_of(method) and delay != NOT_LATE:
                         line |= self._compared(scores, method)
-                    yield line | means_over_seeds(runs[[*MEASURED]])
+                    yield line | means_over_seeds(runs[self.measured])
 
     @cached_property
     def _runs(self) -> dict[tuple[Any, ...], pd.DataFrame]:
@@ -171,7 +183,7 @@ class Comparison:
         of |= {method: (delay, method, self.policy_of(method)) for method in self._present(task, delay)}
         none = pd.DataFrame({self.score: []}, dtype=float)
         found = {name: self._runs.get((task, *key), none)[self.score] for name, key in of.items()}
-        return pd.DataFrame(found).sort_index() * (-1 if self.score in LESS_IS_BETTER else 1)
+        return pd.DataFrame(found).sort_index() * sign_of(self.score)
 
     def _present(self, task: str, delay: str) -> list[str]:
         """Methods that have a finished run of a task under a delay."""

@@ -6,14 +6,10 @@ from typing import Any, ClassVar
 
 from damian.common import checks
 from damian.common.fields import Settings, setting
+from damian.runs.measures import check_score
 
 MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
-_MEASURES = ("return", "success_rate", "steps")
-SCORES = (*_MEASURES, *(f"perceived_{name}" for name in _MEASURES))
-"""Measures by which methods can be compared; the first ones are from messages without delay."""
-LESS_IS_BETTER = ("steps", "perceived_steps")
-"""Scores for which lower values are better."""
 STORED = ("sampled", "deterministic")
 """Policies of a checkpoint: its actions are drawn, or the most likely ones."""
 SEEDS = 10
@@ -113,13 +109,14 @@ class CompareConfig(Settings):
     methods: list[str] | None = setting(None, "Methods to run; all of the experiment's if not given.")
     overrides: list[str] = setting([], "Further overrides of ``damian train`` for every run.")
     score: str = setting(
-        "return", "Measure that counts, as it truly was, or as the server perceived it.", choices=SCORES
+        "return", "Metric that counts: return, success_rate, steps, perceived_return, ..., or your own."
     )
     report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
     keep: bool = setting(False, "Keep the results of runs whose folders are gone, and run only the others.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_score(self.score)
         for word in self.overrides:
             ours = word.lstrip("+~").partition("=")[0].partition(".")[0] in SET_BY_COMPARISON
             problem = "cannot be the same for every run: the comparison sets it; leave it out"

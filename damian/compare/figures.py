@@ -15,8 +15,7 @@ from matplotlib.ticker import EngFormatter
 from pandas.api.types import is_numeric_dtype
 
 from damian.common.plotting import STYLE, save_figure
-from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method
-from damian.compare.config import LESS_IS_BETTER
+from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method, sign_of
 from damian.compare.statistics import Floats, bootstrap, normalised
 from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
 
@@ -85,7 +84,7 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
             style = _LEVEL | {"linestyle": line}
             axis.axvline(level, **style)
             if name == comparison.undelayed and naive:
-                best = min(naive) if score in LESS_IS_BETTER else max(naive)
+                best = min(naive) if sign_of(score) < 0 else max(naive)
                 axis.axvspan(best, level, color="0.92", zorder=0)
         axis.set_yticks(range(len(shown)), [name for name, _ in shown])
         axis.invert_yaxis()

@@ -5,12 +5,11 @@ from collections.abc import Sequence
 import pandas as pd
 
 from damian.common.tables import markdown_table
-from damian.compare.comparison import improvement, means_over_seeds, shown
-from damian.compare.config import LESS_IS_BETTER
+from damian.compare.comparison import improvement, means_over_seeds, shown, sign_of
 from damian.compare.statistics import FEWEST
+from damian.runs.measures import declared
+from damian.runs.run_folder import measured_in
 
-MEASURES = ["return", "success_rate", "steps", "perceived_return", "age"]
-"""Measures of the table of a sweep; success and steps only where some run succeeds."""
 NOTE = (
     f"n: runs, one for each seed; [95 % interval over runs, none below {FEWEST}]; perceived: as far as the "
     "server knew"
@@ -24,8 +23,9 @@ DIFFERENCE = (
 def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> pd.DataFrame:
     """A line for each policy of each group: means over seeds, and differences to the first value."""
     succeeds, lines = (rows["success_rate"] > 0).any(), []
-    measures = [name for name in MEASURES if succeeds or name not in ("success_rate", "steps")]
-    measures = list(dict.fromkeys([*measures, score]))
+    known = {name: declared(name) for name in measured_in(rows, score)}
+    measures = [name for name, each in known.items() if name == score or "sweep" in each.tables]
+    measures = [name for name in measures if name == score or succeeds or known[name].where != "success"]
     for names, runs in rows.groupby([*groups, "policy"], sort=False):
         labels = dict(zip([*groups, "policy"], names, strict=True))
         group = ", ".join(f"{key}={labels[key]}" for key in groups) or "all runs"
@@ -43,7 +43,7 @@ def difference(runs: pd.DataFrame, others: pd.DataFrame, score: str) -> dict[str
     if pairs.empty:
         return {}
     new, old = pairs[f"{score}_x"], pairs[f"{score}_y"]
-    sign = -1 if score in LESS_IS_BETTER else 1
+    sign = sign_of(score)
     found = means_over_seeds(pd.DataFrame({"difference": new - old}))
     return found | improvement(sign * new.to_numpy(), sign * old.to_numpy())
 
@@ -51,7 +51,8 @@ def difference(runs: pd.DataFrame, others: pd.DataFrame, score: str) -> dict[str
 def as_table(lines: pd.DataFrame, groups: Sequence[str], score: str = "return") -> str:
     """Lines of means as a Markdown table, with a note on its columns."""
     head = [*groups, "policy", "n"]
-    measures = [name for name in dict.fromkeys([*MEASURES, score]) if name in lines]
+    known = [name.removesuffix("_low") for name in map(str, lines) if name.endswith("_low")]
+    measures = [name for name in known if name not in ("difference", "improvement")]
     columns, note = {name: name for name in measures}, NOTE
     if "difference" in lines:
         columns |= {"difference": "difference", "improvement": "P > first"}

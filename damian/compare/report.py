@@ -10,7 +10,6 @@ from damian.common.tables import markdown_table
 from damian.compare.comparison import (
     COMPARED,
     HELD_OUT_MARK,
-    MEASURED,
     NOT_LATE,
     RUN,
     SCRIPTED,
@@ -32,20 +31,20 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
             trained = "Policies of another task."
         for delay in comparison.delays(task) or [NOT_LATE]:
             lines = table[(table["task"] == task) & table["delay"].isin([NOT_LATE, delay])]
-            parts += [f"## {task}, delay {delay}", trained, _table(lines)]
+            parts += [f"## {task}, delay {delay}", trained, _table(lines, comparison.measured)]
             if delay != NOT_LATE:
                 parts += _steps(comparison, task, delay)
     return "\n\n".join(parts) + "\n"
 
 
-def _table(lines: pd.DataFrame) -> str:
+def _table(lines: pd.DataFrame, measures: Sequence[str]) -> str:
     rows = []
     for line in lines.to_dict("records"):
         undelayed = " (undelayed)" if line["delay"] == NOT_LATE and line["method"] in SCRIPTED else ""
         labels = (line["method"] + undelayed, line["regime"], line["policy"], line["seeds"])
-        measured, compared = ([shown(line, name) for name in names] for names in (MEASURED, COMPARED))
+        measured, compared = ([shown(line, name) for name in names] for names in (measures, COMPARED))
         rows.append([*labels, *measured, line["compared_seeds"] or "-", *compared])
-    measured = [name.replace("_", " ") for name in MEASURED]
+    measured = [name.replace("_", " ") for name in measures]
     head = ["method", "regime", "policy", "n", *measured, "n compared", *COMPARED[:-1], "P > naive"]
     return markdown_table(head, rows, left=3)
 

@@ -1,4 +1,4 @@
-"""The delays of a scenario as one object, whose laws are resolved once from the settings."""
+"""The delays of a scenario as one object, whose laws are resolved from the settings."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from damian.delays.samplers import HeldSampler, LossSampler, Sampler
 
 
 class ScenarioDelays:
-    """The samplers of all that can be late in a scenario; ``ScenarioConfig.delays`` makes it once.
+    """The samplers of all that can be late in a scenario, made by ``ScenarioConfig.make_delays``.
 
     With ``draws_loss``, the loss of messages to the server differs by world and episode (``randomise``).
     Raises ``InputError`` if a law is wrong, reads what no message carries, or loses rewards.
@@ -44,12 +44,3 @@ class ScenarioDelays:
     def longest(self) -> int:
         """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
         return max(self.obs.longest, self.rew.longest)
-
-
-def delays_of(delay: DelayConfig, links: LinkConfig, dt: float, draws_loss: bool = False) -> ScenarioDelays:
-    """The delays of these settings, which ``delay`` keeps for as long as none of them changes."""
-    kept, written = vars(delay).setdefault("_delays", {}), repr((delay, links, dt, draws_loss))
-    if written not in kept:
-        kept.clear()
-        kept[written] = ScenarioDelays(delay, links, dt, draws_loss)
-    return kept[written]

@@ -109,12 +109,11 @@ class ScenarioConfig(WorldConfig):
         problem = "needs source.motion=dynamic and source.after_walk=stop"
         self.refuse(episode.end_with_source and not stops, "episode.end_with_source", problem)
 
-    @property
-    def delays(self) -> "ScenarioDelays":
-        """The samplers of all delays; laws are resolved at the first use, and again if settings change."""
-        from damian.delays.scenario import delays_of  # noqa: PLC0415 (settings load without torch)
+    def make_delays(self) -> "ScenarioDelays":
+        """Resolve the laws of all delays to samplers, which reads the files of traces."""
+        from damian.delays.scenario import ScenarioDelays  # noqa: PLC0415 (settings load without torch)
 
-        return delays_of(self.delay, self.links, self.clock.dt, "delay.loss" in self.randomise)
+        return ScenarioDelays(self.delay, self.links, self.clock.dt, "delay.loss" in self.randomise)
 
     @property
     def seeks_source(self) -> bool:

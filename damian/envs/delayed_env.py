@@ -14,6 +14,7 @@ from damian import keys
 from damian.common import devices
 from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask
+from damian.delays.scenario import ScenarioDelays
 from damian.envs.nodes import Drop
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.layout import Layout
@@ -35,6 +36,8 @@ class DelayedEnv(TransformedEnv):
     ``_step``), go through TorchRL's hooks.
     """
 
+    delays: ScenarioDelays
+    """The samplers of what is late, as ``make_env`` has resolved them."""
     _compiled: CompiledMethods | None = None
     """The compiled methods; None if nothing is compiled."""
 

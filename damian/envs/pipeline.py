@@ -21,6 +21,7 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
+from damian.delays.scenario import ScenarioDelays
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import Belief, Drop, ServerNode
@@ -61,36 +62,41 @@ def make_env(
     ``earned_reward``, all under ``"agents"``.
     """
     extras = checks.names("extras", extras, ALL_EXTRAS)
-    remote = has_server_node(scenario)
-    needed = {*["message"] * remote, *["position"] * scenario.delays.reads_positions}
+    delays = scenario.make_delays()
+    remote = has_server_node(scenario, delays)
+    needed = {*["message"] * remote, *["position"] * delays.reads_positions}
     env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
-    pipeline = DelayedEnv(env, make_transforms(scenario, env.server, extras))
+    pipeline = DelayedEnv(env, make_transforms(scenario, delays, env.server, extras))
+    pipeline.delays = delays
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
     pipeline.set_seed(seed)
     return pipeline
 
 
-def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
+def make_transforms(
+    scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
+) -> Compose:
     """All transforms of a scenario in order: outputs pass them forwards, a policy's actions backwards."""
+    remote = has_server_node(scenario, delays)
     transforms = [
-        *action_transforms(scenario),
-        *(server_transforms(scenario, server, extras) if has_server_node(scenario) else []),
-        *reward_transforms(scenario, extras),
-        *observation_transforms(scenario),
+        *action_transforms(scenario, delays),
+        *(server_transforms(scenario, delays, server, extras) if remote else []),
+        *reward_transforms(scenario, delays, extras),
+        *observation_transforms(scenario, delays),
     ]
     dropped = [
         *_LINKED * (scenario.links.kind == "matrix"),
         *_REPORTED * ("message" not in extras),
     ]
-    if has_server_node(scenario) and dropped:
+    if remote and dropped:
         transforms.append(Drop(dropped))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
-def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
+def action_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
     """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not sent."""
-    clock, act = scenario.clock, scenario.delays.act
+    clock, act = scenario.clock, delays.act
     if not act.late and clock.steps("agents") == 1:
         return []
     late = ActionDelay(
@@ -99,33 +105,35 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
         default=hold_action(scenario.actions),
         sent_key="ready",
         valid_key=keys.ACTION_VALID,
-        **scenario.delays.told,
+        **delays.told,
     )
     return [late]
 
 
-def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
+def server_transforms(
+    scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
+) -> list[Transform]:
     """The message delay (paper, section 3.4), links, and the server node, which uses arrived messages."""
-    output_messages, delayed, links = "message" in extras, scenario.delays.obs.late, scenario.links
+    output_messages, delayed, links = "message" in extras, delays.obs.late, scenario.links
     remembers = server.grid is not None or scenario.delay.messages > 0 or scenario.observation.timeline > 0
     transforms: list[Transform] = []
     if delayed:
         uplink = ObservationDelay(
-            scenario.delays.obs,
+            delays.obs,
             keys.MESSAGE,
             keys.RECEIVED,
             order=scenario.delay.order,
             sent_key=keys.MESSAGE_SENT,
-            age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
+            age_key=keys.AGE if output_messages or history_since_message(scenario, delays) else None,
             delay_key=keys.DELAY if output_messages or remembers else None,
-            **scenario.delays.told,
+            **delays.told,
         )
         transforms.append(uplink)
-    longest = scenario.delays.obs.longest if delayed else 0
+    longest = delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
     held, heard = keys.RECEIVED if delayed else keys.MESSAGE, None
     if links.kind == "matrix":
-        heard, law = keys.LINKED, scenario.delays.links
+        heard, law = keys.LINKED, delays.links
         channel = Channel(
             law,
             keys.MESSAGE,
@@ -204,9 +212,11 @@ def scaled_messages(server: Server, rows: Tensor) -> Tensor:
     return torch.cat([messages.position / scale, way / scale, flags], -1)
 
 
-def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
+def reward_transforms(
+    scenario: ScenarioConfig, delays: ScenarioDelays, extras: Collection[str]
+) -> list[Transform]:
     """The reward delay, and the discounted sum of the latest rewards (paper, section 3.5, eq. 4)."""
-    delay, delays, reported = scenario.delay, scenario.delays, "message" in extras
+    delay, reported = scenario.delay, "message" in extras
     transforms: list[Transform] = []
     if delays.rew.late:
         # With a message delay the server computes in hindsight what was earned.
@@ -224,20 +234,20 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
     return transforms
 
 
-def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
+def observation_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
     """Clocks of server and UAVs (paper, section 3.6), the broadcast, and the action history (section 3.3)."""
     clock, links, n_actions = scenario.clock, scenario.links, scenario.delay.history
     transforms: list[Transform] = []
     broadcast = [keys.OBSERVATION, *[keys.TIMELINE] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
         transforms.append(SampleAndHold(clock.steps("server"), [*broadcast, keys.GLOBAL_OBSERVATION]))
-    if links.kind == "updown" and scenario.delays.links.late:
+    if links.kind == "updown" and delays.links.late:
         downlink = ObservationDelay(
-            scenario.delays.links,
+            delays.links,
             keys.OBSERVATION,
             order=scenario.delay.order,
             age_key=None,
-            **scenario.delays.told,
+            **delays.told,
         )
         transforms.append(downlink)
     if clock.steps("agents") > 1:
@@ -250,7 +260,7 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
             codes=action_codes(scenario.actions),
             default=hold_action(scenario.actions),
             recorded_key="ready",
-            age_key=keys.AGE if history_since_message(scenario) else None,
+            age_key=keys.AGE if history_since_message(scenario, delays) else None,
             # Features do not reflect a flight before it has ended, though a message is sent as it begins.
             reflected_after=1 if MOTION_MODELS.get(scenario.motion.kind, "motion.kind").instant else 2,
         )
@@ -258,22 +268,22 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     return transforms
 
 
-def history_since_message(scenario: ScenarioConfig) -> bool:
+def history_since_message(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
     """Whether an action history holds only actions newer than the message that the server holds.
 
     Not where a UAV cannot tell which are newer (slow clocks, delayed actions), or knows its own message.
     """
-    delays, clock = scenario.delays, scenario.clock
+    clock = scenario.clock
     slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"
     tells = scenario.delay.history > 0 and not scenario.observation.own and not slow
     return tells and delays.obs.late and not delays.act.late
 
 
-def has_server_node(scenario: ScenarioConfig) -> bool:
+def has_server_node(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
     """Whether a ``ServerNode`` computes observations and rewards, instead of ``UavEnv``."""
     observation, messages = scenario.observation, scenario.delay.messages
     remembers = bool(observation.belief) or messages > 0 or observation.timeline > 0
-    return scenario.delays.obs.late or remembers or scenario.links.kind == "matrix"
+    return delays.obs.late or remembers or scenario.links.kind == "matrix"
 
 
 def hold_action(actions: ActionConfig) -> int:

@@ -30,6 +30,7 @@ def server_recompute(
     """
     own = "actor" in corrected and server.observation.own
     observers = {"critic", "actor"}.intersection(corrected) - ({"actor"} if own else set())
+    kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
     observed = own or bool(observers)
     believes = server.grid is not None and (observed or server.rewards_belief)
     timed = server.observation.timeline > 0 and observed
@@ -53,7 +54,6 @@ def server_recompute(
             entries[keys.OBSERVATION] = server.observe_with_own_messages(
                 messages, sent, elapsed, own_belief, timeline, own_timeline
             )
-        kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
         return {next_key(key): value for key, value in entries.items() if key not in kept}
 
     return recompute

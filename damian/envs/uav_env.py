@@ -1,5 +1,6 @@
 """``UavEnv``: the simulation and the server node as a TorchRL environment without delays."""
 
+import copy
 from collections.abc import Collection
 from typing import Any, cast
 
@@ -63,7 +64,7 @@ class UavEnv(EnvBase):
     not act; and TorchRL's ``_step`` [B].
 
     Args:
-        scenario: all settings; the defaults if not given.
+        scenario: all settings, which are copied; the defaults if not given.
         num_worlds: number of parallel environments, B.
         seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
         device: of all tensors.
@@ -84,7 +85,7 @@ class UavEnv(EnvBase):
     ) -> None:
         checks.whole("num_worlds", num_worlds, 1, checks.WORLDS)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
-        self.scenario = scenario or ScenarioConfig()
+        self.scenario = copy.deepcopy(scenario) if scenario else ScenarioConfig()
         checks.device("device", str(device))
         self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         of = self.scenario

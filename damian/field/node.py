@@ -110,12 +110,13 @@ class Node:
         self.worlds = ReportedEnv(scenario, seed, reward_terms)
         self.scenario, self.dt = scenario, scenario.clock.dt
         self.server, self.simulation = self.worlds.server, self.worlds.simulation
-        self.law_longest = scenario.delays.obs.longest
+        delays = scenario.make_delays()
+        self.law_longest = delays.obs.longest
         longest = max(self.law_longest, REMEMBERED_STEPS)
         transforms = [
             *remembering_transforms(scenario, self.server, longest, delayed=True),
             ServerNode(self.server, reward_terms=reward_terms),
-            *observation_transforms(scenario),
+            *observation_transforms(scenario, delays),
         ]
         self.env = DelayedEnv(self.worlds, Compose(*transforms))  # type: ignore[arg-type]
         """The environment for which the policy is built; nobody steps it."""

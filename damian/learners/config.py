@@ -1,5 +1,6 @@
 """Settings of learners, which name the class that learns with them."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -90,8 +91,9 @@ class LearnerConfig(Settings):
 
     reads: ClassVar[tuple[str, ...]] = ()
     """Optional outputs of the environment that the learner needs in its batches: ``message``, ``state``,
-    ``reward_terms`` or ``privileged`` (``damian.make_env``); and ``hindsight``: with back-updating, stored
-    steps then also hold the newest message that has arrived since (``keys.HINDSIGHT``)."""
+    ``reward_terms`` or ``privileged`` (``damian.make_env``); ``timeline``: what ``delay.messages`` adds; and
+    ``hindsight``: with back-updating, stored steps then also hold the newest message that has arrived since
+    (``keys.HINDSIGHT``)."""
     actor_follows_critic: ClassVar[bool] = False
     """Whether the sizes of the actor's layers also follow from what the critic observes."""
     learner: ClassVar[str] = ""
@@ -121,7 +123,7 @@ class LearnerConfig(Settings):
             buffer: replay buffer of ``buffer_size`` steps, on a ``TimeStorage``, or with back-updating on a
                 ``BackupdateStorage``, which corrects what is stored; None if ``buffer_size`` is None.
         """
-        return resolved(self.learner)(env, self, setup, buffer)
+        return resolved(self.learner)(env, copy.deepcopy(self), copy.deepcopy(setup), buffer)
 
     def make_actor(self, env: "EnvBase", model: ModelConfig) -> "ProbabilisticActor":
         """Build an actor as the learner has it, for evaluations, which load its weights."""

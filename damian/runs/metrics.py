@@ -1,8 +1,8 @@
 """Measures of episodes, in training and in evaluations."""
 
 import math
-from dataclasses import astuple, dataclass, fields
-from typing import Any, cast
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -10,64 +10,77 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
+from damian.common.errors import naming_errors
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.recompute import beliefs_in_hindsight
 from damian.keys import next_key
 from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage
 from damian.runs.checkpoint import to_tensordict
+from damian.runs.measures import BUILT_IN, METRICS
 from damian.server.server import Server
 
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Means over episodes: from messages without delay and, ``perceived_``, as the server perceived them."""
-
-    episodes: int
-    """Number of episodes."""
-    success_rate: float
-    """Share of the episodes that ended with success."""
-    steps: float
-    """Length of an episode; where success is possible, an episode without it counts the horizon."""
-    return_: float
-    """Sum of the undelayed rewards of an episode, as a mean over the UAVs."""
-    perceived_success_rate: float
-    """Share of the episodes that ended with success as far as the server knew."""
-    perceived_steps: float
-    """Length of an episode up to the end that the server perceived, counted as ``steps``."""
-    perceived_return: float
-    """Sum of the rewards as they were paid, as a mean over the UAVs."""
-    age: float
-    """Age of information: age of the message of a UAV that the server holds [steps]."""
-    late: float
-    """Share of the messages that arrive late."""
-    lost: float
-    """Share of the messages that never arrive."""
-
-    def row(self, group: str = "") -> dict[str, float]:
-        """The measures by the names that they have in every file; ``return`` cannot name a field."""
-        return dict(zip([group + name for name in EVALUATED], astuple(self), strict=True))
+Evaluation = dict[str, float]
+"""Metrics by name, and the number of ``episodes``."""
 
 
-EVALUATED = tuple(field.name.rstrip("_") for field in fields(Evaluation))
-"""Names of the measures of an ``Evaluation`` in files."""
+class Episodes(NamedTuple):
+    """The first episode of each of B worlds, as it truly was or as the server perceived it."""
+
+    succeeded: Tensor
+    """Whether it ended with success, [B] bool."""
+    steps: Tensor
+    """Its length; where success is possible, an episode without it counts the horizon, [B]."""
+    returns: Tensor
+    """Sum of its rewards, as a mean over the UAVs, [B]."""
+
+
+class Flights(NamedTuple):
+    """What metrics are computed from: the first episode of each world in T steps."""
+
+    rollout: TensorDictBase
+    """All entries of the steps, [B, T]."""
+    server: Server
+    """Reads messages, and computes features and rewards from them."""
+    true: Episodes
+    """Episodes as messages without delay tell them."""
+    perceived: Episodes
+    """Episodes as the server perceived them, with rewards as they were paid."""
+    in_episode: Tensor
+    """Steps up to the end that the server perceived, [B, T] bool."""
+    age: Tensor
+    """Age of the message of each UAV that the server holds [steps], [B, T, N]."""
+    delay: Tensor
+    """Delays of the messages sent in the episodes [steps], negative if lost, [M]; 0 if none is late."""
 
 
 @torch.no_grad()
-def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = True) -> Evaluation:
+def evaluate(
+    env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = True, metrics: Sequence[str] = ()
+) -> Evaluation:
     """Fly one episode of at most ``horizon`` steps in every world of an environment with ``message``.
 
     With ``sample``, actions are drawn from the policy's distribution, else the most likely ones are taken.
+    ``metrics`` are names or paths of further ones.
     """
     add_recurrent_state(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     with set_exploration_type(mode):
         rollout = env.rollout(horizon, policy, break_when_any_done=False)
-    return evaluation(rollout, env.server)
+    return evaluation(rollout, env.server, metrics)
 
 
-def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
-    """Measures of the first episode of each world in a rollout [B, T]."""
+def evaluation(rollout: TensorDictBase, server: Server, metrics: Sequence[str] = ()) -> Evaluation:
+    """Metrics of the first episode of each world in a rollout [B, T]."""
+    flights, found = flights_of(rollout, server), Evaluation(episodes=len(rollout))
+    for name in dict.fromkeys((*BUILT_IN, *metrics)):
+        with naming_errors(f"metric {name}"):
+            found[name] = torch.as_tensor(METRICS.get(name, "metrics").compute(flights)).float().mean().item()
+    return found
+
+
+def flights_of(rollout: TensorDictBase, server: Server) -> Flights:
+    """The first episode of each world in a rollout [B, T], and what has come of its messages."""
     next_step = cast(TensorDictBase, rollout["next"])
     elapsed = torch.arange(1, rollout.shape[1] + 1, device=rollout.device).expand(rollout.shape)
     message = next_step[keys.MESSAGE]
@@ -75,32 +88,29 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     truth = server(server.messages(message), elapsed, over, belief=belief)
     done, success, reward = (next_step[k].squeeze(-1) for k in (keys.DONE, keys.SUCCESS, keys.REWARD))
     in_episode = _up_to_first_end(done)
+    true_end = in_episode & _up_to_first_end(truth.status.terminated)
     held = server.messages(next_step.get(keys.RECEIVED, message))
-    age = held.age(elapsed * server.dt) / server.dt
-    sent, late, lost = cast(Tensor, next_step[keys.MESSAGE_SENT])[in_episode], 0.0, 0.0
+    sent, delay = cast(Tensor, next_step[keys.MESSAGE_SENT])[in_episode], torch.zeros(1)
     if sent.any() and keys.DELAY in next_step.keys(True):
         delay = cast(Tensor, next_step[keys.DELAY]).squeeze(-1)[in_episode][sent]
-        late, lost = _mean(delay > 0), _mean(delay < 0)
     can_succeed = server.episode.can_succeed
-    true_end = in_episode & _up_to_first_end(truth.status.terminated)
-    return Evaluation(
-        len(in_episode),
-        *_of_episodes(truth.status.success, truth.reward, true_end, can_succeed),
-        *_of_episodes(success, reward, in_episode, can_succeed),
-        age=_mean(age[in_episode]),
-        late=late,
-        lost=lost,
+    return Flights(
+        rollout,
+        server,
+        true=_episodes(truth.status.success, truth.reward, true_end, can_succeed),
+        perceived=_episodes(success, reward, in_episode, can_succeed),
+        in_episode=in_episode,
+        age=held.age(elapsed * server.dt) / server.dt,
+        delay=delay,
     )
 
 
-def _of_episodes(
-    success: Tensor, reward: Tensor, counted: Tensor, can_succeed: bool
-) -> tuple[float, float, float]:
-    """Success rate, steps and return of episodes, from the steps that count, a mask [B, T]."""
+def _episodes(success: Tensor, reward: Tensor, counted: Tensor, can_succeed: bool) -> Episodes:
+    """Episodes from the steps that count, a mask [B, T]."""
     succeeded, steps = (success & counted).any(-1), counted.sum(-1)
     if can_succeed:
         steps = torch.where(succeeded, steps, counted.shape[1])
-    return _mean(succeeded), _mean(steps), _mean((reward.mean(-1) * counted).sum(-1))
+    return Episodes(succeeded, steps, (reward.mean(-1) * counted).sum(-1))
 
 
 def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Tensor | None:
@@ -117,10 +127,6 @@ def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Te
 def _up_to_first_end(ended: Tensor) -> Tensor:
     """Mask of the steps up to and including the first end, [B, T] bool."""
     return ended.int().cumsum(-1) - ended.int() == 0
-
-
-def _mean(numbers: Tensor) -> float:
-    return numbers.float().mean().item()
 
 
 class EpisodeLog:

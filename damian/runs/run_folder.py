@@ -7,10 +7,12 @@ from pathlib import Path
 import pandas as pd
 from filelock import FileLock, Timeout
 
+from damian.common import checks
 from damian.common.atomic_files import not_linked, write_atomically, writing
 from damian.common.errors import InputError
 from damian.common.plotting import save_figure
 from damian.common.tables import markdown_table, read_csv, write_csv
+from damian.runs.measures import BUILT_IN, declared
 from damian.runs.metrics import Evaluation
 
 FIGURE = "learning_curve.png"
@@ -49,7 +51,7 @@ def plot_learning_curve(
     figure = Figure(figsize=(5 * len(panels), 3.4), layout="tight")
     axes = figure.subplots(1, len(panels), squeeze=False)
     for axis, (name, measure) in zip(axes[0], panels.items(), strict=True):
-        levels = {policy: each.row()[measure] for policy, each in evaluations.items()}
+        levels = {policy: each[measure] for policy, each in evaluations.items()}
         curve = pd.concat([pd.Series({0: levels[UNTRAINED]}), table[name].dropna()])
         axis.plot(curve, color="tab:blue", marker="o", markevery=[0], label="training")
         for policy, style in {SCRIPT: "-.", RANDOM: "--"}.items():
@@ -76,28 +78,41 @@ def save_results(
     below = "\n".join(filter(None, [note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
-    cells = pd.DataFrame([{"policy": name, **each.row()} for name, each in rows.items()])
+    cells = pd.DataFrame([{"policy": name, **each} for name, each in rows.items()])
     write_csv(folder / RESULTS, cells)  # last: with it, a run counts as finished
     return table
 
 
 def read_results(path: Path) -> pd.DataFrame:
-    """Evaluations as a run or a comparison has written them, one in a row."""
-    return read_csv(path, text=("task", "delay", "method", "regime", "policy"))
+    """Evaluations as a run or a comparison has written them, one in a row.
+
+    A metric that did not exist when the table was written has an empty column.
+    """
+    table = read_csv(path, text=("task", "delay", "method", "regime", "policy"))
+    return table.reindex(columns=list(dict.fromkeys((*table, *BUILT_IN)))) if len(table) else table
+
+
+def measured_in(table: pd.DataFrame, score: str) -> list[str]:
+    """Metrics of a table of evaluations, the columns behind the number of episodes, first the score."""
+    names = [*map(str, table)]
+    metrics = names[names.index("episodes") + 1 :]
+    checks.require(score in metrics, "score", score, f"is not stored, only {', '.join(metrics)}")
+    return [score, *(name for name in metrics if name != score)]
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
     """Evaluations of policies as a Markdown table; NAME``, deterministic`` gives columns of NAME's line."""
-    measures = [*["success_rate", "steps"] * can_succeed, "return"]
-    likely = measures if any(name.endswith(DETERMINISTIC) for name in rows) else []
-    if late:
-        measures = [*measures, "perceived_return", "age", "late", "lost"]
+    hidden = {*["success"] * (not can_succeed), *["late"] * (not late)}
+    names = [name for name in next(iter(rows.values())) if name != "episodes"]
+    measures = [n for n in names if "run" in declared(n).tables and declared(n).where not in hidden]
+    likely = any(name.endswith(DETERMINISTIC) for name in rows)
+    likely = [name for name in measures if likely and declared(name).where != "late"]
     lines = []
     for name, evaluation in rows.items():
         if not name.endswith(DETERMINISTIC):
-            row, other = evaluation.row(), rows.get(name + DETERMINISTIC)
-            numbers = [f"{row[measure]:.2f}" for measure in measures]
-            numbers += [f"{other.row()[measure]:.2f}" if other else "" for measure in likely]
+            other = rows.get(name + DETERMINISTIC)
+            numbers = [f"{evaluation[measure]:.2f}" for measure in measures]
+            numbers += [f"{other[measure]:.2f}" if other else "" for measure in likely]
             lines.append([name, *numbers])
     head = ["policy", *measures, *(f"{measure}, deterministic" for measure in likely)]
     return markdown_table([title.replace("_", " ") for title in head], lines)

@@ -57,8 +57,10 @@ def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) 
     def changed_of_others(field: Tensor) -> Tensor:
         if field.dtype == torch.bool:
             other = ~field
+        elif field.is_floating_point():
+            other = field + 1
         else:
-            other = field + 1 if field.is_floating_point() else field.flip(0, 1)  # other landing points
+            other = field.roll(1, 1)  # those of another UAV of its world: landing points of one region
         return torch.where(expand_mask(own, field.unsqueeze(1)), field.unsqueeze(1), other.unsqueeze(1))
 
     return server.own_features(tree_map(changed_of_others, messages), steps, [name])[name]

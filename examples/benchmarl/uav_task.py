@@ -67,7 +67,7 @@ class UavTask(TaskClass):
 
     def mean_return(self, env: DelayedEnv, policy: nn.Module, sample: bool) -> float:
         """Mean return of a policy by what has truly happened, whenever the server heard of it."""
-        return evaluate(env, policy, self.max_steps(env), sample).return_
+        return evaluate(env, policy, self.max_steps(env), sample)["return"]
 
     def supports_continuous_actions(self) -> bool:
         return True

@@ -94,7 +94,7 @@ def load_teacher(folder: str, env: EnvBase) -> Any:
     key = "learner.teacher"
     checks.require(bool(folder), key, "''", "is missing: the run folder of a policy trained without delay")
     config = stored_config(Path(folder), key)
-    checks.require(not config.delays.obs.late, key, folder, "was trained with delayed messages")
+    checks.require(not config.make_delays().obs.late, key, folder, "was trained with delayed messages")
     world = make_env(config, 1, device=env.device)
     spec, wanted = env.full_action_spec_unbatched[keys.ACTION], world.full_action_spec_unbatched[keys.ACTION]
     should = "chooses from other actions, or from continuous ones"

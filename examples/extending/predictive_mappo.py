@@ -55,6 +55,7 @@ class PredictiveMappoConfig(MappoConfig):
     heads: int = setting(4, "Number of attention heads over the messages.", low=1, high=1024)
     width: int = setting(32, "Size of the embedding of a message.", low=1, high=16384)
 
+    reads: ClassVar[tuple[str, ...]] = ("timeline",)
     actor_follows_critic: ClassVar[bool] = True
 
     def check(self, setup: LearningSetup) -> None:

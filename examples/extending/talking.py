@@ -50,7 +50,9 @@ class AttentionConfig(ModelConfig):
     width: int = setting(32, "Width of what is read from a block of rows.", low=1, high=1024)
 
     def make_network(self, layout: Layout, n_out: int) -> nn.Module:
-        self.refuse(not any(block.rows for block in layout), "name", "needs a feature of rows, such as others")
+        self.refuse(
+            not any(block.rows for block in layout), "name", "needs a feature of rows, such as others"
+        )
         return Attention(self, layout, n_out)
 
 

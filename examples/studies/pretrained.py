@@ -79,7 +79,7 @@ def returns(name: str, law: tuple[str, ...]) -> dict[str, list[float]]:
         for kind, flown in {"sampled": policy, **({} if law else others)}.items():
             env.set_seed(seed)
             horizon = env.uav_env.scenario.episode.max_steps or 0
-            mean = evaluate(env, flown, horizon, sample=kind != "most likely").return_
+            mean = evaluate(env, flown, horizon, sample=kind != "most likely")["return"]
             found.setdefault(kind, []).append(mean)
     return found
 

@@ -6,7 +6,7 @@ curves are two CSV files, which are enough for all tables and figures, without t
 
 import math
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -26,6 +26,7 @@ from damian.common.errors import InputError, RunError
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, OF_METHOD, RUN, Method, regime
 from damian.compare.config import CompareConfig, HeldOut
 from damian.compare.figures import LABELS
+from damian.runs.measures import BUILT_IN
 from damian.runs.metrics_log import read_metrics
 from damian.runs.processes import each_in_processes
 from damian.runs.run_folder import RESULTS, check_no_links, read_results
@@ -73,6 +74,7 @@ class Run:
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
     """Every run with its checked settings: seed after seed, and last what flies others' policies."""
     tasks, delays, runs = config.chosen("tasks"), {NOT_LATE: [], **config.chosen("delays")}, list[Run]()
+    composed = cache(cli.settings)  # several methods differ only in whose policy they fly: 0.2 s each
     places = [(task, task, HeldOut()) for task in tasks]
     for name, held_out in config.experiment.held_out.items():
         places += [(f"{t}{HELD_OUT_MARK}{name}", t, held_out) for t in tasks if _in(held_out.tasks, t)]
@@ -81,7 +83,7 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
             fits = method.delayed == (delay != NOT_LATE) and _in(method.tasks, task)
             if fits and _in(held_out.methods, name) and _in(held_out.delays, delay):
                 overrides = _replaced([*tasks[task], *words], held_out.overrides)
-                runs += _seeds(config, folder / place / delay / name, task, overrides)
+                runs += _seeds(config, composed, folder / place / delay / name, task, overrides)
     by_folder = {run.folder: run.config for run in runs}
     for run in runs:
         if run.config.checkpoint is not None:
@@ -92,6 +94,9 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
     succeeds = any(run.config.episode.can_succeed for run in runs)
     should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
     checks.require(succeeds or "success" not in config.score, "score", config.score, should)
+    measured = all(config.score in (*BUILT_IN, *run.config.metrics) for run in runs)
+    should = f"is not measured by every run: add overrides=['metrics=[{config.score}]']"
+    checks.require(measured, "score", config.score, should)
     return sorted(runs, key=lambda run: (run.stage, run.config.seed))
 
 
@@ -105,7 +110,13 @@ def _replaced(words: Sequence[str], by: Sequence[str]) -> list[str]:
     return [*(word for word in words if not f"{key_of(word)}.".startswith(keys)), *by]
 
 
-def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list[str]) -> Iterator[Run]:
+def _seeds(
+    config: CompareConfig,
+    composed: Callable[..., TrainConfig],
+    folder: Path,
+    trained_in: str,
+    overrides: list[str],
+) -> Iterator[Run]:
     """The runs of one task, delay and method, which the folder names."""
     task, delay, name = folder.parts[-3:]
     method, methods = config.experiment.methods[name], config.experiment.methods
@@ -114,8 +125,8 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     source = flown or method.source
     words = ["logger=csv", *overrides, *method.overrides, *config.overrides]
     try:
-        unseeded = _composed(*words)
-        late_by = [] if method.delayed else late(unseeded)
+        unseeded = composed(*words)
+        late_by = [] if method.delayed else late(unseeded.make_delays())
         if late_by and away:
             return  # a held-out delay, under which the undelayed method is not flown
         should = "delays this method, with which others are compared: put delays under experiment.delays"
@@ -138,9 +149,6 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
                 seeded = replace(seeded, learner=replace(seeded.learner, teacher=str(policy)))
         trains = not (method.untrained or flown)
         yield Run(task, delay, name, seeded, folder / seed_folder, trains, policy)
-
-
-_composed = cache(cli.settings)  # several methods differ only in whose policy they fly; Hydra takes 0.2 s
 
 
 def perform_all(runs: Sequence[Run], processes: int, train: Work, fly: Work) -> list[Run]:

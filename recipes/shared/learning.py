@@ -15,11 +15,13 @@ from damian.common import checks
 from damian.common.compiling import COMPILE_OPTIONS
 from damian.common.devices import free_memory
 from damian.common.errors import naming_errors
+from damian.delays.scenario import ScenarioDelays
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.learners.base import Learner, undelayed_talk
+from damian.learners.config import LearnerConfig
 from damian.learners.schedule import SystemClock
 from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage, corrections_of
@@ -37,9 +39,9 @@ BASE_MEMORY, COPIES = 0.6, 2.6
 def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment of the training, [B], with what the learner and the logs need."""
     triggered = config.clock.trigger is not None
-    messages = backupdates(config) or measures_hindsight(config) or triggered
+    messages = measures_hindsight(config.make_delays()) or triggered
     privileged = config.critic == "privileged"
-    reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
+    reads = {*config.learner.reads} - {"hindsight", "timeline"}  # from the storage, and delay.messages
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config, config.worlds, config.seed, config.device, extras)
     if config.compiles:
@@ -48,16 +50,17 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     return env
 
 
-def own_code(learner: str) -> AbstractContextManager[None]:
+def own_code(learner: LearnerConfig) -> AbstractContextManager[None]:
     """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
-    return naming_errors(learner) if ":" in learner else nullcontext()
+    built_in = type(learner).__module__ == LearnerConfig.__module__
+    return nullcontext() if built_in else naming_errors(learner.name)
 
 
 def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
     """The learner, with the replay buffer that it needs."""
     name = config.learner.name
-    with own_code(name):
-        learner = config.learner.make(env, learning_setup(config), buffer)
+    with own_code(config.learner):
+        learner = config.learner.make(env, learning_setup(config, env.delays), buffer)
         has_actor = "actor" in learner.components()
     should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
     checks.require(has_actor, f"{name}: components", [*learner.components()], should)
@@ -66,7 +69,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
 
 def require_delayed_talk(config: TrainConfig, env: EnvBase, learner: Learner) -> None:
     """Refuse an actor by which UAVs read at once in each other's rows what these know late or never."""
-    own, links = config.observation.own and config.delays.obs.late, config.links.kind
+    own, links = config.observation.own and env.delays.obs.late, config.links.kind
     if config.learner.talks or not (own or links != "server"):
         return
     known = "observation.own=true" if own else f"links={links}"
@@ -74,19 +77,19 @@ def require_delayed_talk(config: TrainConfig, env: EnvBase, learner: Learner) ->
         f"has an actor that reads other UAVs' rows, which with {known} hold what each knows at once: attend "
         "over blocks of a UAV's own row (docs/extending.md), or give learner.talks=true to let UAVs talk so"
     )
-    with own_code(config.learner.name):
+    with own_code(config.learner):
         talk = undelayed_talk(learner.actor, env)
     checks.require(not talk, "learner", config.learner.name, should)
 
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
-    setup = learning_setup(config)
-    with own_code(config.learner.name):
+    setup = learning_setup(config, env.delays)
+    with own_code(config.learner):
         size = config.learner.buffer_size(setup)
     if size is None:
         return None
-    if not backupdates(config):
+    if not setup.backupdate:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
     least = setup.least_buffer
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
@@ -99,7 +102,7 @@ def corrected_storage(
     config: TrainConfig, env: DelayedEnv, corrected: Collection[str], size: int, worlds: int
 ) -> BackupdateStorage:
     """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct steps."""
-    late_messages = config.delays.obs.late
+    late_messages = env.delays.obs.late
     corrected = corrected if late_messages else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
     # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
@@ -108,7 +111,7 @@ def corrected_storage(
     return BackupdateStorage(
         size + sum(correction.lookback for correction in corrections) * worlds,
         server_recompute(env.server, corrected) if late_messages else None,
-        config.delays.longest,
+        env.delays.longest,
         corrections=corrections,
         hindsight_key=keys.HINDSIGHT if hindsight else None,
         device=config.device,
@@ -127,10 +130,11 @@ def require_memory(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | 
 
 def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:
     """The returns of the learning curve; None if they are those perceived."""
-    if not measures_hindsight(config):
+    if not measures_hindsight(env.delays):
         return None
     worlds = min(config.worlds, HindsightReturns.WORLDS)
-    size = (learning_setup(config).longest_period + 2 * config.delays.longest) * worlds
+    period = learning_setup(config, env.delays).longest_period
+    size = (period + 2 * env.delays.longest) * worlds
     return HindsightReturns(corrected_storage(config, env, ["reward"], size, worlds), worlds)
 
 
@@ -163,9 +167,9 @@ def ticks(collector: Collector, clock: SystemClock, server: Server) -> Iterator[
         yield batch
 
 
-def read_by(config: TrainConfig, batch: TensorDictBase) -> TensorDictBase:
+def read_by(config: TrainConfig, delays: ScenarioDelays, batch: TensorDictBase) -> TensorDictBase:
     """The entries of a batch [B, T] for the learner, whose replay buffer would keep messages in vain."""
-    if backupdates(config) or "message" in config.learner.reads:
+    if backupdates(config, delays) or "message" in config.learner.reads:
         return batch
     sent = (keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.REWARD_DELAY, keys.EARNED_REWARD)
     return batch.exclude(*sent, *map(keys.next_key, sent))

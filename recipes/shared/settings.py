@@ -2,8 +2,10 @@
 
 from damian import keys
 from damian.common import checks
+from damian.delays.scenario import ScenarioDelays
 from damian.learners.config import LearningSetup
 from damian.learners.schedule import SystemClock
+from damian.runs.measures import METRICS
 from damian.runs.metrics_log import read_logger
 from damian.server.features.base import check_features
 from damian.server.rewards import terms_of
@@ -14,22 +16,22 @@ from damian.world.vehicles import MOTION_MODELS
 from ..config import TrainConfig
 
 
-def late(config: TrainConfig) -> list[str]:
+def late(delays: ScenarioDelays) -> list[str]:
     """Settings by which messages, actions or rewards are late."""
-    return [f"delay.{name}" for name in ("obs", "act", "rew") if getattr(config.delays, name).late]
+    return [f"delay.{name}" for name in ("obs", "act", "rew") if getattr(delays, name).late]
 
 
-def measures_hindsight(config: TrainConfig) -> bool:
+def measures_hindsight(delays: ScenarioDelays) -> bool:
     """Whether messages or rewards are late."""
-    return bool({"delay.obs", "delay.rew"} & {*late(config)})
+    return delays.obs.late or delays.rew.late
 
 
-def backupdates(config: TrainConfig) -> bool:
+def backupdates(config: TrainConfig, delays: ScenarioDelays) -> bool:
     """Is back-updating switched on, and can any message or reward be late or lost?"""
-    return config.backupdate and (config.delays.obs.late or config.delays.rew.late)
+    return config.backupdate and measures_hindsight(delays)
 
 
-def learning_setup(config: TrainConfig) -> LearningSetup:
+def learning_setup(config: TrainConfig, delays: ScenarioDelays) -> LearningSetup:
     """The settings of a run that a learner needs beside its own."""
     clock = SystemClock(config.clock, config.update_steps)
     privileged = config.critic == "privileged"
@@ -38,43 +40,46 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
         worlds=config.worlds,
         shortest_period=clock.shortest,
         longest_period=clock.longest,
-        longest_delay=config.delays.longest,
-        backupdate=backupdates(config),
+        longest_delay=delays.longest,
+        backupdate=backupdates(config, delays),
         settle=config.settle,
         recompute_actor="actor" in config.corrected,
         critic_key=keys.PRIVILEGED_OBSERVATION if privileged else keys.GLOBAL_OBSERVATION,
         compile=config.compiles,
         frames=config.frames,
-        action_delay=config.delays.act.constant_delay,
+        action_delay=delays.act.constant_delay,
     )
 
 
-def check_components(config: TrainConfig) -> None:
+def check_components(config: TrainConfig) -> ScenarioDelays:
     """Check that the device and all components exist that the settings name, which imports them."""
     checks.device("device", config.device)
     REGION_SOURCES.get(config.region.kind, "region.kind")
     MOTION_MODELS.get(config.motion.kind, "motion.kind")
-    _ = config.delays
+    delays = config.make_delays()
     check_features(config.observation)
     terms_of(config.reward)
     sensors_of(config.sensors)
+    for name in config.metrics:
+        METRICS.get(name, "metrics")
     for written in config.logger.custom:
         read_logger(written)
+    return delays
 
 
 def check_learning(config: TrainConfig) -> None:
     """Check that the settings allow training; an evaluation has fewer requirements."""
-    check_components(config)
-    config.learner.check(learning_setup(config))
-    _check_backupdate(config)
+    delays = check_components(config)
+    config.learner.check(learning_setup(config, delays))
+    _check_backupdate(config, delays.obs.late)
     messages, name = config.delay.messages, config.learner.name
-    problem = f"is not read by learner={name}, only by a learner of your own: leave it out"
-    checks.require(not messages or ":" in name, "delay.messages", messages, problem)
+    problem = f"is not read by learner={name}, whose reads have no timeline: leave it out"
+    checks.require(not messages or "timeline" in config.learner.reads, "delay.messages", messages, problem)
 
 
-def _check_backupdate(config: TrainConfig) -> None:
+def _check_backupdate(config: TrainConfig, late_messages: bool) -> None:
     """Check what goes with back-updating only, and what it needs."""
-    no_messages = not (config.backupdate and config.delays.obs.late)
+    no_messages = not (config.backupdate and late_messages)
     problem = "reads hindsight, which needs aware=backupdate and a message delay (delay.obs)"
     unable = "hindsight" in config.learner.reads and no_messages
     checks.require(not unable, "learner", config.learner.name, problem)

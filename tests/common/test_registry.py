@@ -1,5 +1,7 @@
 """Components are found by name or by path, and what cannot be found is said in one line."""
 
+import importlib
+
 import pytest
 
 from damian.common.errors import InputError
@@ -35,6 +37,20 @@ def test_your_own_component_is_found_by_its_path_in_the_current_folder(tmp_path,
     monkeypatch.chdir(tmp_path)
     (tmp_path / "polite_words.py").write_text("def formal():\n    return 'good day'\n")
     assert greetings().get("polite_words:formal", "greeting")() == "good day"
+
+
+def test_a_module_that_was_loaded_again_gives_its_new_component(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    registry, file = greetings(), tmp_path / "changing_words.py"
+    for word in ("good day", "good night"):
+        file.write_text(f"def formal():\n    return '{word}'.lower()  # {'longer' * len(word)}\n")
+        importlib.reload(importlib.import_module("changing_words"))
+        assert registry.get("changing_words:formal", "greeting")() == word
+        assert registry["changing_words:formal"]() == word
+    file.write_text("formal = 3  # no function any more\n")
+    importlib.reload(importlib.import_module("changing_words"))
+    with pytest.raises(InputError, match="is not a function"):
+        registry.get("changing_words:formal", "greeting")
 
 
 def test_an_installed_package_registers_names_by_its_entry_point(tmp_path, monkeypatch):

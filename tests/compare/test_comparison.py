@@ -6,8 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from damian.compare.comparison import MEASURED, RANDOM, TRAINED, UNTRAINED, Comparison, Method, shown
+from damian.common.errors import InputError
+from damian.common.tables import write_csv
+from damian.compare.comparison import RANDOM, TRAINED, UNTRAINED, Comparison, Method, shown
+from damian.compare.paired import means
 from damian.compare.report import markdown
+from damian.runs.measures import BUILT_IN
+from damian.runs.run_folder import read_results
 
 LIKELIEST = f"{TRAINED}, deterministic"
 METHODS = {
@@ -22,7 +27,11 @@ def row(task: str, delay: str, method: str, seed: int, value: float, policy: str
     """A row of results in which every measure has the same value."""
     labels = {"task": task, "delay": delay, "method": method, "regime": "late data"}
     labels |= {"seed": seed, "policy": policy}
-    return labels | {"frames": 400, "seconds": 36.0} | dict.fromkeys((*MEASURED, "episodes"), value)
+    return (
+        labels
+        | {"frames": 400, "seconds": 36.0}
+        | dict.fromkeys(("backupdated", "episodes", *BUILT_IN), value)
+    )
 
 
 def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
@@ -35,7 +44,9 @@ def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float
     ]
 
 
-def comparison(rows: list[dict], methods: dict[str, Method] = METHODS, curves: list = ()) -> Comparison:
+def comparison(
+    rows: list[dict] | pd.DataFrame, methods: dict[str, Method] = METHODS, curves: list = ()
+) -> Comparison:
     columns = ["task", "delay", "method", "seed", "frames", "hindsight_return", "perceived_success_rate"]
     return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), methods)
 
@@ -48,6 +59,22 @@ def compared(found: Comparison) -> dict[str, dict]:
 
 
 THREE = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3], "flown": [5.0, 3, 4], "aware": [6.0, 9, 7]}
+
+
+def test_a_table_from_before_a_metric_existed_has_an_empty_column(tmp_path):
+    stored = pd.DataFrame(rows_of("t", "late", THREE)).drop(columns="lost")
+    write_csv(tmp_path / "results.csv", stored)
+    rows = read_results(tmp_path / "results.csv").assign(**{"lab:other": 2.0})
+    assert rows["lost"].isna().all()
+    (line,) = [line for line in comparison(rows).table.to_dict("records") if line["policy"] == RANDOM][:1]
+    assert (line["return"], line["lab:other"]) == (0.0, 2.0)
+    assert np.isnan(line["lost"])
+    lines = means(rows, [], "perceived_steps")
+    assert {"lab:other", "perceived_steps"} <= {*lines}
+    with pytest.raises(InputError, match="score: lab:unknown is not stored, only success_rate, steps"):
+        means(rows, [], "lab:unknown")
+
+
 SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
 
 

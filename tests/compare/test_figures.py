@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from damian.compare.figures import METHOD_COLOURS, plot_sweep
-from damian.compare.paired import MEASURES, means
+from damian.compare.paired import means
 
 TO_CONES = [[0.41222, 0.53633, 0.05145], [0.21190, 0.68070, 0.10740], [0.08830, 0.28172, 0.62998]]
 TO_LAB = [[0.21045, 0.79362, -0.00407], [1.97800, -2.42859, 0.45059], [0.02590, 0.78277, -0.80868]]
@@ -32,18 +32,21 @@ def test_colours_of_methods_are_far_apart(seen):
     assert all(place[0] < 0.85 for place in places)  # they are seen on white
 
 
+MEASURES = ["return", "success_rate", "steps", "perceived_return", "age"]
+
+
 def test_a_sweep_has_a_panel_for_each_value_with_the_other_panels_in_grey(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     returns = {("none", 4): 2.0, ("none", 0): 9.0, ("timeline", 4): 7.0}
     rows = pd.DataFrame(
         [
-            (*place, policy, seed, mean + seed - 10 * (policy == "script"), 0.0, 1.0, 0.0, 0.0)
+            (*place, policy, seed, 9, mean + seed - 10 * (policy == "script"), 0.0, 1.0, 0.0, 0.0)
             for place, mean in returns.items()
             for seed in (-1, 0, 1)
             for policy in ("trained", "script", "untrained")
         ],
-        columns=[*(groups := ["aware", "delay.obs"]), "policy", "seed", *MEASURES],
+        columns=[*(groups := ["aware", "delay.obs"]), "policy", "seed", "episodes", *MEASURES],
     )
     for keys in (groups, groups[:1], []):
         plot_sweep(means(rows, keys), keys, tmp_path / "figure.png")

@@ -1,33 +1,90 @@
-"""The delays of a scenario are read once, and again only if their settings change."""
+"""What an environment has been made from may change: it keeps its own copy, and the next one follows."""
 
+import json
+from copy import deepcopy
 from dataclasses import replace
 
+import pytest
 from delay_twin import trace
-from helpers import square
+from delayed_envs import choices
+from helpers import all_same, play, square
 
 from damian.delays.config import DelayConfig, LinkConfig
+from damian.delays.samplers import TableSampler
 from damian.envs.pipeline import make_env
+from damian.envs.uav_env import UavEnv
 from damian.learners.config import MappoConfig
 from damian.recipes.config import TrainConfig
-from damian.recipes.shared.learning import learning_env
-from damian.recipes.shared.settings import check_learning, learning_setup
+from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
+from damian.recipes.shared.settings import check_learning
+from damian.world.config import RegionConfig, SourceConfig
 
 
-def test_until_the_first_step_of_a_training_a_trace_is_read_once(tmp_path):
+def test_an_environment_reads_a_trace_once(tmp_path):
     delay = DelayConfig(obs=trace(tmp_path, 1, 2, 0), act={"law": "uniform", "high": 2}, rew=1, history=2)
     scenario = square(delay=delay, links=LinkConfig("matrix", delay=1))
     config = TrainConfig(**vars(scenario), learner=MappoConfig(steps=5), worlds=2, backupdate=True)
     check_learning(config)
+    env = learning_env(config)
     next(tmp_path.iterdir()).unlink()  # so that to read it again fails
-    learning_setup(config)
-    make_env(config, 1)
-    learning_env(config).rollout(3)
+    make_learner(config, env, replay_buffer(config, env))
+    env.rollout(3)
 
 
-def test_changed_settings_are_read_anew():
-    scenario = square(delay=DelayConfig(obs=3))
-    assert scenario.delays.obs.constant_delay == 3
-    assert scenario.delays is scenario.delays
-    scenario.delay.obs = 5
-    assert scenario.delays.obs.constant_delay == 5
-    assert replace(scenario, delay=DelayConfig(obs=1)).delays.longest == 1
+def write_trace(path, delay: int) -> None:
+    path.write_text("delay\n" + f"{delay}\n" * 20)
+
+
+def write_region(path, side: int) -> None:
+    places = [[x * side * 1e-5, y * side * 1e-5] for x, y in [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]]
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [places]}))
+
+
+FILES = {
+    "trace": (write_trace, (1, 5), lambda env: env.delays.longest),
+    "region": (write_region, (150, 300), lambda env: env.uav_env.simulation.airspace.scale.item() // 1.57),
+}
+"""What writes a file, from which numbers, and the number that an environment has read; a diagonal of 1e-5
+degrees is 1.57 metres long."""
+
+
+@pytest.mark.parametrize("kind", FILES)
+@pytest.mark.parametrize("copied", [lambda s: s, deepcopy, replace], ids=["same", "deepcopy", "replace"])
+def test_a_file_that_was_rewritten_is_read_anew(tmp_path, kind, copied):
+    (write, numbers, read), path = FILES[kind], tmp_path / "file.csv"
+    told = {"delay": DelayConfig(obs={"law": "trace", "path": str(path)})}
+    if kind == "region":
+        path = path.with_suffix(".geojson")
+        told = {"region": RegionConfig("geojson", path=str(path), lattice_step=40.0)}
+        told["source"] = SourceConfig()
+    scenario = square(**told)
+    for number in numbers:
+        write(path, number)
+        assert read(make_env(copied(scenario))) == number
+
+
+CHANGES = {
+    "delay": lambda scenario: setattr(scenario.delay, "obs", TableSampler([[0.0] * 3 + [1.0]])),
+    "limit": lambda scenario: setattr(scenario.episode, "max_steps", 2),
+    "lists": lambda scenario: scenario.observation.local_features.pop(),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("make", [make_env, UavEnv])
+def test_an_environment_keeps_the_settings_with_which_it_was_made(make, change):
+    scenario = square(delay=DelayConfig(obs=TableSampler([[0.0, 1.0]])))
+    changed, untouched = make(scenario, 2, 1), make(deepcopy(scenario), 2, 1)
+    CHANGES[change](scenario)
+    actions = choices(untouched, 8)
+    assert all_same(play(changed, actions), play(untouched, actions))
+    same = play(make(scenario, 2, 1), actions)  # the next environment follows
+    assert make is UavEnv or not all_same(same, play(untouched, actions))
+
+
+def test_a_learner_keeps_the_settings_with_which_it_was_made():
+    config = TrainConfig(**vars(square()), learner=MappoConfig(steps=5), worlds=2)
+    env = learning_env(config)
+    learner = make_learner(config, env, None)
+    config.learner.epochs, config.model.hidden = 40, []
+    assert (learner.config.epochs, learner.setup.model.hidden) == (4, [256, 256])

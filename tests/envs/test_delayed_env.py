@@ -40,7 +40,7 @@ def all_transforms(scenario: ScenarioConfig, n_worlds: int) -> DelayedEnv:
     keys = {"sent_key": "ready", "valid_key": "action_valid"}
     transforms = [
         ActionDelay(0, ACTION, default=hold_action(scenario.actions), **keys),
-        *server_transforms(scenario, env.server, EXTRAS),
+        *server_transforms(scenario, scenario.make_delays(), env.server, EXTRAS),
         RewardDelay(0, REWARD),
         CumulativeReward(1, 0.9, REWARD),
         SampleAndHold(1, [OBSERVATION, GLOBAL_OBSERVATION]),
@@ -217,7 +217,7 @@ def test_a_scenario_compiles_to_kernels(name):
 def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None:
     base = env.base_env
     uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
-    one_by_one = TransformedEnv(uav_env, make_transforms(scenario, uav_env.server, EXTRAS))
+    one_by_one = TransformedEnv(uav_env, make_transforms(scenario, env.delays, uav_env.server, EXTRAS))
     for transform in one_by_one.transform:
         transform.set_seed(0)
     one_by_one.append_transform(RewardSum([REWARD], [EPISODE_REWARD]))

@@ -9,6 +9,7 @@ from helpers import SQUARE, check_refused, everything
 
 from damian import make_env
 from damian.common.errors import InputError
+from damian.runs.run_folder import read_results
 from damian.server.config import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.world.regions.sources import RegionConfig
@@ -25,13 +26,18 @@ REWARDS = ["scenario=energy", f"reward.custom=[{LOW}, {{term: rewards:together, 
 REGION = ["region=vertices", "region.kind=region:yard", "region.options={side: 200}"]
 REGION += ["region.lattice_step=40"]
 MOTION = ["motion=polynomial", "motion.kind=motion:WindyFlight", "motion.options={wind: 4, bearing: 0}"]
+METRIC = "metrics=[metric:apart]"
 SENSOR = "sensors=[{sensor: sensor:wind, strength: 3}]"
 
 
 def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
-    first = run(*TINY, *REWARDS, *LAW, *FEATURES, *REGION, *MOTION, SENSOR, "aware=backupdate+history")
+    first = run(
+        *TINY, *REWARDS, *LAW, *FEATURES, *REGION, *MOTION, SENSOR, METRIC, "aware=backupdate+history"
+    )
     second = run(f"checkpoint={first}", "seed=1", "trust=true", program="evaluate", name="evaluated")
-    assert (second / "result.csv").is_file()
+    tables = [read_results(folder / "result.csv") for folder in (first, second)]
+    assert all(table["metric:apart"].between(0, 1).all() for table in tables)
+    assert "metric:apart" in (first / "result.md").read_text()
     with (first / "metrics.csv").open(newline="") as file:
         last = list(csv.DictReader(file))[-1]
     assert {"reward/low_battery", "reward/together", "reward/battery"} <= last.keys()
@@ -65,6 +71,11 @@ def radians(cache):
 def leaks(cache):
     return cache.messages.track.mean(-1, keepdim=True).expand(cache.messages.track.shape) / 7
 
+@feature("local")
+def meets(cache):
+    stops = cache.messages.trail[..., 0]
+    return (stops.sum(-1, keepdim=True).expand(stops.shape) % 7) / 7
+
 @reward_term(reads=["spotted"], scope="system")
 def shared(features, counters):
     return features["spotted"].T
@@ -89,6 +100,7 @@ def seen(name: str) -> dict[str, ObservationConfig]:
     [
         (seen("radians"), r"feature lies:radians: 4 is not between 0 and 1"),
         (seen("leaks"), "lies:leaks: local changes with the messages of other UAVs: make it glob"),
+        (seen("meets"), "lies:meets: local changes with the messages of other UAVs"),
         (
             {"reward": RewardConfig(custom=[{"term": "lies:shared"}])},
             r"reward term shared: shape: \[3, 20\] is not \[20, 3\]",

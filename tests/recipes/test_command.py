@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
@@ -9,10 +10,14 @@ import pytest
 import yaml
 
 import damian
+from damian.common.errors import InputError
 from damian.delays.laws import sampler_of
+from damian.learners.config import LEARNERS, MappoConfig
 from damian.recipes import cli
+from damian.recipes.cli import settings
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
+from damian.recipes.shared.settings import check_learning
 
 
 @pytest.mark.parametrize(
@@ -94,7 +99,7 @@ def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, m
     found = [config.frames, config.seed, *config.model.hidden, config.worlds, config.episode.max_steps]
     assert found == [1_000_000, 7, 100, 64, 20, 30]
     assert {type(number) for number in found} == {int}
-    assert config.delays.obs.longest == 3
+    assert config.make_delays().obs.longest == 3
     assert damian.ClockConfig(simulation="50ms").steps("agents") == 1
 
 
@@ -227,3 +232,21 @@ def test_a_folder_that_cannot_be_written_is_one_line(capsys, tmp_path, monkeypat
     with pytest.raises(SystemExit):
         main(["train", "-m", "seed=0,1", "hydra.sweep.dir=file/sweep"])
     assert capsys.readouterr().err == "error: file/sweep: Not a directory\n"
+
+
+def test_a_belief_by_which_nothing_is_won_is_left_out_and_said():
+    with pytest.warns(UserWarning, match="observation.belief and model.skip: left out, because nothing"):
+        config = settings("scenario=patrol", "aware=belief")
+    assert (config.observation.belief, config.model.skip) == ([], False)
+
+
+def test_a_learner_is_judged_by_what_it_reads_not_by_the_shape_of_its_name():
+    read = {"reads": ("timeline",), "__doc__": "A learner of a plug-in.", "__module__": "lab"}
+    lab = LEARNERS.register("lab")(dataclass(type("Lab", (MappoConfig,), read)))
+    try:
+        assert type(settings("learner=mappo", "learner.name=lab", "delay.messages=2").learner) is lab
+        check_learning(settings("learner=mappo", "learner.name=lab", "delay.messages=2"))
+    finally:
+        del LEARNERS._components["lab"]
+    with pytest.raises(InputError, match=r"delay.messages: 2 is not read by learner=mappo"):
+        check_learning(settings("delay.messages=2"))

@@ -125,4 +125,4 @@ def test_a_policy_of_the_package_returns_what_its_card_says(folder):
     assert (told["law"], told["policy"]) == ("as trained", "sampled")
     assert f"{told['return']:.1f} ± {told['interval']:.1f}" in (folder / "README.md").read_text("utf-8")
     horizon = env.uav_env.scenario.episode.max_steps
-    assert evaluate(env, policy, horizon).return_ == pytest.approx(told["return"], rel=0.1)
+    assert evaluate(env, policy, horizon)["return"] == pytest.approx(told["return"], rel=0.1)

@@ -36,6 +36,7 @@ SETTINGS = {
     "delay.act": lambda name: {"law": "lag", "lag": {"law": name}},
     "links": lambda name: {"kind": "updown", "delay": {"law": name}, "loss": 0.0},
     "logger.custom": lambda name: [name],
+    "metrics": lambda name: [name],
     "reward.custom": lambda name: [{"term": name}],
     "observation.local_features": lambda name: [name],
     "observation.belief": lambda name: [name],

@@ -47,7 +47,7 @@ def fly(env: DelayedEnv, n_steps: int = STEPS) -> TensorDictBase:
 
 def buffer_of(env: DelayedEnv, corrected: Sequence[str]) -> ReplayBuffer:
     """A buffer in which late messages and rewards correct what is named."""
-    late = env.uav_env.scenario.delays.obs.late
+    late = env.delays.obs.late
     recompute = server_recompute(env.server, corrected, reward_terms=True) if late else None
     names = corrected if late else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in names])
@@ -120,12 +120,13 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     case, motion = CASES[name], "polynomial" if name in FLYING else "instant"
     scenario = everything(motion, episode=EpisodeConfig(max_steps=9), **case)
     on_time = replace(scenario, delay=replace(scenario.delay, obs=0, rew=0, order="generation"))
-    actor = scenario.links.kind == "server" and scenario.delays.obs.late
+    late_messages = scenario.make_delays().obs.late
+    actor = scenario.links.kind == "server" and late_messages
     corrected = ["reward", "critic", *["actor"] * actor]
     rollouts = (*backupdated(scenario, corrected), fly(training_env(on_time)))
     late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
     after = [keys.REWARD, keys.GLOBAL_OBSERVATION, *ENDS]
-    if scenario.delays.obs.late:
+    if late_messages:
         after += [(*keys.REWARD_TERMS, term) for term in scenario.reward.terms]
     for key in [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]:
         assert found[key].equal(true[key]), key

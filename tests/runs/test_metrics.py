@@ -115,7 +115,7 @@ def by_hand(flight: TensorDictBase, server: Server, needed: int) -> dict[str, fl
 def test_an_evaluation_equals_counting_step_by_step(motion, delay):
     flight, server = fly(joint_spotting(motion, DELAYS[delay]))
     expected = by_hand(flight, server, needed=2)
-    assert evaluation(flight, server).row() == pytest.approx(expected, rel=1e-5)
+    assert evaluation(flight, server) == pytest.approx(expected, rel=1e-5)
     assert 0 < expected["perceived_success_rate"] <= 1
     assert 0 < expected["success_rate"] < 1
 
@@ -127,13 +127,13 @@ def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion)
     for scenario in (joint_spotting(motion, DelayConfig()), stops):
         flight, server = fly(scenario)
         row = evaluation(flight, server)
-        assert (row.success_rate, row.steps, row.return_) == (
-            row.perceived_success_rate,
-            row.perceived_steps,
-            row.perceived_return,
+        assert (row["success_rate"], row["steps"], row["return"]) == (
+            row["perceived_success_rate"],
+            row["perceived_steps"],
+            row["perceived_return"],
         )
-        assert (row.late, row.lost) == (0.0, 0.0)
-        assert (row.age == 0) == (motion == "instant")
+        assert (row["late"], row["lost"]) == (0.0, 0.0)
+        assert (row["age"] == 0) == (motion == "instant")
 
 
 @both_motions
@@ -149,8 +149,8 @@ def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_o
     env = make_env(joint_spotting(motion, DelayConfig(), **sections), 24, seed=2, extras=["message"])
     same = env.rollout(HORIZON, again, break_when_any_done=False)
     late, on_time = evaluation(flight, server), evaluation(same, env.server)
-    assert on_time.return_ == on_time.perceived_return == pytest.approx(late.return_, rel=1e-6)
-    assert late.perceived_return != pytest.approx(late.return_, rel=0.01)
+    assert on_time["return"] == on_time["perceived_return"] == pytest.approx(late["return"], rel=1e-6)
+    assert late["perceived_return"] != pytest.approx(late["return"], rel=0.01)
 
 
 # Measures in training.

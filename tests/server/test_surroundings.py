@@ -65,7 +65,7 @@ def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
     scenario = ScenarioConfig(
         agents=agents,
         observation=ObservationConfig(local, shared, own=own, window=3),
-        region=RegionConfig(kind="random", pool=2, lattice_step=60.0),
+        region=RegionConfig(kind="random", pool=2, lattice_step=60.0, initial_conditions=8),
         delay=DelayConfig(obs=2),
         motion=MotionConfig(kind=motion, max_speed=10.0),
     )

@@ -10,7 +10,6 @@ from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
 from damian.server.config import ObservationConfig
-from damian.server.features.others import OTHERS
 from damian.server.termination import EpisodeConfig
 from damian.world.config import RegionConfig
 

@@ -246,8 +246,8 @@ FEATURES = Registry[Feature]("feature", Feature, "is not a feature: decorate a f
 
 
 def feature_of(name: str) -> Feature:
-    """The feature of a name or path."""
-    return FEATURES.get(name, "feature")
+    """The feature of a name or path, as it has been imported last."""
+    return FEATURES[name] if name in FEATURES else FEATURES.get(name, "feature")
 
 
 def check_features(config: ObservationConfig) -> None:
