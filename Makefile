@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-training | bench-gpu | fleet | fleet-campaign | benchmarl | upstream | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | coverage | test-browser | test-site | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-training | bench-gpu | fleet | fleet-campaign | benchmarl | upstream | pictures | docs | page-libraries | weight | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -10,7 +10,7 @@ PIP     = $(PY) -m pip install --quiet --disable-pip-version-check --no-compile 
 export PYTHONDONTWRITEBYTECODE :=
 
 RUN := runs/timeline_$(shell date +%Y-%m-%d_%H-%M-%S)
-.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-training bench-gpu fleet fleet-campaign benchmarl upstream pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow coverage test-browser test-site test-lowest test-newest package bench bench-jaxmarl bench-quick bench-training bench-gpu fleet fleet-campaign benchmarl upstream pictures docs page-libraries weight check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=1..7 aware=timeline \
@@ -144,6 +144,10 @@ page-libraries:
 	cp $(PAGE)/libraries/node_modules/uplot/dist/uPlot.min.css $(PAGE)/uplot.css
 	(printf 'three.js\n========\n\n'; cat $(PAGE)/libraries/node_modules/three/LICENSE; \
 	 printf '\n\nuPlot\n=====\n\n'; cat $(PAGE)/libraries/node_modules/uplot/LICENSE) > $(PAGE)/LICENSES.txt
+
+# Tokens of code, and how many stand in a line.
+weight:
+	$(PYTHON) tests/weight.py
 
 check: $(VENV)/dev
 	$(VENV)/bin/ruff format --check .
