@@ -22,7 +22,7 @@ from damian.server.features import ServerContext, check_features, feature_of, ob
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
-from damian.world.config import FOOTPRINT, IN_REACH
+from damian.world.config import FOOTPRINT
 from damian.world.coverage import KnownCoverage, tables_of_all
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.signal_source import footprint_radius
@@ -193,12 +193,10 @@ class Server:
         seen = {observer: getattr(self.observation, observer) for observer in observers}
         names = sorted({*self.reads, *itertools.chain(*seen.values())})
         features = self.features(messages, steps, names, coverage, belief)
-        if self.reward.detection == "truth":
-            first, _ = self._context.readings[IN_REACH]
-            messages = messages._replace(spotted=messages.readings[..., first] > 0.5)
+        judged = features
+        if self.reward.detection == "truth":  # from here on, for all that decides and pays
+            messages = messages.of_truth
             judged = self.features(messages, steps, self.reads, coverage, belief)
-        else:
-            judged = features
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         counters = Counters(steps, messages.motions)
         ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)

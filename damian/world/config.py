@@ -11,8 +11,6 @@ from damian.common.fields import Settings, check_place, constant, rules, setting
 RANDOM, GEOJSON, FILES = ("random",), ("geojson",), ("fir", "geojson")
 POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 """Variants of a section that read a setting (``kinds``)."""
-IN_REACH = "in_reach"
-"""The sensor that tells the truth about detections, for ``reward.detection=truth``."""
 FOOTPRINT = "footprint"
 """The sensor that tells the radius of a UAV's footprint, if it is drawn."""
 RANDOMISED = ("motion.max_speed", "motion.max_acceleration", "battery.capacity_kwh")
@@ -378,6 +376,11 @@ class WorldConfig(Settings):
         self._check_randomise()
         problem = "needs motion=polynomial: instant flights feel no wind"
         self.refuse(self.is_windy and self.motion.kind == "instant", "wind", problem)
+
+    @property
+    def tells_truth(self) -> bool:
+        """Whether messages also tell who truly was in reach of a source."""
+        return False
 
     @property
     def is_windy(self) -> bool:

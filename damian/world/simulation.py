@@ -39,7 +39,9 @@ class Simulation:
         self.radius = footprint_radius(config.source)
         """Radius of a footprint [m]."""
         n_readings = sum(each.width for each in self.sensors.values())
-        self.widths = Widths(len(self.sources), n_readings, config.requests.slots)
+        n_sources = len(self.sources)
+        n_truths = n_sources if config.tells_truth else 0
+        self.widths = Widths(n_sources, n_readings, config.requests.slots, n_truths)
         regions, longest = regions_of(config.region, rng), max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
@@ -162,23 +164,26 @@ class Simulation:
         position = state.position[..., :2]
         in_reach = self.in_reach(state, emits, on_ground)
         detected = self._reported(state, in_reach, on_ground.unsqueeze(-1))
-        spotted = detected.any(-1)
+        counts = (in_reach if self.widths.truths else detected).any(-1)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         trail, landed = self._stops(state, times, on_ground, action_valid)
         state, served, serves = self._serve(state, now, on_ground, action_valid)
+        true_time, true_position = self._true_detections(state, in_reach, times)
         messages = Messages(
             time=times,
             position=position,
             target=gather_rows(self.points, state.goal),
             track=state.track,
             battery=state.battery,
-            spotted=spotted,
+            spotted=detected.any(-1),
             empty=self._empty(state, on_ground),
             motions=state.motions,
             detected_time=torch.where(detected, times.unsqueeze(-1), state.sent.detected_time),
             detected_position=torch.where(
                 detected.unsqueeze(-1), position.unsqueeze(-2), state.sent.detected_position
             ),
+            true_time=true_time,
+            true_position=true_position,
             requests=self._heard(state, on_ground),
             served=served,
             serves=serves,
@@ -187,7 +192,7 @@ class Simulation:
             readings=self._readings(state),
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
-        return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
+        return state._replace(message_sent=sends, motions=torch.where(counts, 0, state.motions), sent=sent)
 
     def radii(self, state: State) -> Tensor | None:
         """Radius of the footprints of each world's UAVs [m], [B, 1], if it is drawn."""
@@ -214,6 +219,15 @@ class Simulation:
         seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
         share = counter_rng.uniform(seed, *counters, self.pairs)
         return torch.where(in_reach, share >= miss, listens & (share < alarm))
+
+    def _true_detections(self, state: State, in_reach: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
+        """When and where each UAV truly was in reach of each source last, if messages tell that."""
+        time, place = state.sent.true_time, state.sent.true_position
+        if not self.widths.truths:
+            return time, place
+        here = state.position[..., None, :2]
+        time = torch.where(in_reach, now.unsqueeze(-1), time)
+        return time, torch.where(in_reach.unsqueeze(-1), here, place)
 
     def _stops(
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
