@@ -396,5 +396,13 @@ class WorldConfig(Settings):
             good = isinstance(values, list) and 1 <= len(values) <= 8
             checks.require(good, own, values, "is not a range or a list of at most 8 values")
             section, _, name = key.partition(".")
+            given = getattr(getattr(self, section), name)
+            problem = (
+                f"draws one value for all UAVs, but {key}={given} has one for each: leave one of them out"
+            )
+            checks.require(not isinstance(given, list), own, values, problem)
+            apart = section == "source" and any(name in each for each in self.source.each)
+            problem = f"draws one value for all sources, but source.each tells {name}: leave one of them out"
+            checks.require(not apart, own, values, problem)
             for value in values:
                 replace(getattr(self, section), **{name: value})

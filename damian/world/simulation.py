@@ -114,16 +114,20 @@ class Simulation:
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
-        distance = gather_rows(self.candidates.distance, state.goal)
-        if self.vehicles.is_windy:
-            nearest = gather_rows(self.candidates.nearest, state.goal)
-            origin = state.goal.unsqueeze(-1).expand_as(nearest)
-            distance = self.vehicles.distance(state, origin, nearest).where(distance.isfinite(), torch.inf)
         reach = self.vehicles.reach(state).unsqueeze(-1)
-        valid = distance <= reach
+        valid = self._action_distances(state) <= reach
         if not self.candidates.can_hold:
             valid = valid | ~valid.any(-1, keepdim=True)
         return valid if self.vehicles.instant else torch.where(reach >= 0, valid, self.candidates.hold)
+
+    def _action_distances(self, state: State) -> Tensor:
+        """Lengths of the discrete actions for the batteries [m], infinite outside the region, [B, N, A]."""
+        distance = gather_rows(self.candidates.distance, state.goal)
+        if not self.vehicles.is_windy:
+            return distance
+        nearest = gather_rows(self.candidates.nearest, state.goal)
+        in_wind = self.vehicles.distance(state, state.goal.unsqueeze(-1).expand_as(nearest), nearest)
+        return in_wind.where(distance.isfinite(), torch.inf)
 
     # The stages of one step, in order.
 
@@ -273,7 +277,10 @@ class Simulation:
         if self.shortest_flight is None:
             return state.sent.empty
         reach = self.vehicles.battery_reach(state)
-        stuck = on_ground & (reach < gather_rows(self.shortest_flight, state.goal))
+        shortest = gather_rows(self.shortest_flight, state.goal)
+        if self.vehicles.is_windy:
+            shortest = self._shortest_in_wind(state)
+        stuck = on_ground & (reach < shortest)
         return stuck | (observed(state.battery, self.config.battery) <= 0)
 
     def _shortest_flights(self) -> Tensor:
@@ -292,6 +299,23 @@ class Simulation:
         problem = "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
         checks.require(moves, "actions.distances", actions.distances, problem)
         return length.where(length.isfinite(), 0.0)
+
+    def _shortest_in_wind(self, state: State) -> Tensor:
+        """As ``shortest_flight`` for each UAV, as long as the flights are for the batteries now, [B, N]."""
+        if self.config.actions.kind == "discrete":
+            length = self._action_distances(state)
+        else:
+            n_points = self.airspace.max_points
+            goals = torch.arange(n_points, device=state.goal.device)
+            goals = (state.region.unsqueeze(-1) * n_points + goals).unsqueeze(1)  # [B, 1, L]
+            goals = goals.expand(-1, state.goal.shape[-1], -1)
+            origin = state.goal.unsqueeze(-1).expand_as(goals)
+            straight = self.airspace.length(origin, goals)
+            near = straight < 2 * self.candidates.max_distance  # false for padded points
+            goals = torch.where(near, goals, origin)
+            length = self.vehicles.distance(state, origin, goals)
+        shortest = length.where(length > 0, torch.inf).amin(-1)
+        return shortest.where(shortest.isfinite(), 0.0)
 
     def _readings(self, state: State) -> Tensor:
         """Readings of all sensors beside each other, [B, N, K]."""
