@@ -159,7 +159,7 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         footprints=None,
         points=torch.zeros(1, 2),
     )
-    return messages, server, Counters(number, motions)
+    return messages, server, Counters(number, motions, torch.ones_like(messages.spotted))
 
 
 def converted(name: str, value: float, detected: bool) -> float:

@@ -56,9 +56,10 @@ class Drop(WorldTransform):
 class ServerNode(WorldTransform):
     """Computes observations, rewards and the task's status from the messages that have arrived.
 
-    It writes the entries that ``UavEnv`` writes itself when no message is delayed; after a reset, the server,
-    and every UAV, holds the first message of every UAV. ``damian.make_env`` adds it where a scenario delays
-    or loses messages, or UAVs hear each other.
+    It writes the entries that ``UavEnv`` writes itself when no message is delayed, and, into the messages
+    that it holds, what the server knows without them; after a reset, the server, and every UAV, holds the
+    first message of every UAV. ``damian.make_env`` adds it where a scenario delays or loses messages, or UAVs
+    hear each other.
 
     Args:
         server: server node that does the computations.
@@ -85,41 +86,53 @@ class ServerNode(WorldTransform):
         super().__init__([message_key], [*created, keys.SUCCESS, *keys.ENDS])
         self.server, self.heard_key, self.reward_terms = server, heard_key, reward_terms
         self.own_key = keys.MESSAGE if server.observation.own else None
+        is_late = message_key != keys.MESSAGE
+        self.known_key = keys.MESSAGE if server.knows_requests and is_late else None
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + server.observation.own] if server.grid else []
         self.step_keys = [*self.required_keys, keys.SOURCE_OVER]
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
-        return existing([*self.in_keys, self.heard_key, self.own_key, *self.belief_keys])
+        return existing([*self.in_keys, self.heard_key, self.own_key, self.known_key, *self.belief_keys])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])
         memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
+        memory["held"] = torch.zeros_like(rows[..., 0])  # when the messages were sent that the server held
         if not self.server.remembers_coverage:
             return memory
         trail = self.server.counted(self.server.messages(rows))
         return memory | {"trail": trail, "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
+        begun = {"elapsed": mask, "held": mask.unsqueeze(-1)}
+        memory = memory | {name: memory[name].masked_fill(rows, 0) for name, rows in begun.items()}
         if "coverage" in memory:
             memory["coverage"] = memory["coverage"].masked_fill(expand_mask(mask, memory["coverage"]), -1)
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
+        sent = entries.get(keys.MESSAGE, received)
+        if self.known_key:
+            received = self.server.with_own_knowledge(received, sent)
         steps, messages = elapsed.view(self.rows), self.server.messages(received)
+        news = messages.time != memory["held"]
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
-        outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, entries.get(keys.BELIEF))
+        over, belief = entries.get(keys.SOURCE_OVER), entries.get(keys.BELIEF)
+        outputs = self.server(messages, steps, over, known, belief, news=news)
         written = outputs.entries(self.reward_terms)
+        if self.known_key:
+            written[self.in_keys[0]] = received
         if self.heard_key:
-            heard = self.server.messages(entries[self.heard_key])
+            rows = self.server.with_own_knowledge(entries[self.heard_key], sent.unsqueeze(-3))
+            heard = self.server.messages(rows)
             written[keys.OBSERVATION] = self.server.observe_each(heard, steps)
         elif self.own_key:
             written[keys.OBSERVATION] = self.server.observe_with_own_messages(
                 received, entries[self.own_key], steps, belief=entries.get(keys.OWN_BELIEF)
             )
-        memory = {"elapsed": elapsed}
+        memory = {"elapsed": elapsed, "held": messages.time.clone()}
         if outputs.coverage is not None:
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
         return memory, written

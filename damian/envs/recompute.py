@@ -33,6 +33,7 @@ def server_recompute(
         elapsed = steps[next_key(keys.STEP_COUNT)].squeeze(-1)
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
         belief = beliefs_in_hindsight(server, steps) if believes else None
+        messages = server.with_own_knowledge(messages, steps[next_key(keys.MESSAGE)])
         held = server.messages(messages)
         outputs = server(held, elapsed, source_over, belief=belief, observers=observers)
         entries = outputs.entries(reward_terms)

@@ -86,6 +86,8 @@ class Server:
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._widths = simulation.widths
+        knows = simulation.config.requests.known_at_once
+        self._known_columns = Messages.request_columns(simulation.widths) if knows else None
         footprints, surrounded = None, "coverage_map" in self.names
         levels = simulation.vehicles.values.choices.get("source.level_db")
         source, radii, scaled = simulation.config.source, [simulation.radius], None
@@ -161,6 +163,22 @@ class Server:
         """Messages from their packed rows [*, N, M], with the readings of all sensors."""
         return Messages.unpack(rows, self._widths)
 
+    @property
+    def knows_requests(self) -> bool:
+        """Whether the server knows at once, without any message, which requests have appeared."""
+        return self._known_columns is not None
+
+    def with_own_knowledge(self, rows: Tensor, sent: Tensor) -> Tensor:
+        """Packed messages [*, N, M] that the server holds, and with them what it knows itself.
+
+        The requests are those in ``sent``, what each UAV would send now, [*, N, M].
+        """
+        if self._known_columns is None:
+            return rows
+        known = rows.clone()
+        known[..., self._known_columns] = sent[..., self._known_columns]
+        return known
+
     def counted(self, messages: Messages) -> Tensor:
         """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
         return messages.trail[..., : self.observation.window]
@@ -185,10 +203,12 @@ class Server:
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
         observers: Collection[str] = ("actor", "critic"),
+        news: Tensor | None = None,
     ) -> ServerOutputs:
         """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and what ``observers`` observe.
 
-        Without ``source_over`` the source never ends.
+        Without ``source_over`` the source never ends. ``news``: which messages the server has not held
+        before, [*, N]; those of now if not given, as without delay and in hindsight.
         """
         seen = {observer: getattr(self.observation, observer) for observer in observers}
         names = sorted({*self.reads, *itertools.chain(*seen.values())})
@@ -198,7 +218,9 @@ class Server:
             messages = messages.of_truth
             judged = self.features(messages, steps, self.reads, coverage, belief)
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
-        counters = Counters(steps, messages.motions)
+        if news is None:
+            news = messages.time == (steps * self.dt).unsqueeze(-1)
+        counters = Counters(steps, messages.motions, news)
         ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
         terms = reward(judged, counters, self.terms)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)

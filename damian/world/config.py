@@ -248,17 +248,25 @@ class RequestConfig(Settings):
     section: ClassVar[str] = "requests"
 
     rate: float = setting(
-        0.0, "Mean number that appears in a minute, at most one in a step.", unit="1/min", low=0, high=6000
+        0.0, "Mean number that appears in a minute (a Poisson process).", unit="1/min", low=0, high=6000
     )
     most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
     range: float | None = setting(
-        None, "UAVs on the ground hear of those within it; everybody at once if not given.", unit="m", above=0
+        None,
+        "UAVs on the ground hear of those within it; the server knows all at once if not given.",
+        unit="m",
+        above=0,
     )
 
     @property
     def slots(self) -> int:
         """Number of requests that a world holds; 0 if none appears."""
         return self.most if self.rate > 0 else 0
+
+    @property
+    def known_at_once(self) -> bool:
+        """Whether requests appear that the server itself knows of at once."""
+        return self.slots > 0 and self.range is None
 
 
 @dataclass

@@ -65,7 +65,10 @@ class Messages(NamedTuple):
     true_position: Annotated[Tensor, Column(None)]
     """As ``detected_position``, of where the UAV truly was in reach, [*, N, T, 2]."""
     requests: Annotated[Tensor, Column(None)]
-    """The latest request of each slot (``damian.world.requests``), [*, N, M, 3]."""
+    """The latest request of each slot (``damian.world.requests``) that the UAV has heard of, [*, N, M, 3].
+
+    Without ``requests.range``, that which there is now, also if the UAV sends nothing.
+    """
     served: Annotated[Tensor, Column(None)]
     """When the latest request of each slot that the UAV has served appeared [s], [*, N, M]; -1 if none."""
     serves: Annotated[Tensor, Column(None)]
@@ -114,6 +117,12 @@ class Messages(NamedTuple):
             requests=found.requests.unflatten(-1, (widths.requests, 3)),
         )
 
+    @staticmethod
+    def request_columns(widths: Widths) -> slice:
+        """The columns of ``requests`` in packed rows."""
+        first = _FIXED + sum(_variable(widths)[: _VARIABLE.index("requests")])
+        return slice(first, first + 3 * widths.requests)
+
     @property
     def spots(self) -> Tensor:
         """Whether the UAV spots each source, [*, N, K]."""
@@ -145,6 +154,10 @@ _ROWS = ("detected_position", "true_position", "requests")
 """Fields that have a row for each source or request."""
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
 """Number of columns of all fields whose number does not depend on the settings; they come first."""
+
+
+_VARIABLE = [name for name, column in zip(_HINTS, _COLUMNS, strict=True) if column.width is None]
+"""Names of the other fields."""
 
 
 def _variable(widths: Widths) -> list[int]:

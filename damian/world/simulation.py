@@ -17,7 +17,7 @@ from damian.world.landing import Candidates, Ranking, assign_landing_points
 from damian.world.messages import Messages, Widths
 from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
-from damian.world.requests import appear, request_places, serve
+from damian.world.requests import appear, poisson_arrivals, serve
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import Walk, draw_walks, drawn_radius, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
@@ -49,7 +49,8 @@ class Simulation:
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         if self.widths.requests:
-            self.request_places = request_places(regions, rng)
+            mean = config.requests.rate * dt / 60
+            self.arrivals = poisson_arrivals(regions, self.widths.requests, mean, rng)
         self.misses, self.false_alarms = (
             torch.tensor([getattr(source, name) for source in self.sources])
             for name in ("miss", "false_alarm")
@@ -196,6 +197,8 @@ class Simulation:
             readings=self._readings(state),
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
+        if self.config.requests.known_at_once:
+            sent = sent._replace(requests=messages.requests)
         return state._replace(message_sent=sends, motions=torch.where(counts, 0, state.motions), sent=sent)
 
     def radii(self, state: State) -> Tensor | None:
@@ -249,13 +252,12 @@ class Simulation:
     def _serve(
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
     ) -> tuple[State, Tensor, Tensor]:
-        """Let a request appear, and the UAVs that land serve some, as in ``Messages``."""
+        """Let requests appear, and the UAVs that land serve some, as in ``Messages``."""
         served, serves = state.sent.served, state.sent.serves
         if not self.widths.requests:
             return state, served, serves
-        probability = -math.expm1(-self.config.requests.rate * self.dt / 60)
         counters = state.seed, state.episode, state.steps, state.region
-        requests = appear(state.requests, served, probability, self.request_places, counters, now)
+        requests = appear(state.requests, served, self.arrivals, counters, now)
         lands = self.vehicles.new_stop(state, on_ground, action_valid)
         lands = on_ground if lands is None else lands
         drawn = self.radii(state)
@@ -266,7 +268,7 @@ class Simulation:
     def _heard(self, state: State, on_ground: Tensor) -> Tensor:
         """The latest request of each slot that each UAV knows, [B, N, M, 3]."""
         requests, reach = state.requests.unsqueeze(-3), self.config.requests.range
-        if reach is None:
+        if reach is None:  # everybody knows of all
             return requests.expand(-1, on_ground.shape[-1], -1, -1)
         ways = requests[..., :2] - state.position[..., None, :2]
         hears = on_ground.unsqueeze(-1) & (ways.square().sum(-1) <= reach**2)
