@@ -141,6 +141,8 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         motions=motions,
         detected_time=(zeros + detected[:, None])[..., None],
         detected_position=(zeros[..., None] + estimate[:, None])[..., None, :],
+        true_time=place.new_zeros(*place.shape[:-1], 0),
+        true_position=place.new_zeros(*place.shape[:-1], 0, 2),
         requests=place.new_zeros(*place.shape[:-1], 0, 3),
         served=place.new_zeros(*place.shape[:-1], 0),
         serves=place.new_zeros(*place.shape[:-1], 0),
@@ -155,7 +157,7 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         observation=ObservationConfig(),
         points=torch.zeros(1, 2),
     )
-    return messages, server, Counters(number, motions)
+    return messages, server, Counters(number, motions, torch.ones_like(messages.spotted))
 
 
 def converted(name: str, value: float, detected: bool) -> float:

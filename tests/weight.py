@@ -45,9 +45,7 @@ def weight(path: Path) -> tuple[int, int]:
 
 
 def main() -> None:
-    listed = subprocess.run(
-        ["git", "ls-files", "*.py"], check=True, capture_output=True, text=True
-    )
+    listed = subprocess.run(["git", "ls-files", "*.py"], check=True, capture_output=True, text=True)
     for group, folders in GROUPS.items():
         tokens, lines = Counter[str](), Counter[str]()
         for name in listed.stdout.split():

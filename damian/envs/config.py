@@ -9,7 +9,7 @@ from damian.common import checks
 from damian.common.fields import Settings, setting
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.world.config import FOOTPRINT, IN_REACH, WorldConfig
+from damian.world.config import FOOTPRINT, WorldConfig
 
 if TYPE_CHECKING:
     from damian.delays.scenario import ScenarioDelays
@@ -79,8 +79,8 @@ class ScenarioConfig(WorldConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        told = {IN_REACH: self.reward.detection == "truth", FOOTPRINT: "source.level_db" in self.randomise}
-        self.sensors = [*self.sensors, *(each for each in told if told[each] and each not in self.sensors)]
+        if "source.level_db" in self.randomise and FOOTPRINT not in self.sensors:
+            self.sensors = [*self.sensors, FOOTPRINT]
         links, observation, episode = self.links.kind, self.observation, self.episode
         problem = "does not go with clock.server: between two broadcasts no observation changes"
         self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)
@@ -114,6 +114,10 @@ class ScenarioConfig(WorldConfig):
         from damian.delays.scenario import ScenarioDelays  # noqa: PLC0415 (settings load without torch)
 
         return ScenarioDelays(self.delay, self.links, self.clock.dt, "delay.loss" in self.randomise)
+
+    @property
+    def tells_truth(self) -> bool:
+        return self.reward.detection == "truth"
 
     @property
     def seeks_source(self) -> bool:

@@ -56,9 +56,10 @@ class Drop(WorldTransform):
 class ServerNode(WorldTransform):
     """Computes observations, rewards and the task's status from the messages that have arrived.
 
-    It writes the entries that ``UavEnv`` writes itself when no message is delayed; after a reset, the server,
-    and every UAV, holds the first message of every UAV. ``damian.make_env`` adds it where a scenario delays
-    or loses messages, or UAVs hear each other.
+    It writes the entries that ``UavEnv`` writes itself when no message is delayed, and, into the messages
+    that it holds, what the server knows without them; after a reset, the server, and every UAV, holds the
+    first message of every UAV. ``damian.make_env`` adds it where a scenario delays or loses messages, or UAVs
+    hear each other.
 
     Args:
         server: server node that does the computations.
@@ -89,36 +90,48 @@ class ServerNode(WorldTransform):
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + own] if server.grid else []
         heard = [keys.HEARD_STOPS] if heard_key else [keys.OWN_STOPS] if own else []
         self.stop_keys = [keys.STOPS, *heard] if timeline else []
+        is_late = message_key != keys.MESSAGE
+        self.known_key = keys.MESSAGE if server.knows_requests and is_late else None
         self.step_keys = [*self.required_keys, keys.SOURCE_OVER]
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
-        read = [*self.in_keys, self.heard_key, self.own_key, *self.belief_keys, *self.stop_keys]
-        return existing(read)
+        read = [*self.in_keys, self.heard_key, self.own_key, self.known_key]
+        return existing([*read, *self.belief_keys, *self.stop_keys])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])
         memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
+        memory["held"] = torch.zeros_like(rows[..., 0])  # when the messages were sent that the server held
         if not self.server.remembers_coverage:
             return memory
         trail = self.server.counted(self.server.messages(rows))
         return memory | {"trail": trail, "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
+        begun = {"elapsed": mask, "held": mask.unsqueeze(-1)}
+        memory = memory | {name: memory[name].masked_fill(rows, 0) for name, rows in begun.items()}
         if "coverage" in memory:
             memory["coverage"] = memory["coverage"].masked_fill(expand_mask(mask, memory["coverage"]), -1)
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
+        sent = entries.get(keys.MESSAGE, received)
+        if self.known_key:
+            received = self.server.with_own_knowledge(received, sent)
         steps, messages = elapsed.view(self.rows), self.server.messages(received)
+        news = messages.time != memory["held"]
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
-        belief, timeline = entries.get(keys.BELIEF), entries.get(keys.STOPS)
-        outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, belief, timeline)
+        over, belief = entries.get(keys.SOURCE_OVER), entries.get(keys.BELIEF)
+        timeline = entries.get(keys.STOPS)
+        outputs = self.server(messages, steps, over, known, belief, timeline, news=news)
         written = outputs.entries(self.reward_terms)
+        if self.known_key:
+            written[self.in_keys[0]] = received
         if self.heard_key:
-            heard = self.server.messages(entries[self.heard_key])
+            rows = self.server.with_own_knowledge(entries[self.heard_key], sent.unsqueeze(-3))
+            heard = self.server.messages(rows)
             heard_timeline = _by_sender(entries[keys.HEARD_STOPS]) if timeline is not None else None
             written[keys.OBSERVATION] = self.server.observe_each(heard, steps, timeline=heard_timeline)
         elif self.own_key:
@@ -130,7 +143,7 @@ class ServerNode(WorldTransform):
                 timeline,
                 entries.get(keys.OWN_STOPS),
             )
-        memory = {"elapsed": elapsed}
+        memory = {"elapsed": elapsed, "held": messages.time.clone()}
         if outputs.coverage is not None:
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
         return memory, written

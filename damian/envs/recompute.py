@@ -40,6 +40,7 @@ def server_recompute(
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
         belief = beliefs_in_hindsight(server, steps) if believes else None
         timeline = timeline_in_hindsight(server, steps) if timed else None
+        messages = server.with_own_knowledge(messages, steps[next_key(keys.MESSAGE)])
         held = server.messages(messages)
         remembered = {"belief": belief, "timeline": timeline}
         outputs = server(held, elapsed, source_over, **remembered, observers=observers)

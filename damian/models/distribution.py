@@ -22,9 +22,12 @@ class LegalCategorical(Distribution):
     """
 
     def __init__(self, logits: Tensor, mask: Tensor | None = None) -> None:
-        legal = logits if mask is None else logits.masked_fill(~mask, -1e8)
-        self.logits = legal.log_softmax(-1)
-        super().__init__(legal.shape[:-1], validate_args=False)
+        lowest = torch.finfo(logits.dtype).min
+        logits = logits.clamp(min=lowest / 4)  # finite, so that an entropy is
+        if mask is not None:
+            logits = logits.masked_fill(~mask, lowest / 2)  # far below all legal ones, whatever these are
+        self.logits = logits.log_softmax(-1)
+        super().__init__(logits.shape[:-1], validate_args=False)
 
     @property
     def probs(self) -> Tensor:
@@ -44,7 +47,7 @@ class LegalCategorical(Distribution):
         return (cumulative <= drawn * cumulative[..., -1:]).sum(-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability of actions [*sample_shape, *], about -1e8 where they are illegal."""
+        """Log-probability of actions [*sample_shape, *], finite but very low where they are illegal."""
         logits = self.logits.expand(*value.shape, -1)
         return logits.gather(-1, value.unsqueeze(-1)).squeeze(-1)
 

@@ -45,7 +45,7 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
                 checks.require(same, key, "local", should)
     for term in server.terms.values():
         with naming_errors(f"reward term {term.name}"):
-            term.value(found, Counters(steps, messages.motions))
+            term.value(found, Counters(steps, messages.motions, messages.time >= 0))
     return found
 
 

@@ -22,6 +22,8 @@ class Counters(NamedTuple):
     """Elapsed steps of the episode, [*]."""
     motions: Tensor
     """Motions since each UAV last spotted the source, [*, N]."""
+    news: Tensor
+    """Whether the server has not held each UAV's message before, [*, N] bool: pay an event only then."""
 
 
 class RewardTerm(NamedTuple):
@@ -154,7 +156,7 @@ def _add(name: str, scope: str, compute: Callable[..., Tensor]) -> None:
 _add("coverage", "individual", lambda x, counters: x)
 _add("spotted", "individual", _per_motion)
 _add("battery", "individual", lambda x, counters: x)
-_add("served", "individual", lambda x, counters: x)
+_add("served", "individual", lambda x, counters: x * counters.news)
 _add("source_distance", "system", lambda x, counters: _per_motion(1 - x, counters))
 _add("source_time", "system", lambda x, counters: 1 - x)
 _add("source_bearing", "system", lambda x, counters: 1 - x)

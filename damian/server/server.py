@@ -24,7 +24,7 @@ from damian.server.features.timeline import first_timeline, stop_ages, stop_plac
 from damian.server.layout import Layout
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.termination import Status, status
-from damian.world.config import FOOTPRINT, IN_REACH
+from damian.world.config import FOOTPRINT
 from damian.world.coverage import KnownCoverage
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.signal_source import footprint_radius
@@ -88,6 +88,8 @@ class Server:
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._widths = simulation.widths
+        knows = simulation.config.requests.known_at_once
+        self._known_columns = Messages.request_columns(simulation.widths) if knows else None
         levels = simulation.vehicles.values.choices.get("source.level_db")
         radii = [
             footprint_radius(replace(simulation.config.source, level_db=level)) for level in levels or ()
@@ -142,6 +144,22 @@ class Server:
         """Messages from their packed rows [*, N, M], with the readings of all sensors."""
         return Messages.unpack(rows, self._widths)
 
+    @property
+    def knows_requests(self) -> bool:
+        """Whether the server knows at once, without any message, which requests have appeared."""
+        return self._known_columns is not None
+
+    def with_own_knowledge(self, rows: Tensor, sent: Tensor) -> Tensor:
+        """Packed messages [*, N, M] that the server holds, and with them what it knows itself.
+
+        The requests are those in ``sent``, what each UAV would send now, [*, N, M].
+        """
+        if self._known_columns is None:
+            return rows
+        known = rows.clone()
+        known[..., self._known_columns] = sent[..., self._known_columns]
+        return known
+
     def counted(self, messages: Messages) -> Tensor:
         """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
         return messages.trail[..., : self.observation.window]
@@ -159,22 +177,24 @@ class Server:
         belief: Tensor | None = None,
         timeline: Tensor | None = None,
         observers: Collection[str] = ("actor", "critic"),
+        news: Tensor | None = None,
     ) -> ServerOutputs:
         """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and what ``observers`` observe.
 
-        Without ``source_over`` the source never ends.
+        Without ``source_over`` the source never ends. ``news``: which messages the server has not held
+        before, [*, N]; those of now if not given, as without delay and in hindsight.
         """
         seen = {observer: getattr(self.observation, observer) for observer in observers}
         names = sorted({*self.reads, *itertools.chain(*seen.values())})
         features = self.features(messages, steps, names, coverage, belief, timeline)
-        if self.reward.detection == "truth":
-            first, _ = self._context.readings[IN_REACH]
-            messages = messages._replace(spotted=messages.readings[..., first] > 0.5)
+        judged = features
+        if self.reward.detection == "truth":  # from here on, for all that decides and pays
+            messages = messages.of_truth
             judged = self.features(messages, steps, self.reads, coverage, belief, timeline)
-        else:
-            judged = features
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
-        counters = Counters(steps, messages.motions)
+        if news is None:
+            news = messages.time == (steps * self.dt).unsqueeze(-1)
+        counters = Counters(steps, messages.motions, news)
         ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
         terms = reward(judged, counters, self.terms)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)

@@ -35,8 +35,7 @@ def status(
     if config.success_share is not None:
         success = messages.spotted.sum(-1) >= share_of(config.success_share, n_agents)
     if config.all_sources:
-        spotted = messages.detected_time == messages.time.unsqueeze(-1)  # by each UAV now
-        success = success | spotted.any(-2).all(-1)
+        success = success | messages.spots.any(-2).all(-1)
     if config.discharged_share is not None:
         ended = messages.empty.sum(-1) >= share_of(config.discharged_share, n_agents)
     if config.end_with_source:

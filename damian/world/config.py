@@ -11,8 +11,6 @@ from damian.common.fields import Settings, check_place, constant, rules, setting
 RANDOM, GEOJSON, FILES = ("random",), ("geojson",), ("fir", "geojson")
 POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 """Variants of a section that read a setting (``kinds``)."""
-IN_REACH = "in_reach"
-"""The sensor that tells the truth about detections, for ``reward.detection=truth``."""
 FOOTPRINT = "footprint"
 """The sensor that tells the radius of a UAV's footprint, if it is drawn."""
 RANDOMISED = ("motion.max_speed", "motion.max_acceleration", "battery.capacity_kwh")
@@ -251,17 +249,25 @@ class RequestConfig(Settings):
     section: ClassVar[str] = "requests"
 
     rate: float = setting(
-        0.0, "Mean number that appears in a minute, at most one in a step.", unit="1/min", low=0, high=6000
+        0.0, "Mean number that appears in a minute (a Poisson process).", unit="1/min", low=0, high=6000
     )
     most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
     range: float | None = setting(
-        None, "UAVs on the ground hear of those within it; everybody at once if not given.", unit="m", above=0
+        None,
+        "UAVs on the ground hear of those within it; the server knows all at once if not given.",
+        unit="m",
+        above=0,
     )
 
     @property
     def slots(self) -> int:
         """Number of requests that a world holds; 0 if none appears."""
         return self.most if self.rate > 0 else 0
+
+    @property
+    def known_at_once(self) -> bool:
+        """Whether requests appear that the server itself knows of at once."""
+        return self.slots > 0 and self.range is None
 
 
 @dataclass
@@ -381,6 +387,11 @@ class WorldConfig(Settings):
         self.refuse(self.is_windy and self.motion.kind == "instant", "wind", problem)
 
     @property
+    def tells_truth(self) -> bool:
+        """Whether messages also tell who truly was in reach of a source."""
+        return False
+
+    @property
     def is_windy(self) -> bool:
         """Whether there may be wind."""
         drawn = {"wind.speed", "wind.gusts"} & {*self.randomise}
@@ -394,5 +405,13 @@ class WorldConfig(Settings):
             good = isinstance(values, list) and 1 <= len(values) <= 8
             checks.require(good, own, values, "is not a range or a list of at most 8 values")
             section, _, name = key.partition(".")
+            given = getattr(getattr(self, section), name)
+            problem = (
+                f"draws one value for all UAVs, but {key}={given} has one for each: leave one of them out"
+            )
+            checks.require(not isinstance(given, list), own, values, problem)
+            apart = section == "source" and any(name in each for each in self.source.each)
+            problem = f"draws one value for all sources, but source.each tells {name}: leave one of them out"
+            checks.require(not apart, own, values, problem)
             for value in values:
                 replace(getattr(self, section), **{name: value})

@@ -27,6 +27,8 @@ class Widths(NamedTuple):
     """Number of values that the user's sensors read."""
     requests: int = 0
     """Number of requests that can be open at once, M."""
+    truths: int = 0
+    """Number of sources of which messages tell the true detections, too: K if rewards follow them."""
 
 
 ONE_SOURCE = Widths()
@@ -53,13 +55,20 @@ class Messages(NamedTuple):
     empty: Annotated[Tensor, Column(dtype=torch.bool)]
     """Whether the observed battery level is 0, or the battery allows nothing but holding."""
     motions: Annotated[Tensor, Column(dtype=torch.long)]
-    """Motions (holding included) since the latest detection before this message."""
+    """Motions (holding included) since the latest detection that counts before this message."""
     detected_time: Annotated[Tensor, Column(None)]
     """Time of the latest detection of each source [s], [*, N, K]; -1 if there was none."""
     detected_position: Annotated[Tensor, Column(None)]
     """Position of the UAV at its latest detection of each source, east, north [m], [*, N, K, 2]."""
+    true_time: Annotated[Tensor, Column(None)]
+    """As ``detected_time``, of when the UAV truly was in reach, [*, N, T]; T is K, or 0 if it is not told."""
+    true_position: Annotated[Tensor, Column(None)]
+    """As ``detected_position``, of where the UAV truly was in reach, [*, N, T, 2]."""
     requests: Annotated[Tensor, Column(None)]
-    """The latest request of each slot (``damian.world.requests``), [*, N, M, 3]."""
+    """The latest request of each slot (``damian.world.requests``) that the UAV has heard of, [*, N, M, 3].
+
+    Without ``requests.range``, that which there is now, also if the UAV sends nothing.
+    """
     served: Annotated[Tensor, Column(None)]
     """When the latest request of each slot that the UAV has served appeared [s], [*, N, M]; -1 if none."""
     serves: Annotated[Tensor, Column(None)]
@@ -76,12 +85,13 @@ class Messages(NamedTuple):
         """Messages of zeros, without a detection, of UAVs with the landing points ``trail`` [*, N, S]."""
         width = _FIXED + sum(_variable(widths)) + 2 * trail.shape[-1]
         blank = cls.unpack(torch.zeros(*trail.shape[:-1], width, device=trail.device), widths)
-        never = {name: getattr(blank, name) - 1 for name in ("detected_time", "requests", "served")}
+        unknown = ("detected_time", "true_time", "requests", "served")
+        never = {name: getattr(blank, name) - 1 for name in unknown}
         return blank._replace(**never, trail=trail)
 
     def pack(self) -> Tensor:
         """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through exactly."""
-        flat = {name: getattr(self, name).flatten(-2) for name in ("detected_position", "requests")}
+        flat = {name: getattr(self, name).flatten(-2) for name in _ROWS}
         fields = zip(self._replace(**flat), _COLUMNS, strict=True)
         parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
         return torch.cat(parts, -1)
@@ -101,16 +111,28 @@ class Messages(NamedTuple):
             field = part.squeeze(-1) if width == 1 else part
             fields.append(field > 0.5 if dtype == torch.bool else field.to(dtype))
         found = cls._make(fields)
-        at, requests = found.detected_position, found.requests
         return found._replace(
-            detected_position=at.unflatten(-1, (widths.sources, 2)),
-            requests=requests.unflatten(-1, (widths.requests, 3)),
+            detected_position=found.detected_position.unflatten(-1, (widths.sources, 2)),
+            true_position=found.true_position.unflatten(-1, (widths.truths, 2)),
+            requests=found.requests.unflatten(-1, (widths.requests, 3)),
         )
+
+    @staticmethod
+    def request_columns(widths: Widths) -> slice:
+        """The columns of ``requests`` in packed rows."""
+        first = _FIXED + sum(_variable(widths)[: _VARIABLE.index("requests")])
+        return slice(first, first + 3 * widths.requests)
 
     @property
     def spots(self) -> Tensor:
         """Whether the UAV spots each source, [*, N, K]."""
         return self.detected_time == self.time.unsqueeze(-1)
+
+    @property
+    def of_truth(self) -> "Messages":
+        """These messages, with the true detections in the place of those that the UAVs report."""
+        told = self._replace(detected_time=self.true_time, detected_position=self.true_position)
+        return told._replace(spotted=told.spots.any(-1))
 
     @property
     def in_flight(self) -> Tensor:
@@ -128,11 +150,17 @@ class Messages(NamedTuple):
 
 _HINTS = get_type_hints(Messages, include_extras=True)
 _COLUMNS: list[Column] = [hint.__metadata__[0] for hint in _HINTS.values()]
+_ROWS = ("detected_position", "true_position", "requests")
+"""Fields that have a row for each source or request."""
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
 """Number of columns of all fields whose number does not depend on the settings; they come first."""
 
 
+_VARIABLE = [name for name, column in zip(_HINTS, _COLUMNS, strict=True) if column.width is None]
+"""Names of the other fields."""
+
+
 def _variable(widths: Widths) -> list[int]:
     """Numbers of columns of the other fields, but those of the stops."""
-    n, m = widths.sources, widths.requests
-    return [n, 2 * n, 3 * m, m, min(m, 1), widths.readings]
+    n, m, t = widths.sources, widths.requests, widths.truths
+    return [n, 2 * n, t, 2 * t, 3 * m, m, min(m, 1), widths.readings]

@@ -6,6 +6,7 @@ time of each slot.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,10 +22,26 @@ _PLACES = 4096
 _APPEARS, _PLACE = counter_rng.number_of("request appears"), counter_rng.number_of("request place")
 
 
-def request_places(regions: Sequence[Region], rng: np.random.Generator) -> Tensor:
+class Arrivals(NamedTuple):
+    """How many requests appear in a step, and where."""
+
+    chance: Tensor
+    """Probability that at least 1, 2, ..., M appear, [M]."""
+    places: Tensor
     """Places uniform in each region, [R, P, 2] metres."""
-    places = [sample_interior(region.polygon, _PLACES, rng) for region in regions]
-    return torch.as_tensor(np.stack(places), dtype=torch.float32)
+    slots: Tensor
+    """Numbers of the slots, [M]; made within a step, they would not compile."""
+
+
+def poisson_arrivals(
+    regions: Sequence[Region], slots: int, mean: float, rng: np.random.Generator
+) -> Arrivals:
+    """Poisson numbers of requests, ``mean`` in a step, for worlds with M ``slots``."""
+    places = np.stack([sample_interior(region.polygon, _PLACES, rng) for region in regions])
+    # That at least k appear has the probability P(k, mean), the regularised lower incomplete gamma function.
+    at_least = torch.arange(1, slots + 1, dtype=torch.float64)
+    chance = torch.special.gammainc(at_least, torch.full_like(at_least, mean))
+    return Arrivals(chance.float(), torch.as_tensor(places, dtype=torch.float32), torch.arange(slots))
 
 
 def is_open(requests: Tensor, served: Tensor) -> Tensor:
@@ -34,28 +51,24 @@ def is_open(requests: Tensor, served: Tensor) -> Tensor:
 
 
 def appear(
-    requests: Tensor,
-    served: Tensor,
-    probability: float,
-    places: Tensor,
-    counters: tuple[Tensor, ...],
-    now: Tensor,
+    requests: Tensor, served: Tensor, arrivals: Arrivals, counters: tuple[Tensor, ...], now: Tensor
 ) -> Tensor:
-    """The slots [B, M, 3] after a step in which a request appears with a probability.
+    """The slots [B, M, 3] after a step, in which requests have appeared; none has when an episode begins.
 
-    It takes the slot whose request is the oldest of those that are served; if there is none, it is lost.
-    ``places``: of the world's region, [R, P, 2] by ``counters[-1]``, the region [B]; the others are the seed,
-    the episode and the step of each world [B]. ``now`` [B] is in seconds.
+    They take the slots whose requests are served, the oldest first; what finds none is lost. ``counters``:
+    the seed, the episode, the step and the region of each world [B]. ``now`` [B] is in seconds.
     """
-    seed, episode, step, region = counters
-    appears = counter_rng.uniform(seed, torch.full_like(step, _APPEARS), episode, step) < probability
-    number = counter_rng.bits(seed, torch.full_like(step, _PLACE), episode, step) % places.shape[1]
-    place = gather_rows(places.flatten(0, 1), region * places.shape[1] + number)
-    new = torch.cat([place, now.unsqueeze(-1)], -1)
+    seed, episode, step, region = (each.unsqueeze(-1) for each in counters)
+    share = counter_rng.uniform(seed, torch.full_like(step, _APPEARS), episode, step)
+    number = ((share < arrivals.chance) & (step > 0)).sum(-1, keepdim=True)
+    drawn = counter_rng.bits(seed, torch.full_like(step, _PLACE), episode, step, arrivals.slots)
+    n_places = arrivals.places.shape[1]
+    place = gather_rows(arrivals.places.flatten(0, 1), region * n_places + drawn % n_places)
+    new = torch.cat([place, now[:, None, None].expand_as(place[..., :1])], -1)
     age = requests[..., 2].masked_fill(is_open(requests, served), torch.inf)
-    taken = torch.arange(age.shape[-1], device=age.device) == age.argmin(-1, keepdim=True)
-    taken = taken & age.isfinite() & appears.unsqueeze(-1)
-    return torch.where(taken.unsqueeze(-1), new.unsqueeze(-2), requests)
+    rank = age.argsort(dim=-1, stable=True).argsort(-1)
+    taken = (rank < number) & age.isfinite()
+    return torch.where(taken.unsqueeze(-1), new, requests)
 
 
 def serve(

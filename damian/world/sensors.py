@@ -9,7 +9,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.registry import Registry, check_parameters, name_of
-from damian.world.config import FOOTPRINT, IN_REACH
+from damian.world.config import FOOTPRINT
 from damian.world.messages import Messages
 from damian.world.state import State
 
@@ -57,14 +57,6 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
 
 SENSORS = Registry[Sensor]("sensor", Sensor, "is not a sensor: decorate the function with damian.sensor")
 """Sensors, as ``package.module:name``."""
-
-
-@SENSORS.register(IN_REACH)
-@sensor()
-def in_reach(state: State, world: Any) -> Tensor:
-    """Whether a UAV is where it would spot a source if it never missed one, [B, N]: the simulator's truth."""
-    _, emits, _ = world.source_now(state)
-    return world.in_reach(state, emits, world.vehicles.on_ground(state)).any(-1).float()
 
 
 @SENSORS.register(FOOTPRINT)

@@ -17,7 +17,7 @@ from damian.world.landing import Candidates, Ranking, assign_landing_points
 from damian.world.messages import Messages, Widths
 from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
-from damian.world.requests import appear, request_places, serve
+from damian.world.requests import appear, poisson_arrivals, serve
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import Walk, draw_walks, drawn_radius, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
@@ -39,7 +39,9 @@ class Simulation:
         self.radius = footprint_radius(config.source)
         """Radius of a footprint [m]."""
         n_readings = sum(each.width for each in self.sensors.values())
-        self.widths = Widths(len(self.sources), n_readings, config.requests.slots)
+        n_sources = len(self.sources)
+        n_truths = n_sources if config.tells_truth else 0
+        self.widths = Widths(n_sources, n_readings, config.requests.slots, n_truths)
         regions, longest = regions_of(config.region, rng), max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
@@ -47,7 +49,8 @@ class Simulation:
         self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         if self.widths.requests:
-            self.request_places = request_places(regions, rng)
+            mean = config.requests.rate * dt / 60
+            self.arrivals = poisson_arrivals(regions, self.widths.requests, mean, rng)
         self.misses, self.false_alarms = (
             torch.tensor([getattr(source, name) for source in self.sources])
             for name in ("miss", "false_alarm")
@@ -112,16 +115,20 @@ class Simulation:
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
-        distance = gather_rows(self.candidates.distance, state.goal)
-        if self.vehicles.is_windy:
-            nearest = gather_rows(self.candidates.nearest, state.goal)
-            origin = state.goal.unsqueeze(-1).expand_as(nearest)
-            distance = self.vehicles.distance(state, origin, nearest).where(distance.isfinite(), torch.inf)
         reach = self.vehicles.reach(state).unsqueeze(-1)
-        valid = distance <= reach
+        valid = self._action_distances(state) <= reach
         if not self.candidates.can_hold:
             valid = valid | ~valid.any(-1, keepdim=True)
         return valid if self.vehicles.instant else torch.where(reach >= 0, valid, self.candidates.hold)
+
+    def _action_distances(self, state: State) -> Tensor:
+        """Lengths of the discrete actions for the batteries [m], infinite outside the region, [B, N, A]."""
+        distance = gather_rows(self.candidates.distance, state.goal)
+        if not self.vehicles.is_windy:
+            return distance
+        nearest = gather_rows(self.candidates.nearest, state.goal)
+        in_wind = self.vehicles.distance(state, state.goal.unsqueeze(-1).expand_as(nearest), nearest)
+        return in_wind.where(distance.isfinite(), torch.inf)
 
     # The stages of one step, in order.
 
@@ -162,23 +169,26 @@ class Simulation:
         position = state.position[..., :2]
         in_reach = self.in_reach(state, emits, on_ground)
         detected = self._reported(state, in_reach, on_ground.unsqueeze(-1))
-        spotted = detected.any(-1)
+        counts = (in_reach if self.widths.truths else detected).any(-1)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         trail, landed = self._stops(state, times, on_ground, action_valid)
         state, served, serves = self._serve(state, now, on_ground, action_valid)
+        true_time, true_position = self._true_detections(state, in_reach, times)
         messages = Messages(
             time=times,
             position=position,
             target=gather_rows(self.points, state.goal),
             track=state.track,
             battery=state.battery,
-            spotted=spotted,
+            spotted=detected.any(-1),
             empty=self._empty(state, on_ground),
             motions=state.motions,
             detected_time=torch.where(detected, times.unsqueeze(-1), state.sent.detected_time),
             detected_position=torch.where(
                 detected.unsqueeze(-1), position.unsqueeze(-2), state.sent.detected_position
             ),
+            true_time=true_time,
+            true_position=true_position,
             requests=self._heard(state, on_ground),
             served=served,
             serves=serves,
@@ -187,7 +197,9 @@ class Simulation:
             readings=self._readings(state),
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
-        return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
+        if self.config.requests.known_at_once:
+            sent = sent._replace(requests=messages.requests)
+        return state._replace(message_sent=sends, motions=torch.where(counts, 0, state.motions), sent=sent)
 
     def radii(self, state: State) -> Tensor | None:
         """Radius of the footprints of each world's UAVs [m], [B, 1], if it is drawn."""
@@ -215,6 +227,15 @@ class Simulation:
         share = counter_rng.uniform(seed, *counters, self.pairs)
         return torch.where(in_reach, share >= miss, listens & (share < alarm))
 
+    def _true_detections(self, state: State, in_reach: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
+        """When and where each UAV truly was in reach of each source last, if messages tell that."""
+        time, place = state.sent.true_time, state.sent.true_position
+        if not self.widths.truths:
+            return time, place
+        here = state.position[..., None, :2]
+        time = torch.where(in_reach, now.unsqueeze(-1), time)
+        return time, torch.where(in_reach.unsqueeze(-1), here, place)
+
     def _stops(
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
     ) -> tuple[Tensor, Tensor]:
@@ -231,13 +252,12 @@ class Simulation:
     def _serve(
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
     ) -> tuple[State, Tensor, Tensor]:
-        """Let a request appear, and the UAVs that land serve some, as in ``Messages``."""
+        """Let requests appear, and the UAVs that land serve some, as in ``Messages``."""
         served, serves = state.sent.served, state.sent.serves
         if not self.widths.requests:
             return state, served, serves
-        probability = -math.expm1(-self.config.requests.rate * self.dt / 60)
         counters = state.seed, state.episode, state.steps, state.region
-        requests = appear(state.requests, served, probability, self.request_places, counters, now)
+        requests = appear(state.requests, served, self.arrivals, counters, now)
         lands = self.vehicles.new_stop(state, on_ground, action_valid)
         lands = on_ground if lands is None else lands
         drawn = self.radii(state)
@@ -248,7 +268,7 @@ class Simulation:
     def _heard(self, state: State, on_ground: Tensor) -> Tensor:
         """The latest request of each slot that each UAV knows, [B, N, M, 3]."""
         requests, reach = state.requests.unsqueeze(-3), self.config.requests.range
-        if reach is None:
+        if reach is None:  # everybody knows of all
             return requests.expand(-1, on_ground.shape[-1], -1, -1)
         ways = requests[..., :2] - state.position[..., None, :2]
         hears = on_ground.unsqueeze(-1) & (ways.square().sum(-1) <= reach**2)
@@ -259,7 +279,10 @@ class Simulation:
         if self.shortest_flight is None:
             return state.sent.empty
         reach = self.vehicles.battery_reach(state)
-        stuck = on_ground & (reach < gather_rows(self.shortest_flight, state.goal))
+        shortest = gather_rows(self.shortest_flight, state.goal)
+        if self.vehicles.is_windy:
+            shortest = self._shortest_in_wind(state)
+        stuck = on_ground & (reach < shortest)
         return stuck | (observed(state.battery, self.config.battery) <= 0)
 
     def _shortest_flights(self) -> Tensor:
@@ -278,6 +301,23 @@ class Simulation:
         problem = "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
         checks.require(moves, "actions.distances", actions.distances, problem)
         return length.where(length.isfinite(), 0.0)
+
+    def _shortest_in_wind(self, state: State) -> Tensor:
+        """As ``shortest_flight`` for each UAV, as long as the flights are for the batteries now, [B, N]."""
+        if self.config.actions.kind == "discrete":
+            length = self._action_distances(state)
+        else:
+            n_points = self.airspace.max_points
+            goals = torch.arange(n_points, device=state.goal.device)
+            goals = (state.region.unsqueeze(-1) * n_points + goals).unsqueeze(1)  # [B, 1, L]
+            goals = goals.expand(-1, state.goal.shape[-1], -1)
+            origin = state.goal.unsqueeze(-1).expand_as(goals)
+            straight = self.airspace.length(origin, goals)
+            near = straight < 2 * self.candidates.max_distance  # false for padded points
+            goals = torch.where(near, goals, origin)
+            length = self.vehicles.distance(state, origin, goals)
+        shortest = length.where(length > 0, torch.inf).amin(-1)
+        return shortest.where(shortest.isfinite(), 0.0)
 
     def _readings(self, state: State) -> Tensor:
         """Readings of all sensors beside each other, [B, N, K]."""

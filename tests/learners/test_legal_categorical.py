@@ -1,5 +1,7 @@
 """The distribution of discrete actions, beside TorchRL's and torch's."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -54,6 +56,21 @@ def test_draws_are_legal_and_as_frequent_as_probable(shape, masked):
     illegal = ours.logits < -1e7
     assert illegal.any() == masked
     assert (ours.probs[illegal] == 0).all()
+
+
+@pytest.mark.parametrize("low", [-1e9, -1e30, -torch.inf])
+def test_however_low_the_logits_are_draws_are_legal_and_entropies_finite(low):
+    logits = torch.tensor([[low, low, 0.0, 1.0], [0.0, low, low, low]]).repeat(500, 1).requires_grad_()
+    mask = torch.tensor([[True, True, False, False], [True, True, False, False]]).repeat(500, 1)
+    distribution = LegalCategorical(logits, mask)
+    first, second = distribution.probs.view(500, 2, 4)[0]
+    assert first.tolist() == [0.5, 0.5, 0.0, 0.0]
+    assert second.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert mask.gather(-1, distribution.sample().unsqueeze(-1)).all()
+    entropy = distribution.entropy().view(500, 2)[0]
+    torch.testing.assert_close(entropy, torch.tensor([math.log(2), 0.0]))
+    entropy.sum().backward()
+    assert logits.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("n_legal", [1, 2, 7])

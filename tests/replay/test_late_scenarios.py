@@ -20,8 +20,8 @@ from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.server.config import ObservationConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
+from damian.world.config import RequestConfig, SourceConfig
 
 STEPS, WORLDS, LONGEST = 40, 4, 5
 LATE = {"law": "uniform", "low": 0, "high": LONGEST}
@@ -71,6 +71,12 @@ def backupdated(
     return late, in_order(buffer)
 
 
+REQUESTS = {
+    "requests": RequestConfig(rate=40.0, most=3),
+    "observation": ObservationConfig(["served"], ["others", "requests"], own=True),
+    "reward": RewardConfig(spotted=0.0, served=1.0),
+}
+UNSURE = SourceConfig(count=2, level_db=140.0, miss=0.4, false_alarm=0.3)
 CASES: dict[str, dict[str, Any]] = {
     "late messages": {"delay": DelayConfig(obs=LATE)},
     "late messages, the same features for all": {
@@ -98,6 +104,12 @@ CASES: dict[str, dict[str, Any]] = {
         "delay": DelayConfig(obs=LATE),
         "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7, stops=2, own=True),
     },
+    "late requests": {"delay": DelayConfig(obs=LATE), **REQUESTS},
+    "late truth": {
+        "delay": DelayConfig(obs=LATE),
+        "source": UNSURE,
+        "reward": RewardConfig(source_distance=0.5, detection="truth"),
+    },
     "links": {
         "delay": DelayConfig(obs=LATE, rew=LATE),
         "clock": ClockConfig(server="2s"),
@@ -106,6 +118,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 FLYING = {
     "late messages of two stops, timeline",
+    "late requests",
     "late messages",
     "late messages, slow server",
     "late and summed rewards",
@@ -139,6 +152,15 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
             assert not late[key][..., :n_features].equal(true[key][..., :n_features])
 
 
+def test_a_served_request_is_paid_in_hindsight_once_where_its_message_arrived():
+    scenario = square(source=SourceConfig(level_db=142.0), episode=EpisodeConfig(30), **REQUESTS)
+    late, found = backupdated(replace(scenario, delay=DelayConfig(obs=LATE, loss=0.5)), ["reward"])
+    true = fly(training_env(scenario))["next", "agents", "reward"]
+    arrived, known = late["next", "agents", "delay"] >= 0, STEPS - LONGEST
+    assert found["next", "agents", "reward"][:known].equal((true * arrived)[:known])
+    assert 5 < late["next", "agents", "reward"].sum() < true.sum()
+
+
 @pytest.mark.parametrize("corrected", [["reward"], ["critic"]], ids="+".join)
 def test_only_what_is_named_is_corrected(corrected):
     late, found = backupdated(square(delay=DelayConfig(obs=3)), corrected)
@@ -147,8 +169,19 @@ def test_only_what_is_named_is_corrected(corrected):
         assert found[key].equal(late[key]) == (name not in corrected)
 
 
-def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():
-    scenario = square(episode=EpisodeConfig(max_steps=12, success_share=0.3))
+@pytest.mark.parametrize(
+    "success",
+    [
+        {"episode": EpisodeConfig(12, success_share=0.3)},
+        {
+            "episode": EpisodeConfig(12, all_sources=True),
+            "source": UNSURE,
+            "reward": RewardConfig(detection="truth"),
+        },
+    ],
+)
+def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened(success):
+    scenario = square(**success)
     _, corrected = backupdated(replace(scenario, delay=DelayConfig(obs=3)), ["reward", "critic"], 16, 60)
     first_episode = corrected["step_count"].squeeze(-1).cumsum(0) == torch.arange(60).cumsum(0).view(60, 1)
     valid = first_episode & corrected["valid"].squeeze(-1)

@@ -19,7 +19,7 @@ def test_a_built_in_term_can_be_used_again_with_parameters_of_its_own():
     unused = {"term": "battery", "weight": 0.0, "name": "unused"}
     task = RewardConfig(spotted=0.0, mean_distance=1.0, custom=[again, unused])
     inputs = {name: torch.rand(2, 3) for name in BUILT_IN}
-    counters = Counters(steps=torch.ones(2), motions=torch.ones(2, 3))
+    counters = Counters(torch.ones(2), motions=torch.ones(2, 3), news=torch.ones(2, 3, dtype=torch.bool))
     ours = reward(inputs, counters, terms_of(task))
     assert [*ours] == task.terms == ["mean_distance", "close"]
     near = RewardConfig(spotted=0.0, mean_distance=2.0, desired_distance=0.2)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers import clock
 
+from damian.common import counter_rng
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
@@ -20,6 +21,7 @@ from damian.world.config import (
     MotionConfig,
     RegionConfig,
     RequestConfig,
+    SourceConfig,
     WindConfig,
 )
 
@@ -151,7 +153,6 @@ def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     envs = [make_env(replace(base, randomise={"source.level_db": levels}), 8)]
     envs += [make_env(scenario, 8) for scenario in scenarios]
     for env in envs:
-        env.uav_env.simulation.draws = True  # requests of the first step, too, are drawn in each episode
         env.set_seed(1)
     tds, met = [env.reset() for env in envs], set()
     for step in range(30):
@@ -213,9 +214,46 @@ def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
     assert ((share - torch.tensor([0.7, 0.1])).abs() < spread).all(), share
 
 
-def test_rewards_by_the_truth_are_those_without_misses_and_false_alarms():
-    reward = RewardConfig(spotted=0.0, spotting_agents=1.0)
-    clear = replace(STILL, reward=reward, source=replace(WORLD.source, level_db=150.0))
+def test_reports_of_two_sources_are_those_of_a_plain_loop():
+    each = [{"level_db": 150.0, "miss": 0.4, "false_alarm": 0.1}, {"level_db": 145.0, "miss": 0.2}]
+    moving = replace(WORLD.motion, max_speed=60.0, max_acceleration=40.0)
+    scenario = replace(WORLD, motion=moving, source=SourceConfig(count=2, each=each))
+    scenario = replace(scenario, episode=EpisodeConfig(None, all_sources=True))
+    env, tag = UavEnv(scenario, 8, seed=0), torch.tensor(counter_rng.number_of("report"))
+    td, missed, alarms, successes = env.reset(), 0, 0, 0
+    heard = [[[-1.0, -1.0] for _ in range(3)] for _ in range(8)]
+    for t in range(31):
+        state = env.state
+        ground = env.simulation.vehicles.on_ground(state)
+        counters = (state.seed, tag.expand(8), state.episode, state.steps)
+        counters = [each.view(8, 1, 1) for each in counters]
+        shares = counter_rng.uniform(*counters, torch.arange(6).view(3, 2)).tolist()
+        for b, n, k in itertools.product(range(8), range(3), range(2)):
+            share = shares[b][n][k]
+            way = math.dist(state.position[b, n, :2].tolist(), state.source[b, k].tolist())
+            near = way <= 10 ** ((each[k]["level_db"] - 105) / 20)
+            reports = share >= each[k]["miss"] if near else share < each[k].get("false_alarm", 0)
+            missed += bool(ground[b, n] and near and not reports)
+            alarms += bool(ground[b, n] and not near and reports)
+            if ground[b, n] and reports:
+                heard[b][n][k] = 2.0 * t
+                at = state.sent.detected_position[b, n, k]
+                assert at.equal(state.position[b, n, :2])
+        assert state.sent.detected_time.tolist() == heard
+        spotted = torch.tensor(heard) == state.sent.time.unsqueeze(-1)
+        assert state.sent.spotted.equal(spotted.any(-1))
+        if t:
+            assert td["success"][:, 0].equal(spotted.any(1).all(-1))
+            successes += int(td["success"].sum())
+        td = env.step(env.rand_action(td))["next"]
+    assert min(missed, alarms, successes) > 5
+
+
+@pytest.mark.parametrize("ends", [{"success_share": 0.6}, {"all_sources": True, "since_detection": True}])
+def test_the_truth_pays_and_ends_as_if_there_were_no_misses_and_false_alarms(ends):
+    reward = RewardConfig(spotted=1.0, spotting_agents=1.0, source_distance=0.5, bonus=7.0, penalty=3.0)
+    source, episode = SourceConfig(count=2, level_db=150.0), EpisodeConfig(12, **ends)
+    clear = replace(STILL, reward=reward, source=source, episode=episode)
     reported = replace(clear, source=replace(clear.source, miss=0.5, false_alarm=0.2))
     judged, rewards = replace(reported, reward=replace(clear.reward, detection="truth")), []
     for scenario in (clear, judged, reported):
@@ -225,10 +263,43 @@ def test_rewards_by_the_truth_are_those_without_misses_and_false_alarms():
         for step in range(20):
             action = torch.randint(24, (16, 3), generator=torch.Generator().manual_seed(step))
             td = env.step(td.set(("agents", "action"), action))["next"]
-            found.append(td["agents", "reward"])
+            decided = [td[name].float() for name in ("success", "terminated", "truncated")]
+            found.append(torch.cat([td["agents", "reward"].squeeze(-1), *decided], -1))
         rewards.append(torch.stack(found))
     assert rewards[1].equal(rewards[0])
-    assert not rewards[2].equal(rewards[0])
+    assert (rewards[2] != rewards[0]).flatten(0, 1).any(0).all()
+    assert rewards[0][..., -3:].flatten(0, 1).any(0).all()
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_a_battery_is_empty_where_it_allows_no_flight_in_this_wind(kind):
+    windy = replace(
+        WORLD,
+        motion=replace(WORLD.motion, max_speed=10.0, max_acceleration=4.0),
+        wind=WindConfig(speed=7.0, direction=0.0),
+        battery=BatteryConfig(enabled=True, capacity_kwh=0.01, charging_power_kw=1e-6),
+        actions=ActionConfig(kind, distances=[0.0, 60.0, 120.0]),
+    )
+    env = UavEnv(windy, 64, seed=1)
+    env.reset()
+    levels = torch.linspace(5, 45, 64).unsqueeze(-1).repeat(1, 3)
+    env.state = env.state._replace(battery=levels, battery_before=levels.clone())
+    td = env.rand_action()
+    td["agents", "action"] = torch.zeros_like(td["agents", "action"])  # all hold
+    td = env.step(td)["next"]
+    state, points = env.state, env.simulation.points.tolist()
+    reach, counts = env.simulation.vehicles.battery_reach(state), [0, 0]
+    for b, n in itertools.product(range(64), range(3)):
+        at = points[state.goal[b, n]]
+        if kind == "discrete":
+            goals = [points[p] for p in env.simulation.candidates.nearest[state.goal[b, n]]]
+        else:
+            goals = [p for p in points if math.dist(p, at) < 2 * 120]
+        ways = [through_the_air([at, goal], (0.0, -7.0), 10.0)[0] for goal in goals if goal != at]
+        stuck = reach[b, n] < min(ways) or state.battery[b, n] < 5
+        assert state.sent.empty[b, n].item() == stuck
+        counts[stuck] += 1
+    assert min(counts) > 20
 
 
 @pytest.mark.parametrize(
@@ -239,6 +310,14 @@ def test_rewards_by_the_truth_are_those_without_misses_and_false_alarms():
         ({"randomise": {"agents": [1, 2]}}, "randomise.agents: .* cannot be drawn, only motion.max_speed"),
         ({"randomise": {"wind.speed": [0, 1000]}}, "wind.speed: 1000"),
         ({"randomise": {"wind.speed": 3}}, "randomise.wind.speed: 3 is not a range"),
+        (
+            {"randomise": {"motion.max_speed": [5, 9]}},
+            "randomise.motion.max_speed: .* one for each: leave one",
+        ),
+        (
+            {"source": SourceConfig(each=[{"miss": 0.5}]), "randomise": {"source.miss": [0, 0.2]}},
+            "randomise.source.miss: .* source.each tells miss: leave one",
+        ),
     ],
 )
 def test_values_that_cannot_be_are_refused(changed, message):

@@ -10,7 +10,7 @@ from damian.baselines.script import script_policy
 from damian.common import counter_rng
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
@@ -31,31 +31,35 @@ def scenario(**changed) -> ScenarioConfig:
     return ScenarioConfig(agents=3, **settings | changed)
 
 
-@pytest.mark.parametrize("kind", ["instant", "polynomial"])
-def test_requests_appear_and_are_served_as_in_a_plain_loop(kind):
-    env = UavEnv(scenario(motion=MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)), 6, seed=2)
+@pytest.mark.parametrize(("kind", "dt"), [("instant", 1), ("polynomial", 1), ("instant", 5)])
+def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
+    motion = MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
+    env = UavEnv(scenario(motion=motion, clock=ClockConfig(f"{dt}s")), 6, seed=2)
     env.set_seed(5)
+    mean, several = RATE * dt / 60, 0
+    none_of = [math.exp(-mean) * mean**k / math.factorial(k) for k in range(MOST)]
+    at_least = [1 - math.fsum(none_of[:k]) for k in range(1, MOST + 1)]
+    tag = torch.tensor(counter_rng.number_of("request appears"))
     td, radius, served_ever, lost = env.reset(), env.simulation.radius, 0, 0
     slots = [[(*row,) for row in world] for world in env.state.requests.tolist()]
     memory = env.state.sent.served.tolist()
     for _ in range(60):
-        before = env.state
-        td = env.step_and_maybe_reset(env.rand_action(td))[1]
-        state = env.state
+        after, td = env.step_and_maybe_reset(env.rand_action(td))
+        state, rewards = env.state, after["next", "agents", "reward"]
+        shares = counter_rng.uniform(state.seed, tag.expand(6), state.episode, state.steps).tolist()
         lands = env.simulation.vehicles.new_stop(state, env.simulation.vehicles.on_ground(state), None)
         for b in range(6):
             if state.steps[b] == 0:
                 slots[b] = [(*row,) for row in state.requests[b].tolist()]
                 memory[b] = state.sent.served[b].tolist()
+                assert (state.requests[b, :, 2] == -1).all()
                 continue
-            tag = torch.tensor(counter_rng.number_of("request appears"))
-            share = counter_rng.uniform(state.seed[b], tag, state.episode[b], state.steps[b]).item()
-            if share < 1 - math.exp(-RATE / 60):
-                free = [m for m in range(MOST) if slots[b][m][2] <= max(row[m] for row in memory[b])]
-                lost += not free
-                if free:
-                    oldest = min(free, key=lambda m: slots[b][m][2])
-                    slots[b][oldest] = (*state.requests[b, oldest, :2].tolist(), float(state.steps[b]))
+            number = sum(shares[b] < chance for chance in at_least)
+            free = [m for m in range(MOST) if slots[b][m][2] <= max(row[m] for row in memory[b])]
+            lost += max(number - len(free), 0)
+            several += min(number, len(free)) > 1
+            for m in sorted(free, key=lambda m: slots[b][m][2])[:number]:
+                slots[b][m] = (*state.requests[b, m, :2].tolist(), float(state.steps[b] * dt))
             taken, was = set(), [max(row[m] for row in memory[b]) for m in range(MOST)]
             for n in range(3):
                 at = state.position[b, n, :2].tolist()
@@ -72,15 +76,17 @@ def test_requests_appear_and_are_served_as_in_a_plain_loop(kind):
                     taken.add(best)
                     memory[b][n][best] = slots[b][best][2]
                     served_ever += 1
+                assert rewards[b, n].item() == serves
                 if state.message_sent[b, n]:
                     assert state.sent.serves[b, n].item() == serves
             assert state.requests[b].tolist() == [list(row) for row in slots[b]]
             for n in range(3):
+                assert state.sent.requests[b, n].equal(state.requests[b])
                 if state.message_sent[b, n]:
                     assert state.sent.served[b, n].tolist() == memory[b][n]
-        assert before.seed.equal(state.seed)
     assert served_ever > 10
     assert lost > 0
+    assert several > 0
 
 
 def test_with_a_range_uavs_know_what_they_have_heard_on_the_ground():
@@ -101,28 +107,57 @@ def test_with_a_range_uavs_know_what_they_have_heard_on_the_ground():
     assert heard > 20
 
 
-def test_requests_appear_at_their_rate_anywhere_in_the_region():
-    env = UavEnv(scenario(requests=RequestConfig(rate=12.0, most=64)), 64, seed=0)
+@pytest.mark.parametrize(("rate", "dt", "n_steps"), [(12.0, 1, 39), (60.0, 5, 7)])
+def test_requests_appear_at_their_rate_anywhere_in_the_region(rate, dt, n_steps):
+    asked = scenario(requests=RequestConfig(rate, most=64), clock=ClockConfig(f"{dt}s"))
+    env = UavEnv(asked, 64, seed=0)
     env.reset()
-    for _ in range(39):
+    for _ in range(n_steps):
         env.rand_step()
     appeared = env.state.requests[env.state.requests[..., 2] >= 0]
-    expected = 64 * 39 * (1 - math.exp(-12 / 60))
+    expected = 64 * n_steps * rate * dt / 60
     assert abs(len(appeared) - expected) < 4 * math.sqrt(expected)
     for places, high in ((appeared[:, 0], 400), (appeared[:, 1], 300)):
         share = (places + high / 2) / high
         assert abs(share.mean() - 0.5) < 4 * math.sqrt(1 / 12 / len(share))
 
 
-def test_the_server_knows_of_service_only_what_has_arrived():
-    env = make_env(scenario(delay=DelayConfig(obs=4)), 32, 0, "cpu", ["message", "state"])
-    rollout = env.rollout(30, break_when_any_done=False)
-    server = env.uav_env.server
-    held, sent = (server.messages(rollout["agents", name]) for name in ("received", "message"))
-    assert held.served[:, 10:].equal(sent.served[:, 6:-4])
-    seen = rollout["agents", "global_observation"][..., 20:36].unflatten(-1, (4, 4))
-    assert seen[..., 3].sum() > 0
-    assert (seen[..., 3] <= (held.requests[..., 2].amax(-2) >= 0).sum(-1)[..., None, None]).all()
+@pytest.mark.parametrize("reach", [None, 150.0])
+def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
+    flying = MotionConfig(kind="polynomial", max_speed=60.0, max_acceleration=40.0)
+    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, loss=0.4)
+    asked = scenario(motion=flying, delay=late, requests=RequestConfig(RATE, 6, range=reach))
+    env = make_env(asked, 4, 0, extras=["message"])
+    steps = env.rollout(39, break_when_any_done=False)["next", "agents"]
+    server, shown, overtaken, paid, served = env.uav_env.server, 0, 0, 0, 0
+    held, sent = (server.messages(steps[name]) for name in ("received", "message"))
+    half = server.scales(held)[0, 0].item() / 2
+    seen = steps["global_observation"][..., 20:36].unflatten(-1, (4, 4))
+    assert held.requests.equal(sent.requests) == (reach is None)
+    for b in range(4):
+        before = [0.0] * 3
+        for t in range(39):
+            now = [field[b, t].tolist() for field in (held.time, held.serves, held.target)]
+            known, done = held.requests[b, t].tolist(), held.served[b, t].tolist()
+            newest = [max((row[m] for row in known), key=lambda request: request[2]) for m in range(6)]
+            last = [max(row[m] for row in done) for m in range(6)]
+            overtaken += any(row[m] != newest[m] for row in known for m in range(6))
+            opened = [x for x, when in zip(newest, last, strict=True) if x[2] > max(when, -0.5)]
+            for n, (time, serves, target) in enumerate(zip(*now, strict=True)):
+                pays = serves == [1.0] and time != before[n]
+                assert steps["reward"][b, t, n].item() == pays
+                rows = []
+                for east, north, when in sorted(opened, key=lambda x: math.dist(x[:2], target))[:4]:
+                    way = [(east - target[0]) / half, (north - target[1]) / half]
+                    rows.append([*(min(max(x, -1), 1) for x in way), (t + 1 - when) / 40, 1.0])
+                shown += len(rows)
+                rows += [[0.0] * 4] * (4 - len(rows))
+                torch.testing.assert_close(seen[b, t, n], torch.tensor(rows), rtol=0, atol=1e-5)
+                paid, before[n] = paid + pays, time
+                served += int(sent.serves[b, t, n, 0] * steps["message_sent"][b, t, n])
+    assert 5 < paid < served
+    assert shown > 100
+    assert (overtaken > 100) == (reach is not None)
 
 
 @pytest.mark.parametrize("reach", [None, 100.0])
@@ -141,3 +176,21 @@ def test_the_dispatcher_serves_more_than_chance(reach):
 def test_what_needs_requests_is_refused_without_them():
     with pytest.raises(InputError, match=r"requests.rate: 0 is 0, so that no request appears|requests.rate"):
         scenario(requests=RequestConfig())
+
+
+def test_a_uav_observes_the_nearest_open_requests_by_the_newest_that_anybody_knows():
+    env = UavEnv(scenario(), 1, seed=0)
+    sent, half = env.state.sent, env.simulation.airspace.scale.item() / 2
+    at = torch.tensor([[0.0, 0.0], [10.0, 0.0], [-60.0, 0.0]])
+    old, near, far, done = [50.0, 0, 1], [20.0, 0, 4], [-90.0, 0, 8], [5.0, 0, 6]
+    requests = torch.tensor([[old, far, [0, 0, -1.0]], [near, [0, 0, -1.0], done], [near, far, done]])
+    served = torch.tensor([[1.0, -1, -1], [-1, -1, 6], [-1, -1, -1]])  # the one before `near`, and `done`
+    messages = sent._replace(target=at[None], requests=requests[None], served=served[None])
+    seen = env.server.features(messages, torch.tensor([12]), ["requests"])["requests"][0].unflatten(
+        -1, (4, 4)
+    )
+    for (east, _), rows, order in zip(
+        at.tolist(), seen, [(near, far), (near, far), (far, near)], strict=True
+    ):
+        expected = [[(x - east) / half, 0.0, (12 - when) / 40, 1.0] for x, _, when in order]
+        torch.testing.assert_close(rows, torch.tensor([*expected, [0.0] * 4, [0.0] * 4]))
