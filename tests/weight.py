@@ -27,9 +27,9 @@ def docstrings(source: str) -> set[tuple[int, int]]:
     """Where statements that are nothing but a text begin, as (line, column)."""
     texts = set()
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            if isinstance(node.value.value, str):
-                texts.add((node.value.lineno, node.value.col_offset))
+        value = node.value if isinstance(node, ast.Expr) else None
+        if isinstance(value, ast.Constant) and isinstance(value.value, str):
+            texts.add((value.lineno, value.col_offset))
     return texts
 
 
