@@ -285,7 +285,9 @@ class StatefulTransform(Transform):
         """The rows whose agents have joined again in a step, [M] bool; None if none can."""
         key = self._own_done_key
         ended = None if key is None else before.get(key, None)
-        return None if ended is None else (ended & ~after.get(key)).reshape(-1)
+        if ended is None or ended.shape[:-1] != self.rows:  # the links of a ``Channel`` go on
+            return None
+        return (ended & ~after.get(key)).reshape(-1)
 
     def _begin_again(self, change: Change, entries: Entries, rows: Tensor) -> Change:
         """A change after which these rows [M] hold what they send in this step as their first message."""
