@@ -23,7 +23,7 @@ class Vehicle(Copter):
 
     def commands(self, *numbers: int) -> list[int]:
         """The commands that it has heard, but those that ask for telemetry."""
-        heard = [each.command for each in self.orders if each.command != 511]
+        heard = [each.command for each in self.orders if each.command not in (511, 512)]
         return [each for each in heard if not numbers or each in numbers]
 
     def step(self, now: float, messages: Any = ()) -> list[Any]:

@@ -237,8 +237,9 @@ def test_an_operator_is_heard_in_every_state_of_a_flight(state):
 
 def test_after_a_lost_link_it_reports_before_it_asks():
     world = in_state("cruise")
-    world.vehicle.silent = world.vehicle.deaf = True
     world.vehicle.speed = 0.5
+    world.run(2)  # it has heard that its commands are followed
+    world.vehicle.silent = world.vehicle.deaf = True
     world.run(10)
     n_sent, world.service.log = len(world.vehicle.orders), []
     world.run(10)
@@ -350,6 +351,7 @@ def test_what_waits_says_so(state, caplog):
     world = World() if state == "connect" else in_state("ground" if state == "watch" else state)
     if state == "watch":
         world.vehicle.change_mode(LOITER)
+    world.run(2 * (state != "connect"))
     world.vehicle.silent = state in ("connect", "cruise", "landing")
     world.run(75)
     assert caplog.text.count(f"A: {state} for ") in (1, 2)
