@@ -177,7 +177,7 @@ class Bridge:
         """Where the vehicle was at last [deg]."""
         self.now = self._since = self._place_at = self._steady = self._reported = -math.inf
         self._retry = self._asked_at = self._landed_at = self._commanded = -math.inf
-        self._heard_at = self._climbs_from = self._joined_at = self._stood_since = -math.inf
+        self._heard_at = self._climbs_from = self._handed_at = self._stood_since = -math.inf
         self._down, self._number, self._boots = math.inf, 0, 0
         self._came: dict[str, float] = {}
         self._due: dict[str, float] = {}
@@ -333,7 +333,7 @@ class Bridge:
         if not 800 < message.chan5_raw < 2200:
             return  # no receiver, or no pilot
         stands, memory = sum(message.chan5_raw > edge for edge in SWITCH), self.memory
-        is_settled = self.state not in ("connect", "watch", "left") and self.now > self._joined_at + SETTLED
+        is_settled = self.state not in ("connect", "watch", "left") and self.now > self._handed_at + SETTLED
         self._has_switched |= is_settled and memory.switch not in (None, stands)
         memory.switch = stands if is_settled or self.state != "connect" else memory.switch
 
@@ -552,12 +552,13 @@ class Bridge:
     def _turn(self, state: str, why: str) -> None:
         """Go over to another state, which waits for something."""
         self._say(f"{self.state} -> {state}: {why}")
+        before = self.state
         self.state, self.why, self._since, self._due["word"] = state, why, self.now, self.now + WORD
         self.memory.state, self.memory.mode = state, self.mode
         self._sent, self._results = {}, {}
         self._down, self._is_other, self._has_switched = math.inf, False, False
-        if state == "join":
-            self._joined_at = self.now
+        if state == "join" and before == "watch":
+            self._handed_at = self.now
         elif state == "guided":
             self.memory.lands = False
         elif state == "climb":

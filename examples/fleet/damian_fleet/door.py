@@ -22,7 +22,9 @@ class Door(H11Protocol):
         super().connection_made(transport)
         self.strangers[self] = self.loop.call_later(PATIENCE, transport.abort)
         if len(self.strangers) > MOST_STRANGERS:
-            next(iter(self.strangers)).transport.abort()
+            oldest = next(iter(self.strangers))
+            self.strangers.pop(oldest).cancel()
+            oldest.transport.abort()
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)

@@ -618,8 +618,8 @@ class Fleet:
     def _bends(self, decision: Decision) -> bool:
         """Whether the straight way from where a UAV stands leaves the region or comes too near to its edge.
 
-        Zones are holes of the region. The margin is less where the way begins or ends nearer to the edge; a UAV
-        that stands outside may come straight in by the margin.
+        Zones are holes of the region. The margin is less where the way begins or ends nearer to the edge; a
+        UAV that stands outside may come straight in by the margin.
         """
         polygon, way = self.ground.region.polygon, self._path(decision)
         margin, ends = self.config.margin, [shapely.Point(end) for end in way.coords]
@@ -642,9 +642,9 @@ class Fleet:
         start = torch.tensor(self._start(uav, here))
         total = left + torch.linalg.vector_norm(self.tracker.points[: len(points)] - start, dim=-1)
         for point in total.argsort().tolist():
-            if left[point] < left[here] and point not in taken:
-                if not self._bends(self._decision(uav, None, point)):
-                    return point
+            is_nearer = left[point] < left[here] and point not in taken
+            if is_nearer and not self._bends(self._decision(uav, None, point)):
+                return point
         return goal
 
     def _cleared(self, found: Sequence[tuple[Uav, Decision]]) -> list[dict[str, Any]]:

@@ -9,8 +9,8 @@ import bisect
 import math
 from typing import Any
 
-LATEST = 6.0
-"""No message is later than this [s]."""
+LATEST = 5.2
+"""No message is later than this [s]; where one is, it may count as new."""
 _KEPT = 8.0  # how long messages with a time are remembered, by the vehicle's clock [s]
 _DRIFT = 1e-4  # how much clocks may differ, as a share of the time
 
@@ -33,7 +33,7 @@ class Order:
         self._number = 0  # of the newest message
         self._rate = math.nan  # messages in a second
         self._upper, self._lower = math.inf, -math.inf  # of how far our clock is ahead of the vehicle's
-        self._bounded_at = -math.inf
+        self._bounded_at = self._mixed_until = -math.inf
 
     @property
     def _ahead(self) -> float:
@@ -75,7 +75,10 @@ class Order:
         elif place <= newest:
             return None
         self._newest[kind] = place, now
-        return max(now - self._ahead - sent, 0.0) if self._times else 0.0
+        late = max(now - self._ahead - sent, 0.0) if self._times else 0.0
+        if boot is not None and late > 256 / self._rate - 1.0:
+            self._mixed_until = now + LATEST  # messages come so late that their count has begun again
+        return late
 
     def _clock(self, boot: float, number: int, now: float) -> bool:
         """Take the time of a message, unless it is of an earlier boot."""
@@ -110,6 +113,9 @@ class Order:
             return place, vehicle
         newest = self._numbers[-1] + self._rate * (vehicle - self._times[-1]) + 8 + 0.2 * self._rate
         place = number + math.floor((newest - number) / 256) * 256
+        since = (newest - place) / self._rate
+        if now < self._mixed_until and since + 256 / self._rate < LATEST + 0.5:
+            place -= 256  # it may be as old as that
         self._number = max(self._number, place)
         after = bisect.bisect_left(self._numbers, place)
         if after == len(self._numbers):

@@ -45,8 +45,9 @@ class Copter:
     """One ArduCopter: `step(now, messages)` obeys messages that arrived and returns those that it sends.
 
     Public state is the truth: `mode`, `armed`, `landed`, `place`, `height`, `velocity`, `crashed`. A pilot
-    calls `change_mode`, which moves his switch, `arm` and `disarm`; faults are `crash()`, `reboot(now)` and the fields `wind` [m/s],
-    `fix`, `glitch` [m, of what it says], `prearm` (a text that refuses arming), `battery` [%] of each.
+    calls `change_mode`, which moves his switch, `arm` and `disarm`; faults are `crash()`, `reboot(now)` and
+    the fields `wind` [m/s], `fix`, `glitch` [m, of what it says], `prearm` (a text that refuses arming),
+    `battery` [%] of each.
 
     ``origin`` is latitude and longitude [deg] of place 0, ``drain`` what a second in the air costs [%]. It
     returns on a low battery (BATT_FS_LOW_ACT=2), and lands if the MAVLink system ``station`` is silent for
