@@ -284,19 +284,20 @@ class Bridge:
             return  # an older one, which came on a longer way, or the same again
         self._came[kind] = max(self.now - late, self._came.get(kind, -math.inf))
         self.seen[kind] = message
-        if kind == "GLOBAL_POSITION_INT":
-            self._hear_position(message)
-        elif kind == "RC_CHANNELS":
-            self._hear_switch(message)
-        elif kind == "AUTOPILOT_VERSION":
-            self.memory.vehicle = bytes(message.uid2).hex().strip("0") or f"{message.uid:x}".strip("0")
-        elif kind == "COMMAND_ACK":
-            self._hear_result(message)
-        elif kind in ("SYS_STATUS", "BATTERY_STATUS"):
-            battery = message.id if kind == "BATTERY_STATUS" else -1  # ``id`` of another message is its own
-            self._levels[battery] = self.now, message.battery_remaining
-        elif kind == "STATUSTEXT":
-            self._say(f"the vehicle says (severity {message.severity}): {message.text}")
+        if take := getattr(self, f"_hear_{kind.lower()}", None):
+            take(message)
+
+    def _hear_sys_status(self, message: Any) -> None:
+        self._levels[-1] = self.now, message.battery_remaining
+
+    def _hear_battery_status(self, message: Any) -> None:
+        self._levels[message.id] = self.now, message.battery_remaining
+
+    def _hear_statustext(self, message: Any) -> None:
+        self._say(f"the vehicle says (severity {message.severity}): {message.text}")
+
+    def _hear_autopilot_version(self, message: Any) -> None:
+        self.memory.vehicle = bytes(message.uid2).hex().strip("0") or f"{message.uid:x}".strip("0")
 
     def _is_copter(self, heartbeat: Any) -> bool:
         if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and heartbeat.type in COPTERS:
@@ -307,7 +308,7 @@ class Bridge:
             self._say(self.why)
         return False
 
-    def _hear_position(self, message: Any) -> None:
+    def _hear_global_position_int(self, message: Any) -> None:
         """Take a position if it is one: no sentinel, after a fix, no jump."""
         place, fix = (message.lat / 1e7, message.lon / 1e7), self.seen.get("GPS_RAW_INT")
         at = self._came["GLOBAL_POSITION_INT"]
@@ -328,7 +329,7 @@ class Bridge:
             return
         self.here, self._place_at = place, at
 
-    def _hear_switch(self, message: Any) -> None:
+    def _hear_rc_channels(self, message: Any) -> None:
         """Note where a pilot's switch stands, and that he has moved it."""
         if not 800 < message.chan5_raw < 2200:
             return  # no receiver, or no pilot
@@ -339,7 +340,7 @@ class Bridge:
 
     # Commands.
 
-    def _hear_result(self, ack: Any) -> None:
+    def _hear_command_ack(self, ack: Any) -> None:
         """Note what the vehicle says of a command of this state; none of other stations."""
         if (ack.target_system, ack.target_component) != STATION or ack.command not in self._sent:
             return
@@ -577,17 +578,18 @@ class Bridge:
             own |= {LAND} if mavlink.MAV_CMD_NAV_LAND in self._sent else set()
         if self.mode in own and (self.mode == LAND or self.state in ("join", "ground", "accept")):
             memory.mode = self.mode  # from now on no other
-        if has_booted:
-            return "it has booted again"
-        if self._has_switched:
-            return "the mode switch was moved"
-        if self.mode not in {memory.mode, *own}:
-            return f"mode {name_of('COPTER_MODE', self.mode)} by somebody else"
-        if self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(self.state, True):
-            return "a failsafe of the vehicle"
-        if self.armed != MOTORS.get(self.state, self.armed):
-            return f"motors {'on' if self.armed else 'off'} by somebody else"
-        return "sent elsewhere by somebody else" if self._aims_elsewhere() else ""
+        failed = self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(self.state, True)
+        acts = {
+            "it has booted again": has_booted,
+            "the mode switch was moved": self._has_switched,
+            f"mode {name_of('COPTER_MODE', self.mode)} by somebody else": self.mode
+            not in {memory.mode, *own},
+            "a failsafe of the vehicle": failed,
+            f"motors {'on' if self.armed else 'off'} by somebody else": self.armed
+            != MOTORS.get(self.state, self.armed),
+            "sent elsewhere by somebody else": self._aims_elsewhere(),
+        }
+        return next((what for what, is_so in acts.items() if is_so), "")
 
     def _aims_elsewhere(self) -> bool:
         """Whether the vehicle flies to a place that is not its goal, because another station has told it."""

@@ -45,9 +45,9 @@ class Copter:
     """One ArduCopter: `step(now, messages)` obeys messages that arrived and returns those that it sends.
 
     Public state is the truth: `mode`, `armed`, `landed`, `place`, `height`, `velocity`, `crashed`. A pilot
-    calls `change_mode`, which moves his switch, `arm` and `disarm`; faults are `crash()`, `reboot(now)` and
-    the fields `wind` [m/s], `fix`, `glitch` [m, of what it says], `prearm` (a text that refuses arming),
-    `battery` [%] of each.
+    calls `change_mode`, which moves his `switch` (None: no receiver), `arm` and `disarm`; faults are
+    `crash()`, `reboot(now)` and the fields `wind` [m/s], `fix`, `glitch` [m, of what it says], `prearm` (a
+    text that refuses arming), `battery` [%] of each.
 
     ``origin`` is latitude and longitude [deg] of place 0, ``drain`` what a second in the air costs [%]. It
     returns on a low battery (BATT_FS_LOW_ACT=2), and lands if the MAVLink system ``station`` is silent for
@@ -108,7 +108,7 @@ class Copter:
 
     def change_mode(self, mode):
         """A pilot chooses a mode; whether it flies in that. A switch that stands there is moved and back."""
-        if mode in SWITCH:
+        if mode in SWITCH and self.switch is not None:
             aside = 150 if mode == STABILIZE else -150
             self.switch = SWITCH[mode] + (aside if self.switch == SWITCH[mode] else 0)
             self.send(*self.stream(65))
@@ -341,7 +341,7 @@ class Copter:
                 boot = round((self.now - self.booted) * 1000)
                 speed = (round(100 * v) for v in (self.velocity.real, self.velocity.imag, -self.climb))
                 yield mavlink.MAVLink_global_position_int_message(boot, *place, above_home, *speed, 65535)
-            case 65:  # RC_CHANNELS
+            case 65 if self.switch is not None:  # RC_CHANNELS
                 boot = round((self.now - self.booted) * 1000)
                 channels = [1500, 1500, 1000, 1500, self.switch, *[65535] * 13]
                 yield mavlink.MAVLink_rc_channels_message(boot, 5, *channels, 255)

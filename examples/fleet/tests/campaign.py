@@ -278,14 +278,16 @@ class Campaign:
                 message.pack(self.station)
             link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
             link.asked.send(now, *requests)
-        was_landed, failsafe, mode = copter.landed, set(copter.failsafe), copter.mode
+        was_landed, failsafe = copter.landed, set(copter.failsafe)
+        before = {"mode": copter.mode, "motors": copter.armed}
         sent = copter.step(now, [each for link in links for each in link.down.due(now)])
         copter.mav.seq = (copter.mav.seq + uav.others) % 256
         for link in links:
             heartbeats = now < link.mute_until
             link.up.send(now, *((now, m) for m in sent if not heartbeats or m.get_type() != "HEARTBEAT"))
         if copter.failsafe - failsafe:
-            uav.acted(now, f"failsafe {copter.failsafe}", "mode" if copter.mode != mode else "motors")
+            after = {"mode": copter.mode, "motors": copter.armed}
+            uav.acted(now, f"failsafe {copter.failsafe}", *(i for i in after if after[i] != before[i]))
         if copter.landed or (copter.position_control and uav.way is None):
             goal, level = copter.goal or (copter.place, 0.0)
             path = shapely.LineString([(end.real, end.imag) for end in (copter.place, goal)])

@@ -18,6 +18,8 @@ class Vehicle(Copter):
         self.results: dict[int, int] = {}
         self.orders: list[Any] = []
         self.silent = self.deaf = False
+        self.mute: tuple[str, ...] = ()
+        """Types of messages that get lost."""
         self.kind, self.sensors, self.receiver, self.acknowledges_to = (2, 3), (0, 0), None, None
         super().__init__(HOME, system=system, drain=0.0)
 
@@ -28,7 +30,7 @@ class Vehicle(Copter):
 
     def step(self, now: float, messages: Any = ()) -> list[Any]:
         sent = super().step(now, [] if self.deaf else messages)
-        return [] if self.silent else sent
+        return [each for each in sent if not self.silent and each.get_type() not in self.mute]
 
     def obey(self, command: Any, *rest: Any) -> int:
         self.orders.append(command)
