@@ -14,8 +14,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import shapely
 import torch
+from scipy.sparse.csgraph import dijkstra
 
 from damian import keys
 from damian.common.checks import SECONDS
@@ -259,9 +261,9 @@ class Fleet:
                 said.append(said_by(report))
                 report.stamp(at)
                 self.tracker.check(report, self.joining.get(report.id))
-                self.require_lease(report.id, speaker.bridge, at, speaker.vehicle)
-                if speaker.bridge:
-                    speakers[report.id] = [speaker.bridge, speaker.vehicle]
+            self.require_lease(report.id, speaker.bridge, at, speaker.vehicle)
+            if speaker.bridge:
+                speakers[report.id] = [speaker.bridge, speaker.vehicle]
         return {"received": at, "reports": said, **({"speakers": speakers} if speakers else {})}
 
     def acknowledged(self, rows: Sequence[Acknowledgement], now: float) -> Event:
@@ -536,7 +538,9 @@ class Fleet:
         """Whether a flight is not safe any more that a UAV accepts now."""
         if not decision.moves or decision is not uav.offer:
             return False
-        now = replace(decision, start=self._start(uav, decision.origin))
+        newest, now = self._newest(uav).report, decision
+        if newest.time > decision.time and not newest.flies:
+            now = replace(decision, start=self.ground.local(newest.place() or (0.0, 0.0)))
         return (
             self.danger(uav) not in (None, decision.reason) or self._meets(uav, now, {}) or self._bends(now)
         )
@@ -637,11 +641,11 @@ class Fleet:
         """The landing point to which a UAV flies next on the way to a goal, around what is in between."""
         here, airspace = self._standing(uav.id, True), self.node.simulation.airspace
         points = torch.arange(len(self.ground.points))
-        left = airspace.length(points, torch.full_like(points, goal))  # from each point on
+        between = airspace.length(points.unsqueeze(-1), points).numpy()
+        left = dijkstra(np.where(np.isinf(between), 0.0, between), indices=goal)  # from each point on
         taken = {point for other in self._others(uav) for point in self.booked(other)}
-        start = torch.tensor(self._start(uav, here))
-        total = left + torch.linalg.vector_norm(self.tracker.points[: len(points)] - start, dim=-1)
-        for point in total.argsort().tolist():
+        total = left + np.linalg.norm(self.ground.points - self._start(uav, here), axis=-1)
+        for point in total.argsort(kind="stable").tolist():
             is_nearer = left[point] < left[here] and point not in taken
             if is_nearer and not self._bends(self._decision(uav, None, point)):
                 return point

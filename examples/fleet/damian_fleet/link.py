@@ -121,10 +121,12 @@ def memory_of(path: Path) -> tuple[Memory | None, Any]:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
+        lock.close()
         raise ValueError(f"{path}: another bridge works with this memory: end that one") from None
     try:
         return Memory.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None, lock
     except ValueError as error:
+        lock.close()
         problem = "it is not the memory of a bridge; remove it to begin anew"
         raise ValueError(f"{path}: {problem}: {error}") from None
 
