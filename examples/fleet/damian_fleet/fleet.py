@@ -12,12 +12,15 @@ service takes it to fly to that landing point. Without an acceptance by 110 s, i
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import shapely
 import torch
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import KDTree
 
 from damian import keys
 from damian.common.checks import SECONDS
@@ -619,30 +622,46 @@ class Fleet:
     def _path(self, decision: Decision) -> shapely.LineString:
         return shapely.LineString([decision.start, self.ground.points[decision.goal]])
 
-    def _bends(self, decision: Decision) -> bool:
-        """Whether the straight way from where a UAV stands leaves the region or comes too near to its edge.
+    def _is_clear(self, ways: Any) -> Any:
+        """Whether straight ways stay in the region, and away from its edge, that of its zones included.
 
-        Zones are holes of the region. The margin is less where the way begins or ends nearer to the edge; a
-        UAV that stands outside may come straight in by the margin.
+        The margin is less where a way begins or ends nearer to the edge.
         """
-        polygon, way = self.ground.region.polygon, self._path(decision)
-        margin, ends = self.config.margin, [shapely.Point(end) for end in way.coords]
-        if not polygon.covers(ends[0]):
-            within = way.intersection(polygon)
-            if within.geom_type != "LineString" or within.length < way.length - margin:
-                return True
-            way, ends = within, [shapely.Point(end) for end in within.coords]
-        if not polygon.covers(way):
-            return True
+        polygon = self.ground.region.polygon
+        shapely.prepare(polygon)
         edge = polygon.boundary
-        return way.distance(edge) < min(margin, *(end.distance(edge) for end in ends)) - 1e-6
+        ends = [shapely.distance(shapely.get_point(ways, end), edge) for end in (0, -1)]
+        least = np.minimum(self.config.margin, np.minimum(*ends)) - 1e-6
+        return shapely.covers(polygon, ways) & (shapely.distance(ways, edge) >= least)
+
+    def _bends(self, decision: Decision) -> bool:
+        """Whether the straight way from where a UAV stands is not clear; from outside it may come in."""
+        polygon, way = self.ground.region.polygon, self._path(decision)
+        if not polygon.covers(shapely.Point(decision.start)):
+            within = way.intersection(polygon)
+            if within.geom_type != "LineString" or within.length < way.length - self.config.margin:
+                return True
+            way = within
+        return not self._is_clear(way)
+
+    @cached_property
+    def _hops(self) -> csr_array:
+        """Distances between landing points, not too far apart, whose straight ways are clear [m]."""
+        points = self.ground.points
+        one, other = (
+            KDTree(points).query_pairs(6 * self.node.scenario.region.lattice_step, output_type="ndarray").T
+        )
+        clear = self._is_clear(shapely.linestrings(np.stack([points[one], points[other]], 1)))
+        one, other = one[clear], other[clear]
+        far = np.linalg.norm(points[one] - points[other], axis=1)
+        return csr_array((far, (one, other)), shape=(len(points),) * 2)
 
     def _leads_to(self, uav: Uav, goal: int) -> int:
         """The landing point to which a UAV flies next on the way to a goal, around what is in between."""
-        here, airspace = self._standing(uav.id, True), self.node.simulation.airspace
-        points = torch.arange(len(self.ground.points))
-        between = airspace.length(points.unsqueeze(-1), points).numpy()
-        left = dijkstra(np.where(np.isinf(between), 0.0, between), indices=goal)  # from each point on
+        here = self._standing(uav.id, True)
+        if here == goal or not self._bends(self._decision(uav, None, goal)):
+            return goal
+        left = dijkstra(self._hops, directed=False, indices=goal)  # from each point on
         taken = {point for other in self._others(uav) for point in self.booked(other)}
         total = left + np.linalg.norm(self.ground.points - self._start(uav, here), axis=-1)
         for point in total.argsort(kind="stable").tolist():

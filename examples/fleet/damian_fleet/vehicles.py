@@ -59,6 +59,7 @@ class Copter:
         self.system, self.drain, self.station = system, drain, station
         self.wind, self.fix, self.glitch, self.prearm = 0j, True, 0j, None
         self.battery, self.crashed, self.board, self.switch = [100.0], False, next(BOARDS), SWITCH[STABILIZE]
+        self.aside = -math.inf  # until then the switch is off its place
         self.mav, self.sent, self.now = mavlink.MAVLink(None, system, 1), [], now
         self.reboot(now - FIX_AFTER_BOOT)  # it has stood there for a while
 
@@ -109,9 +110,8 @@ class Copter:
     def change_mode(self, mode):
         """A pilot chooses a mode; whether it flies in that. A switch that stands there is moved and back."""
         if mode in SWITCH and self.switch is not None:
-            aside = 150 if mode == STABILIZE else -150
-            self.switch = SWITCH[mode] + (aside if self.switch == SWITCH[mode] else 0)
-            self.send(*self.stream(65))
+            if self.switch == SWITCH[mode]:
+                self.aside = self.now + 1.0
             self.switch = SWITCH[mode]
         return self.enter(mode)
 
@@ -343,7 +343,8 @@ class Copter:
                 yield mavlink.MAVLink_global_position_int_message(boot, *place, above_home, *speed, 65535)
             case 65 if self.switch is not None:  # RC_CHANNELS
                 boot = round((self.now - self.booted) * 1000)
-                channels = [1500, 1500, 1000, 1500, self.switch, *[65535] * 13]
+                aside = (self.now < self.aside) * (150 if self.switch == SWITCH[STABILIZE] else -150)
+                channels = [1500, 1500, 1000, 1500, self.switch + aside, *[65535] * 13]
                 yield mavlink.MAVLink_rc_channels_message(boot, 5, *channels, 255)
             case 87 if self.position_control and self.goal and self.mode == GUIDED:
                 boot = round((self.now - self.booted) * 1000)
