@@ -18,9 +18,11 @@ until its effect is seen or its acknowledgement has come.
 | watch | nothing; reports on the ground | the pilot hands over: *join* | |
 | left | nothing | | |
 
-**The pilot has the last word**: a mode, or motors on or off, that the bridge has not commanded, a restart of
-the vehicle, and before the flight a refusal or a failsafe, lead to *watch* from every state; so does what has
-changed while the bridge was off. **To hand over again**, the pilot switches the vehicle from another mode to
+**The pilot has the last word**: a mode, motors on or off, or an aim in the air that the bridge has not
+commanded, a move of the mode switch, a restart of the vehicle, and before the flight a refusal or a failsafe,
+lead to *watch* from every state; so does what has changed while the bridge was off. Nothing is commanded
+unless mode and motors were heard since the last command; if they are not for 5 s: *watch*. Where a vehicle is in
+the air in GUIDED and nobody is known to command it, the bridge is silent, so that its failsafe lands it. **To hand over again**, the pilot switches the vehicle from another mode to
 GUIDED, on the ground with its motors off. An operator's hold leads from each state of a flight to *landing*;
 a missing answer of the service ends none. In a state that lasts, the log says every 30 s what is waited for.
 """
