@@ -21,8 +21,8 @@ until its effect is seen or its acknowledgement has come.
 **The pilot has the last word**: a mode, motors on or off, or an aim in the air that the bridge has not
 commanded, a move of the mode switch, a restart of the vehicle, and before the flight a refusal or a failsafe,
 lead to *watch* from every state; so does what has changed while the bridge was off. Nothing is commanded
-unless mode and motors were heard since the last command; if they are not for 5 s: *watch*. Where a vehicle is in
-the air in GUIDED and nobody is known to command it, the bridge is silent, so that its failsafe lands it. **To hand over again**, the pilot switches the vehicle from another mode to
+unless mode and motors were heard since the last command; if they are not for 5 s: *watch*. Where a vehicle is
+in the air in GUIDED and nobody is known to command it, the bridge is silent: so its failsafe lands it. **To hand over again**, the pilot switches the vehicle from another mode to
 GUIDED, on the ground with its motors off. An operator's hold leads from each state of a flight to *landing*;
 a missing answer of the service ends none. In a state that lasts, the log says every 30 s what is waited for.
 """
@@ -51,6 +51,7 @@ COPTERS = (2, 3, 4, 13, 14, 15, 29, 35)
 """MAV_TYPE of what ArduCopter flies: 4 rotors, coaxial, helicopter, 6, 8, 3, 12 and 10 rotors."""
 SILENCE = 5.0  # age of the newest message above which a link counts as lost [s]
 FRESH = 2.5  # age of mode and motors above which nothing is commanded [s]
+ABOUT = 0.3  # how well it is known when a heartbeat was sent, which has no time [s]
 ALONE = 15.0  # how long a vehicle may be in the air in GUIDED while nobody is known to command it [s]
 AIM = 3.0  # difference of its aim to its goal from which somebody else has given it [m]
 SETTLED = 3.0  # how long a switch of a pilot may be told late after he has handed over [s]
@@ -359,7 +360,7 @@ class Bridge:
         """
         if command in self._results:
             return self._results[command][0]
-        is_fresh = self._heard_at > self._commanded and self.now < self._heard_at + FRESH
+        is_fresh = self._heard_at > self._commanded + ABOUT and self.now < self._heard_at + FRESH
         if not is_fresh or self.now < self._sent.get(command, -math.inf) + RETRY:
             return False
         self._sent[command] = self._commanded = self.now
@@ -615,7 +616,7 @@ class Bridge:
 
     def _check_limit(self) -> None:
         """End what has taken too long."""
-        if self.state in FLIGHT and self._heard_at <= self._commanded < self.now - SILENCE:
+        if self.state in FLIGHT and self._heard_at - ABOUT <= self._commanded < self.now - SILENCE:
             self._hands_off(f"mode and motors not heard for {SILENCE:.0f} s after a command")
         goal, lasting, limit = self.memory.goal, self.now - self._since, LIMITS.get(self.state, math.inf)
         if self.state == "climb":

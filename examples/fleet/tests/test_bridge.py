@@ -241,7 +241,7 @@ def test_without_a_memory_a_flight_is_left_to_the_pilot():
 def test_what_is_refused_before_the_flight_gives_the_vehicle_back(command, state):
     world = World()
     world.vehicle.results = {command: REFUSED}
-    world.until(state).run(1)
+    world.until(state).run(2)
     assert watches(world)
     assert world.vehicle.commands(command) == [command]
 
