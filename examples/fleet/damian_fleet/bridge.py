@@ -18,9 +18,11 @@ until its effect is seen or its acknowledgement has come.
 | watch | nothing; reports on the ground | the pilot hands over: *join* | |
 | left | nothing | | |
 
-**The pilot has the last word**: a mode, or motors on or off, that the bridge has not commanded, a restart of
-the vehicle, and before the flight a refusal or a failsafe, lead to *watch* from every state; so does what has
-changed while the bridge was off. **To hand over again**, the pilot switches the vehicle from another mode to
+**The pilot has the last word**: a mode, motors on or off, or an aim in the air that the bridge has not
+commanded, a move of the mode switch, a restart of the vehicle, and before the flight a refusal or a failsafe,
+lead to *watch* from every state; so does what has changed while the bridge was off. Nothing is commanded
+unless mode and motors were heard since the last command; if they are not for 5 s: *watch*. Where a vehicle is
+in the air in GUIDED and nobody is known to command it, the bridge is silent: so its failsafe lands it. **To hand over again**, the pilot switches the vehicle from another mode to
 GUIDED, on the ground with its motors off. An operator's hold leads from each state of a flight to *landing*;
 a missing answer of the service ends none. In a state that lasts, the log says every 30 s what is waited for.
 """
@@ -28,12 +30,14 @@ a missing answer of the service ends none. In a state that lasts, the log says e
 import logging
 import math
 import os
+import secrets
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
+from damian_fleet.order import Order
 from damian_fleet.rows import Advice
 
 os.environ.setdefault("MAVLINK20", "1")
@@ -46,6 +50,12 @@ GUIDED, LAND = 4, 9
 COPTERS = (2, 3, 4, 13, 14, 15, 29, 35)
 """MAV_TYPE of what ArduCopter flies: 4 rotors, coaxial, helicopter, 6, 8, 3, 12 and 10 rotors."""
 SILENCE = 5.0  # age of the newest message above which a link counts as lost [s]
+FRESH = 2.5  # age of mode and motors above which nothing is commanded [s]
+ABOUT = 0.3  # how well it is known when a heartbeat was sent, which has no time [s]
+ALONE = 15.0  # how long a vehicle may be in the air in GUIDED while nobody is known to command it [s]
+AIM = 3.0  # difference of its aim to its goal from which somebody else has given it [m]
+SETTLED = 3.0  # how long a switch of a pilot may be told late after he has handed over [s]
+IDENTITY = 10.0  # how long it is waited for which vehicle it is [s]
 TIMEOUT = 10.0  # when an answer counts as missing [s]
 NEAR, THERE = 2.0, 10.0  # how near to its goal it begins to land, and must have landed [m]
 LEVEL = 1.0  # difference to its flight level at which it has climbed enough [m]
@@ -63,8 +73,13 @@ MOTORS = dict.fromkeys(("join", "ground", "accept", "guided"), False) | {"climb"
 FAILSAFES = (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
 """States of a vehicle in which it does not take off."""
 INTERVALS = {"GLOBAL_POSITION_INT": (33, 0.25), "EXTENDED_SYS_STATE": (245, 0.5), "SYS_STATUS": (1, 1.0)}
-INTERVALS |= {"GPS_RAW_INT": (24, 1.0), "BATTERY_STATUS": (147, 2.0)}
+INTERVALS |= {"GPS_RAW_INT": (24, 1.0), "BATTERY_STATUS": (147, 2.0), "RC_CHANNELS": (65, 0.5)}
+INTERVALS |= {"POSITION_TARGET_GLOBAL_INT": (87, 0.5)}
 """Messages that it asks for while they do not come: their numbers, and the time between two [s]."""
+FLIGHT = ("guided", "arm", "climb", "cruise", "landing")
+"""States in which it commands."""
+SWITCH = (1230, 1360, 1490, 1620, 1749)
+"""Between these [us] of channel 5 stand the positions of a pilot's switch (FLTMODE_CH=5)."""
 _LOG = logging.getLogger("damian_mavlink")
 
 
@@ -93,12 +108,16 @@ class Answer(NamedTuple):
 class Memory(BaseModel):
     """What a bridge that is started again must know."""
 
+    bridge: str = ""  # tells this bridge from all others
     system: int | None = None  # MAVLink system of the vehicle
+    vehicle: str = ""  # identity of its autopilot, if it tells one
     number: int = 0  # of the next report
     state: str = ""  # of the bridge
     mode: int = -1  # in which the vehicle was in this state, by command of the bridge or before
+    switch: int | None = None  # where a pilot's switch stood, counted from 0
     goal: Advice | None = None  # what it has accepted and not ended
     taken_off: bool = False  # to that goal
+    lands: bool = False  # whether the vehicle has accepted its command to land
     stops: list[tuple[float, float]] = []  # where it landed, or held, newest first [deg] ...
     landed: list[float] = []  # ... and when [s since 1970]
     motions: int = 0  # decisions since it last detected the source before
@@ -144,6 +163,7 @@ class Bridge:
         """``period``: between two reports of a vehicle on the ground [s]; a step of the service."""
         self.memory = memory or Memory()
         self.memory.system = system or self.memory.system
+        self.memory.bridge = self.memory.bridge or secrets.token_hex(8)
         self.state, self.leaving = "connect", False
         """``leaving``: it ends the flight in hand and leaves the fleet."""
         self.why = "no heartbeat of a copter with ArduPilot"
@@ -153,13 +173,15 @@ class Bridge:
         self.is_ready = True
         self.ahead, self._trip, self._timed = math.nan, math.inf, -math.inf
         """How far the clock of the service is ahead [s]; how long that answer took [s], and when it came."""
+        self.order = Order()
         self.seen: dict[str, Any] = {}
         """The newest messages of the vehicle by their types."""
         self.here: tuple[float, float] | None = None
         """Where the vehicle was at last [deg]."""
         self.now = self._since = self._place_at = self._steady = self._reported = -math.inf
         self._retry = self._asked_at = self._landed_at = self._commanded = -math.inf
-        self._down, self._number, self._uptime = math.inf, 0, 0
+        self._heard_at = self._climbs_from = self._handed_at = self._stood_since = -math.inf
+        self._down, self._number, self._boots = math.inf, 0, 0
         self._came: dict[str, float] = {}
         self._due: dict[str, float] = {}
         self._raw: tuple[tuple[float, float], float] = ((0.0, 0.0), -math.inf)
@@ -168,7 +190,7 @@ class Bridge:
         self._sent: dict[int, float] = {}
         self._results: dict[int, tuple[bool, float]] = {}
         self._is_flying = not self.memory.stops or self.memory.taken_off
-        self._was_linked = self._has_booted = self._has_joined = self._is_other = False
+        self._was_linked = self._has_switched = self._has_joined = self._is_other = self._is_quiet = False
         self._spotted = self._was_spotted = False
         self._track = self._turned = self._held = None
         self._offer: Advice | None = None
@@ -226,7 +248,8 @@ class Bridge:
         self.time = self.now + self.ahead
         levels = [left for at, left in self._levels.values() if left >= 0 and self.now < at + 30]
         self.battery = min(levels, default=None)
-        is_heard = self.now < self._came.get("HEARTBEAT", -math.inf) + SILENCE  # else the mode is of long ago
+        self._heard_at = self._came.get("HEARTBEAT", -math.inf)
+        is_heard = self.now < self._heard_at + SILENCE  # else the mode is of long ago
         self.is_linked = is_heard and self.here is not None
         if "HEARTBEAT" in seen and "GLOBAL_POSITION_INT" in seen:
             self.mode = seen["HEARTBEAT"].custom_mode
@@ -255,20 +278,29 @@ class Bridge:
             return
         if kind == "HEARTBEAT" and not self._is_copter(message):
             return
-        is_young = kind in self.seen and self.now < self._came[kind] + SILENCE
-        if is_young and 0 < (self.seen[kind].get_seq() - message.get_seq()) % 256 < 64:
-            return  # an older one, which came on a longer way
-        self._came[kind] = self.now
+        if kind == "TIMESYNC":
+            self.order.hear_time(message.ts1, message.tc1 / 1e9)
+            return
+        of = {"BATTERY_STATUS": "id", "COMMAND_ACK": "command", "STATUSTEXT": "text"}.get(kind)
+        late = self.order.lateness((kind, of and getattr(message, of)), message, self.now)
+        if late is None:
+            return  # an older one, which came on a longer way, or the same again
+        self._came[kind] = max(self.now - late, self._came.get(kind, -math.inf))
         self.seen[kind] = message
-        if kind == "GLOBAL_POSITION_INT":
-            self._hear_position(message)
-        elif kind == "COMMAND_ACK":
-            self._hear_result(message)
-        elif kind in ("SYS_STATUS", "BATTERY_STATUS"):
-            battery = message.id if kind == "BATTERY_STATUS" else -1  # ``id`` of another message is its own
-            self._levels[battery] = self.now, message.battery_remaining
-        elif kind == "STATUSTEXT":
-            self._say(f"the vehicle says (severity {message.severity}): {message.text}")
+        if take := getattr(self, f"_hear_{kind.lower()}", None):
+            take(message)
+
+    def _hear_sys_status(self, message: Any) -> None:
+        self._levels[-1] = self.now, message.battery_remaining
+
+    def _hear_battery_status(self, message: Any) -> None:
+        self._levels[message.id] = self.now, message.battery_remaining
+
+    def _hear_statustext(self, message: Any) -> None:
+        self._say(f"the vehicle says (severity {message.severity}): {message.text}")
+
+    def _hear_autopilot_version(self, message: Any) -> None:
+        self.memory.vehicle = bytes(message.uid2).hex().strip("0") or f"{message.uid:x}".strip("0")
 
     def _is_copter(self, heartbeat: Any) -> bool:
         if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and heartbeat.type in COPTERS:
@@ -279,11 +311,10 @@ class Bridge:
             self._say(self.why)
         return False
 
-    def _hear_position(self, message: Any) -> None:
+    def _hear_global_position_int(self, message: Any) -> None:
         """Take a position if it is one: no sentinel, after a fix, no jump."""
         place, fix = (message.lat / 1e7, message.lon / 1e7), self.seen.get("GPS_RAW_INT")
-        self._has_booted |= message.time_boot_ms < self._uptime - 2000
-        self._uptime = message.time_boot_ms
+        at = self._came["GLOBAL_POSITION_INT"]
         self._falls.append((self.now, message.vz / 100))
         while self._falls[0][0] < self.now - 3:
             self._falls.popleft()
@@ -291,32 +322,46 @@ class Bridge:
         if is_none or fix is None or fix.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self.why = "no position of the vehicle" if self.here is None else self.why
             return
-        (before, at), self._raw = self._raw, (place, self.now)
-        if way(before, place)[0] > SCATTER + TOP_SPEED * (self.now - at):
+        (before, then), self._raw = self._raw, (place, at)
+        if way(before, place)[0] > SCATTER + TOP_SPEED * (at - then):
             self._steady = self.now
         away = way(self.here, place)[0] if self.here is not None else 0.0
-        if away > SCATTER + TOP_SPEED * (self.now - self._place_at) and self.now < self._steady + STEADY:
+        if away > SCATTER + TOP_SPEED * (at - self._place_at) and self.now < self._steady + STEADY:
             if self._is_due("jump", 10):
                 self._say(f"a position is {away:.0f} m away at once, and not taken")
             return
-        self.here, self._place_at = place, self.now
+        self.here, self._place_at = place, at
+
+    def _hear_rc_channels(self, message: Any) -> None:
+        """Note where a pilot's switch stands, and that he has moved it."""
+        if not 800 < message.chan5_raw < 2200:
+            return  # no receiver, or no pilot
+        stands, memory = sum(message.chan5_raw > edge for edge in SWITCH), self.memory
+        is_settled = self.state not in ("connect", "watch", "left") and self.now > self._handed_at + SETTLED
+        self._has_switched |= is_settled and memory.switch not in (None, stands)
+        memory.switch = stands if is_settled or self.state != "connect" else memory.switch
 
     # Commands.
 
-    def _hear_result(self, ack: Any) -> None:
+    def _hear_command_ack(self, ack: Any) -> None:
         """Note what the vehicle says of a command of this state; none of other stations."""
         if (ack.target_system, ack.target_component) != STATION or ack.command not in self._sent:
             return
+        self.memory.lands |= ack.command == mavlink.MAV_CMD_NAV_LAND and ack.result == 0
         if ack.result not in (mavlink.MAV_RESULT_IN_PROGRESS, mavlink.MAV_RESULT_TEMPORARILY_REJECTED):
             self._results.setdefault(ack.command, (ack.result == mavlink.MAV_RESULT_ACCEPTED, self.now))
         if ack.result != mavlink.MAV_RESULT_ACCEPTED:
             self._say(f"{name_of('MAV_CMD', ack.command)}: {name_of('MAV_RESULT', ack.result)}")
 
     def _command(self, command: int, *params: float, place: tuple[float, float] | None = None) -> bool:
-        """Send a command, and again until there is a result; returns whether it was accepted."""
+        """Send a command, and again until there is a result; returns whether it was accepted.
+
+        None is sent on an old picture: mode and motors were heard since the command before, and lately.
+        """
         if command in self._results:
             return self._results[command][0]
-        if self.now < self._sent.get(command, -math.inf) + RETRY:
+        is_fresh = self._heard_at > self._commanded + ABOUT and self.now < self._heard_at + FRESH
+        if not is_fresh or self.now < self._sent.get(command, -math.inf) + RETRY:
             return False
         self._sent[command] = self._commanded = self.now
         own, target = (*params, *[0.0] * 7)[:7], (self.memory.system, AUTOPILOT)
@@ -334,8 +379,14 @@ class Bridge:
         return not is_accepted and self.now > at + GRACE
 
     def _keep_in_touch(self) -> None:
-        """Heartbeats, and the messages that do not come."""
-        if self._is_due("heartbeat", 1.0):
+        """Heartbeats, and the messages that do not come; silent where its failsafe shall land the vehicle."""
+        if self._is_alone() != self._is_quiet:
+            self._is_quiet = not self._is_quiet
+            if self._is_quiet:
+                self._warn("nobody commands it in the air: silent, for its failsafe to land it")
+        if self.memory.system is not None and self._is_due("clock", 1.0):
+            self._out.append(mavlink.MAVLink_timesync_message(0, self.order.ask_time(self.now)))
+        if not self._is_quiet and self._is_due("heartbeat", 1.0):
             kind, none = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
             self._out.append(mavlink.MAVLink_heartbeat_message(kind, none, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
         if self.memory.system is None or not self._is_due("intervals", SILENCE):
@@ -344,6 +395,21 @@ class Bridge:
             if self.now > self._came.get(kind, -math.inf) + max(SILENCE, 3 * interval):
                 asked = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval * 1e6, 0, 0, 0, 0, 0
                 self._out.append(mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked))
+
+    def _is_alone(self) -> bool:
+        """Whether the vehicle may have been in the air in GUIDED for long while nobody commands it."""
+        is_left = self.state == "watch" and self.mode == GUIDED and self.armed and self.in_air
+        position = self.seen.get("GLOBAL_POSITION_INT")
+        if not is_left or math.hypot(position.vx, position.vy) > 100:  # somebody lets it fly on [cm/s]
+            self._stood_since = self.now
+        is_lost = (self.state in FLIGHT or is_left) and self.now > self._heard_at + ALONE
+        return is_lost or self.now > self._stood_since + ALONE
+
+    def _warn(self, text: str) -> None:
+        """Say something to the pilot's station as well."""
+        self._say(text)
+        said = f"{self.uav}: {text}".encode("ascii", "replace")[:50]
+        self._out.append(mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_ALERT, said))
 
     # The service.
 
@@ -397,12 +463,17 @@ class Bridge:
 
     def _hear_delivery(self, status: int, body: dict[str, Any]) -> None:
         path, _ = self.memory.outbox.pop(0)
-        if status >= 400:
+        if status >= 400 and self._is_due(f"refused {path}", WORD):
             self._say(f"the service refuses {path}: {body.get('error')}")
+        if body.get("warning"):
+            self._say(f"the service warns: {body['warning']}")
 
     def _say_fact(self, answer: str | None, status: str) -> None:
         """Tell the service, as soon as it is reached, what has happened."""
-        self.memory.outbox.append(("/acknowledgements", {"ID": self.uav, "answer": answer, "status": status}))
+        self.memory.outbox.append(("/acknowledgements", self._row(answer, status)))
+
+    def _row(self, answer: str | None, status: str) -> dict[str, Any]:
+        return {"ID": self.uav, "answer": answer, "status": status, "bridge": self.memory.bridge}
 
     def _need_fresh(self) -> None:
         """Before it asks again, it reports."""
@@ -414,11 +485,12 @@ class Bridge:
         memory, flies = self.memory, self.in_air
         if math.isnan(self.time) or self.here is None or self._place_at <= self._reported:
             return
-        memory.number = memory.number or int(self.time)  # larger than that of a bridge whose memory is lost
+        memory.number = memory.number or int(self.time) % 2**30  # mostly none of a lost memory; < 2**31
         row = {"ID": self.uav, "number": memory.number, "time": self._place_at + self.ahead}
         row |= {"lat": self.here[0], "lon": self.here[1], "FLA": self.height, "on ground": int(not flies)}
         row |= {"battery": self.battery, "source spotted": int(self._spotted and not flies)}
         row |= {"track": self._track, "takeoff-landing time": self._turned}
+        row |= {"bridge": memory.bridge, "vehicle": memory.vehicle or None}
         row |= {"previous": memory.stops[1:], "landed": memory.landed, "motions": memory.motions}
         self._was_spotted, self._reported = self._spotted and not flies, self._place_at
         memory.number += 1
@@ -440,7 +512,8 @@ class Bridge:
             self._report()  # it goes before all that is wanted
         else:
             period = min(self.period / 4, 1.0) if self.state == "ground" else min(self.period, 2.0)
-            self._want(period, self._hear_advice, "POST", "/advice", {"uavs": [self.uav]})
+            asked = {"uavs": [self.uav], "bridge": self.memory.bridge}
+            self._want(period, self._hear_advice, "POST", "/advice", asked)
 
     def _hear_advice(self, status: int, body: dict[str, Any]) -> None:
         if status >= 400:
@@ -483,32 +556,54 @@ class Bridge:
     def _turn(self, state: str, why: str) -> None:
         """Go over to another state, which waits for something."""
         self._say(f"{self.state} -> {state}: {why}")
+        before = self.state
         self.state, self.why, self._since, self._due["word"] = state, why, self.now, self.now + WORD
         self.memory.state, self.memory.mode = state, self.mode
         self._sent, self._results = {}, {}
-        self._down, self._is_other = math.inf, False
+        self._down, self._is_other, self._has_switched = math.inf, False, False
+        if state == "join" and before == "watch":
+            self._handed_at = self.now
+        elif state == "guided":
+            self.memory.lands = False
+        elif state == "climb":
+            self._climbs_from = self.now
         self._due.pop("want", None)
 
     def _act_of_pilot(self) -> str:
         """What somebody else has done with the vehicle in this state; empty if nothing."""
-        has_booted, self._has_booted = self._has_booted, False
-        if self.state not in MOTORS and self.state not in ("arm", "landing"):
+        has_booted, self._boots = self.order.boots > self._boots, self.order.boots
+        if self.state not in MOTORS and self.state not in FLIGHT:
             return ""
         lands, memory = self.state == "landing", self.memory
-        if self.mode == (LAND if lands else GUIDED) and self.state in ("join", "ground", "accept", "landing"):
+        own = {GUIDED} if self.state in ("join", "ground", "accept", "guided") else set()
+        if lands:
+            own = {GUIDED} if memory.mode != LAND else set()
+            own |= {LAND} if mavlink.MAV_CMD_NAV_LAND in self._sent else set()
+        if self.mode in own and (self.mode == LAND or self.state in ("join", "ground", "accept")):
             memory.mode = self.mode  # from now on no other
-        allowed = {memory.mode, LAND} if lands else {memory.mode}
-        if self.state == "guided" or (lands and memory.mode != LAND):
-            allowed.add(GUIDED)
-        if has_booted:
-            return "it has booted again"
-        if self.mode not in allowed:
-            return f"mode {name_of('COPTER_MODE', self.mode)} by somebody else"
-        if self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(self.state, True):
-            return "a failsafe of the vehicle"
-        if self.armed != MOTORS.get(self.state, self.armed):
-            return f"motors {'on' if self.armed else 'off'} by somebody else"
-        return ""
+        failed = self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(self.state, True)
+        acts = {
+            "it has booted again": has_booted,
+            "the mode switch was moved": self._has_switched,
+            f"mode {name_of('COPTER_MODE', self.mode)} by somebody else": self.mode
+            not in {memory.mode, *own},
+            "a failsafe of the vehicle": failed,
+            f"motors {'on' if self.armed else 'off'} by somebody else": self.armed
+            != MOTORS.get(self.state, self.armed),
+            "sent elsewhere by somebody else": self._aims_elsewhere(),
+        }
+        return next((what for what, is_so in acts.items() if is_so), "")
+
+    def _aims_elsewhere(self) -> bool:
+        """Whether the vehicle flies to a place that is not its goal, because another station has told it."""
+        aim, goal = self.seen.get("POSITION_TARGET_GLOBAL_INT"), self.memory.goal
+        flies = self.state in ("climb", "cruise", "landing") and self.mode == GUIDED and self.in_air
+        if not flies or aim is None or goal is None or self._came[aim.get_type()] < self._climbs_from:
+            return False
+        here = self.seen["GLOBAL_POSITION_INT"]
+        height = aim.alt - (here.alt - here.relative_alt) / 1e3
+        away = way((aim.lat_int / 1e7, aim.lon_int / 1e7), (goal.lat, goal.lon))[0]
+        return away > AIM or abs(height - goal.altitude) > AIM
 
     def _hands_off(self, reason: str) -> None:
         """The pilot has it."""
@@ -517,9 +612,12 @@ class Bridge:
             self._offer = None
         self._end()
         self._turn("watch", f"{reason}: a pilot to land it, and to hand over by GUIDED with its motors off")
+        self._warn(f"watches: {reason}")
 
     def _check_limit(self) -> None:
         """End what has taken too long."""
+        if self.state in FLIGHT and self._heard_at - ABOUT <= self._commanded < self.now - SILENCE:
+            self._hands_off(f"mode and motors not heard for {SILENCE:.0f} s after a command")
         goal, lasting, limit = self.memory.goal, self.now - self._since, LIMITS.get(self.state, math.inf)
         if self.state == "climb":
             limit = 30 + 2 * goal.altitude
@@ -564,6 +662,12 @@ class Bridge:
     def _connect(self) -> None:
         if "HEARTBEAT" not in self.seen or self.here is None or not (self.on_ground or self.in_air):
             return
+        if not self.memory.vehicle and self.now < self._since + IDENTITY:
+            self.why = "which vehicle it is"
+            if self._is_due("identity", 1.0):
+                asked = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, 148, *[0.0] * 6
+                self._out.append(mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked))
+            return
         state, mode, is_told = self.memory.state, self.memory.mode, self.memory.goal is not None
         if state in ("watch", "cruise", "landing") or (is_told and self.in_air):
             self._turn(state, "on as before")
@@ -592,7 +696,8 @@ class Bridge:
             self._turn("ground", "a report to be taken")
 
     def _leave(self) -> None:
-        self._want(1.0, self._hear_change, "POST", "/uavs", {"leave": [self.uav]})
+        leave = {"leave": [self.uav], "bridge": self.memory.bridge}
+        self._want(1.0, self._hear_change, "POST", "/uavs", leave)
 
     def _hear_change(self, _: int, body: dict[str, Any]) -> None:
         self._has_joined = True
@@ -615,7 +720,7 @@ class Bridge:
                 self._ask()
 
     def _accept(self) -> None:
-        row = {"ID": self.uav, "answer": self._offer.answer, "status": "accepted"}
+        row = self._row(self._offer.answer, "accepted")
         self._want(0.0, self._hear_confirmation, "POST", "/acknowledgements", row)
 
     def _change(self, command: int, *params: float) -> None:
@@ -680,6 +785,8 @@ class Bridge:
             self.why = "the vehicle to turn its motors off"
         elif self.now > self._down + 2 and max((fall for _, fall in self._falls), default=0.0) > FALL:
             self._hands_off("its motors went off in the air")
+        elif self.now > self._down + 2 and self.memory.mode == LAND and not self.memory.lands:
+            self._hands_off("it has landed, and has not said that it did so for the bridge")
         elif self.now > self._down + 2:
             self._end()
             self._turn("ground" if self._has_joined else "join", "a report to be taken")

@@ -11,11 +11,16 @@ service takes it to fly to that landing point. Without an acceptance by 110 s, i
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import shapely
 import torch
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import KDTree
 
 from damian import keys
 from damian.common.checks import SECONDS
@@ -35,6 +40,7 @@ from damian_fleet.rows import (
     Change,
     Command,
     FleetStatus,
+    Speaker,
     UavStatus,
     said_by,
 )
@@ -42,6 +48,8 @@ from damian_fleet.settings import FleetConfig
 
 GRACE = 60.0
 """A UAV that stands elsewhere so long after twice the duration of its flight has ended that [s]."""
+LEASE = 30.0
+"""How long a UAV is of the bridge that spoke for it last [s]; in a flight, until that is over."""
 MOST_STEPS = 3600
 """Steps that are taken at once, or again after a restart; beliefs begin anew after earlier ones."""
 KEPT_REPORTS, KEPT_ANSWERS = 512, 64
@@ -70,6 +78,21 @@ Event = dict[str, Any]
 
 class Waiting(InputError):
     """The fleet has not begun, because UAVs have not reported yet; ``str(error)`` names them."""
+
+
+class Held(InputError):
+    """Another bridge speaks for the UAV, or for its vehicle."""
+
+
+@dataclass
+class Lease:
+    """Which bridge speaks for a UAV, for which vehicle (empty if it does not tell), and when it did last [s];
+    None after a restart of the service. ``warning``: who else has tried to since."""
+
+    bridge: str
+    vehicle: str
+    seen: float | None
+    warning: str = ""
 
 
 @dataclass
@@ -186,6 +209,10 @@ class Fleet:
         self.parts, self.config, self.mark = parts, config, mark
         self.computed_from, self.clock, self.n_answers = computed_from, 0.0, 0
         self.uavs: dict[str, Uav] = {}
+        self.leases: dict[str, Lease] = {}
+        """The bridges that speak for UAVs."""
+        self.others: Callable[[], Iterable[Fleet]] = lambda: [self]
+        """All fleets of the service, this one included."""
         self.joining: dict[str, UavLog] = {}
         """UAVs that join with their first report."""
         self._take_in(uavs)
@@ -230,13 +257,17 @@ class Fleet:
 
     def reported(self, rows: Rows, now: float) -> Event:
         """Reports that come in together; all or none."""
-        at, said = self._at(now), []
+        at, said, speakers = self._at(now), [], dict[str, Any]()
         for where, report in rows:
             with named(where):
+                speaker = validated(Speaker, {"ID": report.id, **(report.model_extra or {})})
                 said.append(said_by(report))
                 report.stamp(at)
                 self.tracker.check(report, self.joining.get(report.id))
-        return {"received": at, "reports": said}
+            self.require_lease(report.id, speaker.bridge, at, speaker.vehicle)
+            if speaker.bridge:
+                speakers[report.id] = [speaker.bridge, speaker.vehicle]
+        return {"received": at, "reports": said, **({"speakers": speakers} if speakers else {})}
 
     def acknowledged(self, rows: Sequence[Acknowledgement], now: float) -> Event:
         """What UAVs say of their answers; how far these have come stands in the event."""
@@ -244,6 +275,7 @@ class Fleet:
         self.advance(at)
         for row in rows:
             (uav,) = self.members([row.id], "ID")
+            self.require_lease(uav.id, row.bridge, at)
             decision, status = uav.answer(row.answer), "unknown"
             if decision is not None:
                 before = so_far.get(row.answer, decision.status)
@@ -261,6 +293,8 @@ class Fleet:
 
     def changed(self, said: Change, now: float) -> Event:
         """UAVs join with their first reports, and leave now."""
+        for uav in said.leave if said.bridge is not None else ():
+            self.require_lease(uav, said.bridge, self._at(now))
         known = [*self.uavs, *self.joining]
         join = [uav for uav in dict.fromkeys(said.join) if uav not in known]
         leave = [uav for uav in known if uav in said.leave]
@@ -278,6 +312,8 @@ class Fleet:
         """
         asked, at = self.members(said.uavs, "uavs"), self._at(now)
         self.advance(at)
+        for uav in asked if said.bridge else ():
+            self.require_lease(uav.id, said.bridge, at)
         if not self.tracker.has_begun:
             waits = listed([uav for uav, log in self.tracker.logs.items() if log.newest is None])
             raise Waiting(f"no advice yet: no report of {waits} has come in")
@@ -302,12 +338,49 @@ class Fleet:
         rows = zip(self.uavs.values(), action[0].tolist(), goal[0].tolist(), strict=True)
         return {uav.id: self._decision(uav, *row) for uav, *row in rows if uav.id in choosing}
 
+    # Who speaks for a UAV.
+
+    def require_lease(self, uav: str, bridge: str, now: float, vehicle: str = "") -> None:
+        """Refuse a bridge while another one speaks for the UAV, or for its vehicle by another name."""
+        for fleet in self.others():
+            for name, lease in fleet.leases.items():
+                is_same = fleet is self and name == uav
+                lease.seen = now if lease.seen is None else lease.seen
+                if is_same and lease.bridge == bridge:
+                    lease.seen = now
+                elif (is_same or (vehicle and vehicle == lease.vehicle)) and fleet.holds(name, now):
+                    one, other = (each[:6] or "without a name" for each in (lease.bridge, bridge))
+                    what = f"UAV {name}" if is_same else f"the vehicle of UAV {name}, here called {uav}"
+                    lease.warning = f"bridge {other} has tried to speak for {what}: end it"
+                    remedy = "end that one, or wait until it has not been heard"
+                    raise Held(f"bridge: {one} speaks for {what}, not {other}: {remedy} for {LEASE:g} s")
+
+    def holds(self, uav: str, now: float) -> bool:
+        """Whether the bridge that spoke for a UAV last still has it."""
+        seen, member = self.leases[uav].seen or 0.0, self.uavs.get(uav)
+        if order := member and member.open_order:
+            seen = max(seen, order.time + 2 * order.duration + GRACE)
+        return now <= seen + LEASE
+
+    def warnings(self, uavs: Iterable[str]) -> str:
+        """Who else has tried to speak for UAVs since this was asked last."""
+        leases = [self.leases[uav] for uav in uavs if uav in self.leases]
+        found = "; ".join(lease.warning for lease in leases if lease.warning)
+        for lease in leases:
+            lease.warning = ""
+        return found
+
     # Events.
 
     def apply(self, event: Event) -> list[str]:
         """Take an event into account; returns what became of its rows, or to which UAVs it applies."""
         self.advance(event["received"])
         if "reports" in event:
+            for uav, speaker in event.get("speakers", {}).items():
+                lease = Lease(*speaker, event["received"])
+                if (before := self.leases.get(uav)) and before.bridge == lease.bridge:
+                    lease.warning = before.warning
+                self.leases[uav] = lease
             return [self._report(validated(Report, row), event["received"]) for row in event["reports"]]
         if "acknowledged" in event:
             return [self._acknowledge(**row) for row in event["acknowledged"]]
@@ -383,6 +456,7 @@ class Fleet:
 
     def _change(self, join: Sequence[str], leave: Sequence[str]) -> None:
         self.joining = {uav: log for uav, log in self.joining.items() if uav not in leave}
+        self.leases = {uav: lease for uav, lease in self.leases.items() if uav not in leave}
         now = () if self.tracker.has_begun else join
         if now or {*leave} & {*self.uavs}:
             self._regroup([*(uav for uav in self.uavs if uav not in leave), *now])
@@ -467,7 +541,12 @@ class Fleet:
         """Whether a flight is not safe any more that a UAV accepts now."""
         if not decision.moves or decision is not uav.offer:
             return False
-        return self.danger(uav) not in (None, decision.reason) or self._meets(uav, decision, {})
+        newest, now = self._newest(uav).report, decision
+        if newest.time > decision.time and not newest.flies:
+            now = replace(decision, start=self.ground.local(newest.place() or (0.0, 0.0)))
+        return (
+            self.danger(uav) not in (None, decision.reason) or self._meets(uav, now, {}) or self._bends(now)
+        )
 
     def _start(self, uav: Uav, point: int) -> tuple[float, float]:
         """Position of a UAV [m]: by its newest report, if it stands at this landing point; or the point."""
@@ -494,7 +573,7 @@ class Fleet:
         """What a UAV in danger is told: to return if it is sent home or can still get there, else to hold."""
         here = goal = self._standing(uav.id, True)
         if reason == "returning":
-            goal = self._home(uav)
+            goal = self._leads_to(uav, self._home(uav))
         elif reason == "battery" and self.node.scenario.battery.enabled:
             home = self._home(uav)
             reaches = self._flight(uav, self._start(uav, here), home)[1] <= self._newest(uav).battery
@@ -543,10 +622,53 @@ class Fleet:
     def _path(self, decision: Decision) -> shapely.LineString:
         return shapely.LineString([decision.start, self.ground.points[decision.goal]])
 
+    def _is_clear(self, ways: Any) -> Any:
+        """Whether straight ways stay in the region, and away from its edge, that of its zones included.
+
+        The margin is less where a way begins or ends nearer to the edge.
+        """
+        polygon = self.ground.region.polygon
+        shapely.prepare(polygon)
+        edge = polygon.boundary
+        ends = [shapely.distance(shapely.get_point(ways, end), edge) for end in (0, -1)]
+        least = np.minimum(self.config.margin, np.minimum(*ends)) - 1e-6
+        return shapely.covers(polygon, ways) & (shapely.distance(ways, edge) >= least)
+
     def _bends(self, decision: Decision) -> bool:
-        """Whether the way of a flight is not straight; a UAV is told straight ones only."""
-        ways, ends = self.node.simulation.airspace.detours, torch.tensor([decision.origin, decision.goal])
-        return ways is not None and int(ways.row(*ends)) < len(ways.pair)
+        """Whether the straight way from where a UAV stands is not clear; from outside it may come in."""
+        polygon, way = self.ground.region.polygon, self._path(decision)
+        if not polygon.covers(shapely.Point(decision.start)):
+            within = way.intersection(polygon)
+            if within.geom_type != "LineString" or within.length < way.length - self.config.margin:
+                return True
+            way = within
+        return not self._is_clear(way)
+
+    @cached_property
+    def _hops(self) -> csr_array:
+        """Distances between landing points, not too far apart, whose straight ways are clear [m]."""
+        points = self.ground.points
+        one, other = (
+            KDTree(points).query_pairs(6 * self.node.scenario.region.lattice_step, output_type="ndarray").T
+        )
+        clear = self._is_clear(shapely.linestrings(np.stack([points[one], points[other]], 1)))
+        one, other = one[clear], other[clear]
+        far = np.linalg.norm(points[one] - points[other], axis=1)
+        return csr_array((far, (one, other)), shape=(len(points),) * 2)
+
+    def _leads_to(self, uav: Uav, goal: int) -> int:
+        """The landing point to which a UAV flies next on the way to a goal, around what is in between."""
+        here = self._standing(uav.id, True)
+        if here == goal or not self._bends(self._decision(uav, None, goal)):
+            return goal
+        left = dijkstra(self._hops, directed=False, indices=goal)  # from each point on
+        taken = {point for other in self._others(uav) for point in self.booked(other)}
+        total = left + np.linalg.norm(self.ground.points - self._start(uav, here), axis=-1)
+        for point in total.argsort(kind="stable").tolist():
+            is_nearer = left[point] < left[here] and point not in taken
+            if is_nearer and not self._bends(self._decision(uav, None, point)):
+                return point
+        return goal
 
     def _cleared(self, found: Sequence[tuple[Uav, Decision]]) -> list[dict[str, Any]]:
         """Decisions to store, where UAVs hold that would meet others, or whose batteries end too low."""

@@ -10,6 +10,7 @@ its requests, so that a slow service stops nothing. What must outlive a restart 
 
 import argparse
 import contextlib
+import fcntl
 import json
 import logging
 import math
@@ -21,9 +22,12 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
+from collections.abc import Sequence
 from pathlib import Path
 
 os.environ.setdefault("MAVLINK20", "1")
+from typing import Any
+
 from pymavlink import mavutil
 
 from damian_fleet.bridge import STATION, Answer, Bridge, Memory, Request
@@ -90,6 +94,43 @@ def serve(bridge: Bridge, address: str, url: str, token: str, memory: Path) -> N
     link.close()
 
 
+def parsed_vehicles(given: Sequence[str]) -> dict[str, tuple[str, int | None]]:
+    """Address and MAVLink system (None: the first that is heard) of each UAV of ``--vehicle``."""
+    vehicles: dict[str, tuple[str, int | None]] = {}
+    ports: dict[str, str] = {}
+    for text in given:
+        uav, _, place = text.partition("=")
+        address, _, system = place.partition("#")
+        if not (uav and address and (system or "1").isdecimal()):
+            raise ValueError(f"{text} is not as A=udpin:127.0.0.1:14551#1")
+        if uav in vehicles:
+            raise ValueError(f"{uav} is given twice: give each UAV a name of its own")
+        kind, _, end = address.partition(":")
+        port = end.rpartition(":")[2] if kind in ("udp", "udpin", "tcpin") else address
+        if port in ports:
+            raise ValueError(
+                f"{ports[port]} and {uav} are both on {port}: give each vehicle a port of its own"
+            )
+        ports[port], vehicles[uav] = uav, (address, int(system) if system else None)
+    return vehicles
+
+
+def memory_of(path: Path) -> tuple[Memory | None, Any]:
+    """What a bridge remembers, and the file that keeps other bridges from it while it is open."""
+    lock = path.with_suffix(".lock").open("w")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise ValueError(f"{path}: another bridge works with this memory: end that one") from None
+    try:
+        return Memory.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None, lock
+    except ValueError as error:
+        lock.close()
+        problem = "it is not the memory of a bridge; remove it to begin anew"
+        raise ValueError(f"{path}: {problem}: {error}") from None
+
+
 def main() -> None:
     """Bridge each vehicle until all have left; Ctrl-C lets them land and leave, a second one ends at once."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -105,19 +146,19 @@ def main() -> None:
     given = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     given.memory.mkdir(parents=True, exist_ok=True)
-    named = dict(text.partition("=")[::2] for text in given.vehicle)
-    threads, bridges = [], []
-    for uav, place in named.items():
-        address, _, system = place.partition("#")
-        if not (uav and address and (system or "1").isdecimal()):
-            parser.error(f"--vehicle: {uav}={place} is not as A=udpin:127.0.0.1:14551#1")
+    threads, bridges, locks = [], [], []
+    try:
+        vehicles = parsed_vehicles(given.vehicle)
+    except ValueError as error:
+        parser.error(f"--vehicle: {error}")
+    for uav, (address, system) in vehicles.items():
         path = given.memory / f"{given.fleet}.{urllib.parse.quote(uav, safe=' ')}.json"
         try:
-            memory = Memory.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None
+            memory, lock = memory_of(path)
         except ValueError as error:
-            parser.error(f"{path}: it is not the memory of a bridge; remove it to begin anew: {error}")
-        own = given.listen, int(system) if system else None, memory
-        bridges.append(Bridge(uav, given.fleet, [*named], *own))
+            parser.error(str(error))
+        locks.append(lock)
+        bridges.append(Bridge(uav, given.fleet, [*vehicles], given.listen, system, memory))
         work = bridges[-1], address, given.service, given.token, path
         threads.append(threading.Thread(target=serve, args=work, daemon=True))
 
@@ -133,6 +174,8 @@ def main() -> None:
         thread.start()
     for thread in threads:
         thread.join()
+    for lock in locks:
+        lock.close()
 
 
 if __name__ == "__main__":

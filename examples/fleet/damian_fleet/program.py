@@ -23,12 +23,14 @@ from damian.baselines.script import script_policy
 from damian.common.errors import InputError, RunError
 from damian.common.fields import rules
 from damian.field.node import Node, for_uavs, scenario_of_reports
+from damian_fleet.door import MOST_STRANGERS, door
 from damian_fleet.fleet import MOST_STEPS, Fleet
 from damian_fleet.service import make_app
 from damian_fleet.settings import FleetConfig
 from damian_fleet.store import Fleets
 
-LIMITS = {"backlog": 64, "limit_concurrency": 500, "timeout_keep_alive": 30, "timeout_graceful_shutdown": 2}
+LIMITS = {"backlog": 64, "limit_concurrency": 500 + MOST_STRANGERS}
+LIMITS |= {"timeout_keep_alive": 30, "timeout_graceful_shutdown": 2}
 """Connections that wait, and those that are served at a time (others are answered 503); times [s]."""
 
 
@@ -113,7 +115,8 @@ def main() -> None:
             app, quiet = make_app(fleets, str(config.token)), {"log_level": "warning", "access_log": False}
             gc.collect()
             gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
-            uvicorn.Server(uvicorn.Config(app, ws="none", **quiet, **LIMITS)).run(sockets=[listener])
+            served = uvicorn.Config(app, http=door(str(config.token)), ws="none", **quiet, **LIMITS)
+            uvicorn.Server(served).run(sockets=[listener])
     except (InputError, RunError) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(3 if isinstance(error, RunError) else 2)

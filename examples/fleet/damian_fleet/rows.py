@@ -8,6 +8,10 @@ from damian.field.rows import Latitude, Longitude, Row, UavId, column_of
 
 MOST_UAVS = 100
 """Most UAVs of a fleet."""
+MOST_ROWS = 500
+"""Most rows of a request: so many take some tenths of a second, for which others wait."""
+BridgeId = Annotated[str, Field(max_length=64)]
+"""Tells a bridge from all others; empty for a client that is none."""
 _plain = BeforeValidator(lambda value: column_of(value) if isinstance(value, str) else value)
 
 
@@ -17,6 +21,15 @@ class Acknowledgement(Row):
     id: UavId
     answer: Annotated[str, Field(max_length=64)]
     status: Annotated[Literal["accepted", "refused", "taken off", "landed", "aborted"], _plain]
+    bridge: BridgeId = ""
+
+
+class Speaker(Row):
+    """Who reports for a UAV: its bridge, and the identity of the autopilot behind that."""
+
+    id: UavId
+    bridge: BridgeId = ""
+    vehicle: BridgeId = ""
 
 
 class Place(BaseModel):
@@ -100,6 +113,7 @@ class Asking(Body):
     """The UAVs that ask for advice."""
 
     uavs: list[UavId]
+    bridge: BridgeId = ""
 
 
 class Command(Body):
@@ -114,6 +128,8 @@ class Change(Body):
 
     join: list[UavId] = []
     leave: list[UavId] = []
+    bridge: BridgeId | None = None
+    """The bridge that says so; None for a person."""
 
 
 def said_by(row: Row) -> dict[str, Any]:

@@ -30,14 +30,23 @@ from damian.common.text_files import one_line, show
 from damian.field.rows import Found, Report, reports_of, rows_of_csv, rows_of_json, validated, written
 from damian.show.geojson import on_earth
 from damian.show.replay_page import PAGE
-from damian_fleet.fleet import Fleet, Waiting
-from damian_fleet.rows import Acknowledgement, Advice, Asking, Change, Command, FleetStatus, Members
+from damian_fleet.fleet import Fleet, Held, Waiting
+from damian_fleet.rows import (
+    MOST_ROWS,
+    Acknowledgement,
+    Advice,
+    Asking,
+    Change,
+    Command,
+    FleetStatus,
+    Members,
+)
 from damian_fleet.store import Fleets, NoFleet
 
 MAX_BODY, TICK = 1_000_000, 1.0
 """Largest body of a request [bytes]; time between two updates of all fleets, so that no request waits for
 many steps [s]."""
-STATUS = {NoFleet: 404, Waiting: 409, InputError: 422, RequestValidationError: 422, RunError: 507}
+STATUS = {NoFleet: 404, Waiting: 409, Held: 409, InputError: 422, RequestValidationError: 422, RunError: 507}
 """What a request is answered that ends with an error; 507: it could not be stored, and changed nothing."""
 _LOG = logging.getLogger("damian_fleet")
 
@@ -86,9 +95,13 @@ async def rows_of(request: Request) -> Found:
     """The rows of a body, JSON (one object or a list) or CSV."""
     body = await request.body()
     is_table = request.headers.get("content-type", "").startswith("text/csv")
+    if is_table and body.count(b"\n") > MOST_ROWS + 1:
+        raise HTTPException(413, f"there are more than {MOST_ROWS} rows: send them in several requests")
     found = rows_of_csv(body.decode("utf-8-sig", "replace")) if is_table else rows_of_json(body)
     if not found:
         raise InputError("there are no rows")
+    if len(found) > MOST_ROWS:
+        raise HTTPException(413, f"there are more than {MOST_ROWS} rows: send them in several requests")
     return found
 
 
@@ -182,9 +195,11 @@ def _fleets(fleets: Fleets, token: str, now: Clock) -> APIRouter:
     async def report(name: str, rows: Rows) -> dict[str, Any]:
         """Take reports, all or none; each is ``new``, ``late``, a ``duplicate`` or too ``old``."""
         reports = reports_of(rows)
-        ignored = sorted({column for _, report in reports for column in report.model_extra or ()})
+        ignored = {column for _, report in reports for column in report.model_extra or ()}
         found = fleets.take(name, Fleet.reported, reports, now())
-        return {"accepted": len(found), "found": found, "ignored": ignored}
+        told = {"accepted": len(found), "found": found, "ignored": sorted(ignored - {"bridge", "vehicle"})}
+        warning = fleets[name].warnings({report.id for _, report in reports})
+        return {**told, "warning": warning} if warning else told
 
     @router.post("/{name}/advice", response_model_exclude_unset=True)
     async def advise(name: str, said: Asking) -> dict[str, list[Advice]]:

@@ -41,6 +41,12 @@ class FleetConfig(Settings):
     clearance: float = setting(
         10.0, "Least distance between paths at one level; else a UAV holds.", unit="m", low=0
     )
+    margin: float = setting(
+        10.0,
+        "Least distance of a way to zones and the edge of the region, but where it ends.",
+        unit="m",
+        low=0,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

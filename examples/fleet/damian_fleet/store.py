@@ -97,7 +97,9 @@ class Fleets:
                 raise RunError(f"database: fleet {name} is of other landing points: give its region")
             for event in self._events(key):
                 fleet.apply(json.loads(event))
-            self.loaded[name] = fleet
+            for lease in fleet.leases.values():
+                lease.seen = None  # from now on it counts
+            self._serve(name, fleet)
         return self.loaded[name]
 
     def _events(self, key: int) -> Iterator[str]:
@@ -143,8 +145,12 @@ class Fleets:
         head |= {"about": self.about, "ground": _mark(made)}
         self._store("INSERT INTO fleets(name, head) VALUES (?, ?)", name, json.dumps(head))
         (self._ids[name],) = self._base.execute("SELECT last_insert_rowid()").fetchone()
-        self.loaded[name] = made
+        self._serve(name, made)
         return True
+
+    def _serve(self, name: str, fleet: Fleet) -> None:
+        fleet.others = self.loaded.values
+        self.loaded[name] = fleet
 
     def end(self, name: str, now: float) -> None:
         """End a fleet; what happened to it stays in the database."""

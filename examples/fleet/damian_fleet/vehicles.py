@@ -8,6 +8,7 @@ attitude, no rotor, no sensor. A place is north + 1j east [m] of the origin; hei
 address of a bridge, over UDP, 60 m apart.
 """
 
+import itertools
 import math
 import os
 import sys
@@ -25,7 +26,12 @@ FORCE = 21196  # second parameter of a disarming that is done in the air as well
 CUSTOM_MODE, ARMED, CHANGE_MODE = 1, 128, 1  # flags of the base mode and of DO_REPOSITION
 RELATIVE_ALTITUDE, AMSL = (3, 6), (0, 5)  # MAV_FRAME
 GROUND_AMSL = 50.0  # [m], so that the heights of the two frames differ
-STREAMS, GPS_RAW = (0, 1, 24, 33, 147, 245), 24  # messages that can be asked for
+STREAMS, GPS_RAW = (0, 1, 24, 33, 65, 87, 147, 148, 245), 24  # messages that can be asked for
+SWITCH = dict(zip((STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND), range(1165, 2000, 150), strict=True))
+"""Where a pilot's switch stands for a mode [us] of channel 5 (FLTMODE_CH)."""
+BY_PILOT = (STABILIZE, ALT_HOLD, LOITER)  # modes that a pilot's sticks fly
+BOARDS = itertools.count(1)
+"""Serial numbers of autopilots."""
 
 METRES_PER_DEGREE = 111_319.49
 CLIMB_SPEED, DESCENT_SPEED, LANDING_SPEED = 2.5, 1.5, 0.5  # [m/s]; the last below LANDING_HEIGHT
@@ -39,19 +45,21 @@ class Copter:
     """One ArduCopter: `step(now, messages)` obeys messages that arrived and returns those that it sends.
 
     Public state is the truth: `mode`, `armed`, `landed`, `place`, `height`, `velocity`, `crashed`. A pilot
-    calls `change_mode`, `arm` and `disarm`; faults are `crash()`, `reboot(now)` and the fields `wind` [m/s],
-    `fix`, `glitch` [m, of what it says], `prearm` (a text that refuses arming), `battery` [%] of each.
+    calls `change_mode`, which moves his `switch` (None: no receiver), `arm` and `disarm`; faults are
+    `crash()`, `reboot(now)` and the fields `wind` [m/s], `fix`, `glitch` [m, of what it says], `prearm` (a
+    text that refuses arming), `battery` [%] of each.
 
     ``origin`` is latitude and longitude [deg] of place 0, ``drain`` what a second in the air costs [%]. It
     returns on a low battery (BATT_FS_LOW_ACT=2), and lands if the MAVLink system ``station`` is silent for
-    5 s (MAV_GCS_SYSID, FS_GCS_ENABLE=5), if one is given.
+    5 s (MAV_GCS_SYSID, FS_GCS_ENABLE=5), if one is given, unless a pilot's sticks fly it (FS_OPTIONS=16).
     """
 
     def __init__(self, origin, place=0j, *, system=1, now=0.0, drain=0.05, station=None):
         self.origin, self.place, self.height, self.landed = origin, complex(place), 0.0, True
         self.system, self.drain, self.station = system, drain, station
         self.wind, self.fix, self.glitch, self.prearm = 0j, True, 0j, None
-        self.battery, self.crashed = [100.0], False
+        self.battery, self.crashed, self.board, self.switch = [100.0], False, next(BOARDS), SWITCH[STABILIZE]
+        self.aside = -math.inf  # until then the switch is off its place
         self.mav, self.sent, self.now = mavlink.MAVLink(None, system, 1), [], now
         self.reboot(now - FIX_AFTER_BOOT)  # it has stood there for a while
 
@@ -100,6 +108,14 @@ class Copter:
         self.stop()
 
     def change_mode(self, mode):
+        """A pilot chooses a mode; whether it flies in that. A switch that stands there is moved and back."""
+        if mode in SWITCH and self.switch is not None:
+            if self.switch == SWITCH[mode]:
+                self.aside = self.now + 1.0
+            self.switch = SWITCH[mode]
+        return self.enter(mode)
+
+    def enter(self, mode):
         """Whether it flies in that mode."""
         if mode == self.mode:
             return True
@@ -158,7 +174,7 @@ class Copter:
             mavlink.MAV_CMD_NAV_LAND: LAND,
         }
         if command.command in modes:
-            return ACCEPTED if self.change_mode(modes[command.command]) else FAILED
+            return ACCEPTED if self.enter(modes[command.command]) else FAILED
         match command.command:
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
                 done = self.arm() if first == 1 else first == 0 and self.disarm(second == FORCE)
@@ -194,7 +210,7 @@ class Copter:
             return DENIED
         if frame not in RELATIVE_ALTITUDE + AMSL or abs(latitude) > 90 or abs(longitude) > 180:
             return DENIED
-        if not self.change_mode(GUIDED):
+        if not self.enter(GUIDED):
             return FAILED
         if not self.position_control:  # entering it resets the speed: only a later one holds
             self.speed, self.position_control = DEFAULT_SPEED, True
@@ -210,6 +226,7 @@ class Copter:
             self.lost_since = self.now
         lost = self.lost_since is not None and self.now - self.lost_since >= EKF_FAILSAFE
         silent = None not in (self.station, self.heard) and self.now - self.heard > STATION_FAILSAFE
+        silent = silent and self.mode not in BY_PILOT
         causes = {
             "EKF": (lost and not self.landed and self.mode in NEED_POSITION, LAND),
             "battery": (min(self.battery) <= BATTERY_LOW, RTL),
@@ -224,7 +241,7 @@ class Copter:
                 if self.landed:
                     self.disarm()
                 elif self.mode != LAND:
-                    _ = self.change_mode(mode) or self.change_mode(LAND)
+                    _ = self.enter(mode) or self.enter(LAND)
 
     def move(self, dt):
         if not self.armed:
@@ -324,6 +341,19 @@ class Copter:
                 boot = round((self.now - self.booted) * 1000)
                 speed = (round(100 * v) for v in (self.velocity.real, self.velocity.imag, -self.climb))
                 yield mavlink.MAVLink_global_position_int_message(boot, *place, above_home, *speed, 65535)
+            case 65 if self.switch is not None:  # RC_CHANNELS
+                boot = round((self.now - self.booted) * 1000)
+                aside = (self.now < self.aside) * (150 if self.switch == SWITCH[STABILIZE] else -150)
+                channels = [1500, 1500, 1000, 1500, self.switch + aside, *[65535] * 13]
+                yield mavlink.MAVLink_rc_channels_message(boot, 5, *channels, 255)
+            case 87 if self.position_control and self.goal and self.mode == GUIDED:
+                boot = round((self.now - self.booted) * 1000)
+                latitude, longitude = (round(each * 1e7) for each in self.degrees(self.goal[0]))
+                aim = latitude, longitude, self.goal[1] + GROUND_AMSL
+                yield mavlink.MAVLink_position_target_global_int_message(boot, 0, 0xFFF8, *aim, *[0] * 8)
+            case 148:  # AUTOPILOT_VERSION
+                rest = *[0] * 5, *[[0] * 8] * 3, *[0] * 3, [*self.board.to_bytes(18, "little")]
+                yield mavlink.MAVLink_autopilot_version_message(*rest)
             case 147:  # BATTERY_STATUS
                 for battery, level in enumerate(left):
                     rest = 32767, [12000] + [65535] * 9, 1000, -1, -1, level

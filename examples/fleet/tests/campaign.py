@@ -23,22 +23,38 @@ import torch
 
 from damian.baselines.random import random_policy
 from damian_fleet import program
-from damian_fleet.bridge import Answer, Bridge, Memory
+from damian_fleet.bridge import FLIGHT, Answer, Bridge, Memory
 from damian_fleet.program import config_of, make_fleets
 from damian_fleet.service import Clock, make_app
 from damian_fleet.store import Fleets
-from damian_fleet.vehicles import ARMED, GUIDED, LAND, LOITER, MODES, RTL, STABILIZE, Copter, mavlink
+from damian_fleet.vehicles import (
+    ARMED,
+    GUIDED,
+    LAND,
+    LOITER,
+    MODES,
+    RTL,
+    STABILIZE,
+    SWITCH,
+    Copter,
+    mavlink,
+)
 
 UAVS, TICK, HOUR = "ABCDE", 0.25, 3600.0
 ORIGIN = (52.8110, -4.1283)
 STARTS = (0j, 170 + 0j, 340 + 0j, 510 + 0j, -170 + 0j)
 SAME_POINT, CLEARANCE = 15.0, 5.0  # [m]; 10 m are set, and a copter stands up to 2 m beside its landing point
 HOVER, LONGEST = 30.0, 600.0  # [s] that a copter may stand in the air in GUIDED, and that it may fly
+HEED, APART = 3.0, 25.0  # [s] after which a bridge watches, and between commands of two bridges
+OLD = 3.5  # how old mode and motors may be when something is commanded [s]
+ASIDE = 30.0  # how far beside STARTS copters begin [m]
 HARMLESS = (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE)
 TOKEN = "campaign-campaign"
 WORDS = ["region=llanbedr", "motion=polynomial", "motion.max_speed=8", "battery.enabled=true"]
 WORDS += ["region.lattice_step=170", "actions.distances=[260,390]", "levels=[20,25,30]"]
-"""15 landing points, long flights and three levels for five, so that UAVs meet often."""
+ZONE = [[110, -50], [150, -50], [150, -10], [110, -10]]
+WORDS += [f"region.zones=[{ZONE}]".replace(" ", "")]
+"""15 landing points, long flights and three levels for five, so that UAVs meet often; a zone between two."""
 
 
 class Line:
@@ -96,20 +112,35 @@ class Service:
         return answer.status_code, answer.json()
 
 
-class Uav:
-    """A copter, its bridge and the links between them and the service."""
+class Link:
+    """A bridge, and its links with a copter and with the service."""
 
-    def __init__(self, name, number, rng):
-        self.name = name
-        self.copter = Copter(ORIGIN, STARTS[number], system=number + 1, station=255)
+    def __init__(self, name, copter, rng):
+        self.name, self.copter, self.bridge = name, copter, None
         self.down, self.up, self.asked, self.answered = [
             Line(rng, slowest) for slowest in (0.3, 0.3, 1.5, 1.5)
         ]
-        self.memory, self.bridge, self.epoch, self.off_until = None, None, 0.0, 0.0
-        self.act, self.act_seen, self.changed = None, False, {}
+        self.mute_until = 0.0  # no heartbeat comes through
+
+    def start(self, memory=None):
+        own = {"system": self.copter.system, "memory": memory}
+        self.bridge = Bridge(self.name, "north", [*UAVS], **own)
+
+
+class Uav(Link):
+    """A copter, its bridge, what a pilot has done with it, and another bridge that somebody starts."""
+
+    def __init__(self, name, number, rng):
+        aside = ASIDE * np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())
+        super().__init__(name, Copter(ORIGIN, STARTS[number] + aside, system=number + 1, station=255), rng)
+        self.memory, self.epoch, self.off_until = None, 0.0, 0.0
+        self.act, self.seen_at, self.changed, self.shown = None, None, {}, {}
+        self.second, self.second_until, self.ambush, self.others, self.wait = None, 0.0, None, 0, None
         self.strayed, self.known, self.confirmed, self.accepted, self.way = False, 0.0, 0.0, 0.0, None
         self.last_command = self.hover_since = self.air_since = self.idle_since = None
-        self.flights, self.shown = 0, None
+        self.commander, self.commanded = None, -np.inf
+        self.commanded_at, self.heartbeat_at = -np.inf, -np.inf  # when those that have come were sent
+        self.flights = 0
 
     def stop_bridge(self, until):
         if self.bridge is not None:
@@ -117,20 +148,42 @@ class Uav:
         self.bridge, self.off_until = None, until
 
     def start_bridge(self, epoch):
-        memory = Memory.model_validate_json(self.memory) if self.memory else None
-        own = {"system": self.copter.system, "memory": memory}
-        self.epoch, self.bridge = epoch, Bridge(self.name, "north", [*UAVS], **own)
+        self.epoch = epoch
+        self.start(Memory.model_validate_json(self.memory) if self.memory else None)
+
+    @property
+    def state(self):
+        """Of the bridge, or in which it was ended."""
+        return self.bridge.state if self.bridge else Memory.model_validate_json(self.memory).state
 
     def acted(self, now, why, *changed):
-        """Somebody else has changed mode (0) or motors (1): once it has seen that, the bridge is quiet."""
-        fell = self.copter.crashed and self.copter.height > 2
-        memory = self.bridge.memory if self.bridge else Memory.model_validate_json(self.memory)
-        lands = self.copter.mode == LAND and (self.last_command == LAND or memory.state == "landing")
-        if fell or not lands:
-            after = self.copter.mode, ARMED * self.copter.armed
-            self.act, self.act_seen, self.changed = (now, why), False, {i: after[i] for i in changed}
-            if fell or not self.copter.landed:
-                self.strayed, self.known = True, np.inf
+        """Somebody else has changed mode, motors, switch or aim: once that is heard, the bridge is quiet."""
+        copter = self.copter
+        fell = copter.crashed and copter.height > 2
+        lands = copter.mode == LAND and (self.last_command == LAND or self.state == "landing")
+        changed = [each for each in changed if each != "mode" or not lands or fell]
+        if changed:
+            self.act, self.seen_at, self.changed = (now, why), None, {*changed}
+        if (changed or fell) and (fell or not copter.landed):
+            self.strayed, self.known = True, np.inf
+
+    def hear(self, at, message, now):
+        """Note whether a message that comes in shows what somebody else has done."""
+        match message.get_type():
+            case "HEARTBEAT":
+                shows = {"mode": message.custom_mode, "motors": message.base_mode & ARMED}
+                self.heartbeat_at = max(self.heartbeat_at, at)
+            case "RC_CHANNELS":
+                shows = {"switch": message.chan5_raw}
+            case "POSITION_TARGET_GLOBAL_INT":
+                shows = {"aim": (message.lat_int, message.lon_int)}
+            case _:
+                return
+        for what, value in shows.items():
+            is_new = what in self.changed and self.shown.get(what) != value
+            if self.act is not None and self.seen_at is None and at >= self.act[0] and is_new:
+                self.seen_at = now
+            self.shown[what] = value
 
 
 class Campaign:
@@ -143,6 +196,8 @@ class Campaign:
         self.service = Service(Path(folder))
         self.uavs = [Uav(name, number, self.rng) for number, name in enumerate(UAVS)]
         self.broken, self.faults, self.answers, self.reported = {}, Counter(), {}, {}
+        self.service.fleets.create("north", [*UAVS])
+        self.ground = self.service.fleets["north"].ground
 
     def play(self, faults, every=10.0):
         """Let it fly, with a fault every so many seconds, then without, until every UAV has flown again."""
@@ -205,61 +260,95 @@ class Campaign:
 
     def step(self, uav):
         copter, now = uav.copter, self.now
-        for request in uav.asked.due(now):
-            uav.answered.send(now, Answer(*self.serve(uav, request), request.number))
         if uav.bridge is None and now >= uav.off_until:
             uav.start_bridge(self.rng.uniform(-HOUR, HOUR))
-            uav.shown = None
-        heard, answers = uav.up.due(now), uav.answered.due(now)
-        if uav.bridge is not None:
-            for at, message in heard:
-                if message.get_type() == "HEARTBEAT":
-                    shown = message.custom_mode, message.base_mode & ARMED
-                    is_new = uav.shown is None or any(
-                        shown[i] == after != uav.shown[i] for i, after in uav.changed.items()
-                    )
-                    uav.act_seen |= uav.act is not None and at >= uav.act[0] and is_new
-                    uav.shown = shown
-            messages, requests = uav.bridge.step(now + uav.epoch, [message for _, message in heard], answers)
+            uav.shown = {}
+        links = [uav, uav.second] if uav.second else [uav]
+        for link in links:
+            for request in link.asked.due(now):
+                link.answered.send(now, Answer(*self.serve(uav, link, request), request.number))
+            heard, answers = link.up.due(now), link.answered.due(now)
+            if link.bridge is None:
+                continue
+            if link is uav:
+                for at, message in heard:
+                    uav.hear(at, message, now)
+            messages, requests = link.bridge.step(now + uav.epoch, [message for _, message in heard], answers)
             for message in messages:
                 message.pack(self.station)
-                self.look_at_command(uav, message)
-            uav.down.send(now, *messages)
-            uav.asked.send(now, *requests)
-        was_landed, failsafe, mode = copter.landed, set(copter.failsafe), copter.mode
-        uav.up.send(now, *((now, message) for message in copter.step(now, uav.down.due(now))))
+            link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
+            link.asked.send(now, *requests)
+        was_landed, failsafe = copter.landed, set(copter.failsafe)
+        before = {"mode": copter.mode, "motors": copter.armed}
+        sent = copter.step(now, [each for link in links for each in link.down.due(now)])
+        copter.mav.seq = (copter.mav.seq + uav.others) % 256
+        for link in links:
+            heartbeats = now < link.mute_until
+            link.up.send(now, *((now, m) for m in sent if not heartbeats or m.get_type() != "HEARTBEAT"))
         if copter.failsafe - failsafe:
-            uav.acted(now, f"failsafe {copter.failsafe}", 0 if copter.mode != mode else 1)
+            after = {"mode": copter.mode, "motors": copter.armed}
+            uav.acted(now, f"failsafe {copter.failsafe}", *(i for i in after if after[i] != before[i]))
         if copter.landed or (copter.position_control and uav.way is None):
             goal, level = copter.goal or (copter.place, 0.0)
             path = shapely.LineString([(end.real, end.imag) for end in (copter.place, goal)])
             uav.way = None if copter.landed else (level, path)
+            if uav.way and not uav.act and self.in_zone(copter.place, goal) > 1.0:
+                self.break_("no way through a zone", f"{uav.name} from {copter.place} to {goal}")
         if was_landed and not copter.landed:
             uav.flights, uav.air_since = uav.flights + 1, now
             uav.strayed, uav.accepted = uav.strayed and uav.act is not None, uav.confirmed
+        if uav.second and now > uav.second_until:
+            uav.second = None
+        if uav.wait and uav.bridge and uav.bridge.state == uav.wait[0]:
+            (_, act), uav.wait = uav.wait, None
+            act()
         self.see_to(uav)
 
-    def look_at_command(self, uav, message):
+    def in_zone(self, *places):
+        """How much of a way between places lies in the zone [m]."""
+        ground, copter = self.ground, self.uavs[0].copter
+        path = shapely.LineString([ground.local(copter.degrees(place)) for place in places])
+        return path.intersection(shapely.Polygon(ZONE)).length
+
+    def goes_through(self, uav, link, message):
+        """Look at a message of a bridge; returns whether it goes on its way."""
         if message.get_type() not in ("COMMAND_LONG", "COMMAND_INT", "SET_MODE"):
-            return
+            return True
         number = getattr(message, "command", mavlink.MAV_CMD_DO_SET_MODE)
         if number in HARMLESS:
-            return
+            return True
+        is_other = uav.commander not in (None, link.bridge.memory.bridge)
+        if is_other and (self.now < uav.commanded + APART or not uav.copter.landed):
+            self.break_("one bridge a UAV", f"{uav.name}: {link.name} {message}")
+        uav.commander, uav.commanded = link.bridge.memory.bridge, self.now
         to_land = number == mavlink.MAV_CMD_NAV_LAND or (number == 176 and message.param2 == LAND)
         uav.last_command = LAND if to_land else number
-        if to_land and not uav.act_seen and uav.copter.mode == LAND:
+        if to_land and uav.seen_at is None and uav.copter.mode == LAND and uav.changed <= {"mode"}:
             uav.act = None  # both at once: it has what it wanted
-        if uav.act_seen:
+        if uav.seen_at is not None:
             self.break_("no command after a pilot's act", f"{uav.name} {uav.act}: {message}")
+        if link is uav and not uav.commanded_at < uav.heartbeat_at >= self.now - OLD:
+            self.break_("no command on an old picture", f"{uav.name}: {message}")
+        uav.commanded_at = self.now if link is uav else uav.commanded_at
+        if uav.ambush and link is uav:
+            (seconds, is_lost, act), uav.ambush = uav.ambush, None
+            uav.mute_until = self.now + seconds
+            if act:
+                self.after(self.rng.uniform(0.3, seconds), act)
+            return not is_lost
+        return True
 
-    def serve(self, uav, request):
+    def serve(self, uav, link, request):
         """Status and body of an answer of the service, None without one."""
         if self.now < self.service.down_until:
             return None, None
         status, body = self.service.ask(request.method, request.path, request.body)
         if status >= 500:
             self.break_("no error of the service", f"{request}: {status} {body}")
-        if status == 200 and request.path.endswith("/reports"):
+        if link is not uav and status == 200 and link.name not in UAVS:
+            if "answer" in (request.body or {}) or request.path.endswith("/reports"):
+                self.break_("one bridge a UAV", f"{link.name} speaks for {uav.name}: {request}")
+        elif status == 200 and request.path.endswith("/reports"):
             self.reported.setdefault(request.body["ID"], set()).add(request.body["number"])
             at = uav.copter.metres(request.body["lat"], request.body["lon"])
             if uav.copter.landed and uav.known > self.now and abs(at - uav.copter.place) < SAME_POINT:
@@ -275,21 +364,29 @@ class Campaign:
     def see_to(self, uav):
         """What a person does: lands what he has taken over, mends it, and hands it over again."""
         copter = uav.copter
+        if uav.seen_at is not None and (uav.bridge is None or uav.bridge.state == "connect"):
+            uav.seen_at = self.now
+        is_heeded = uav.bridge is None or uav.bridge.state in ("watch", "left")
+        if uav.seen_at is not None and not is_heeded and self.now > uav.seen_at + HEED:
+            self.break_("a pilot's act is heeded", f"{uav.name} {uav.act}: {uav.bridge.state}")
         if not (uav.act or copter.failsafe or (uav.bridge and uav.bridge.state == "watch")):
             uav.idle_since = None
         elif not copter.landed:
             uav.idle_since = self.now
             if uav.act and copter.mode not in (LAND, RTL) and self.now > uav.act[0] + 20:
                 copter.change_mode(LAND)
+                uav.strayed, uav.known = True, np.inf
         elif uav.idle_since is None or copter.armed:
             uav.idle_since = self.now
         elif self.now == uav.idle_since + 20:
             if copter.failsafe:
                 copter.reboot(self.now)
             copter.crashed, copter.battery = False, [100.0]
+            if self.in_zone(copter.place - 1, copter.place + 1):
+                copter.place = STARTS[ord(uav.name) - ord("A")]
             copter.change_mode(STABILIZE)
         elif self.now >= uav.idle_since + 35:
-            uav.act, uav.act_seen, uav.idle_since = None, False, self.now
+            uav.act, uav.seen_at, uav.changed, uav.idle_since = None, None, {}, self.now
             copter.change_mode(GUIDED)
 
     # What must hold.
@@ -339,6 +436,21 @@ class Faults:
     def messages_doubled_and_late(field, uav, seconds):
         field.lines([uav.down, uav.up], seconds, double=0.5, slowest=2.0)
 
+    def messages_late_at_fifty_a_second(field, uav, seconds):
+        uav.others = 9
+        field.lines([uav.up], seconds, slowest=5.0)
+        field.after(seconds + 10, lambda: vars(uav).update(others=0))
+
+    def heartbeats_lost_around_a_command(field, uav, seconds):
+        act = [None, lambda: Faults.pilot_chooses(field, uav)][field.rng.integers(2)]
+        uav.ambush = seconds / 4 + 1, field.rng.random() < 0.5, act
+
+    def another_bridge(field, uav, seconds):
+        """Of the same name, or of another one, for the same vehicle."""
+        name = uav.name if field.rng.random() < 0.5 else f"{uav.name}2"
+        uav.second, uav.second_until = Link(name, uav.copter, field.rng), field.now + 3 * seconds
+        uav.second.start()
+
     def requests_lost(field, uav, seconds):
         field.lines([uav.asked], seconds, loss=1.0)
 
@@ -358,7 +470,7 @@ class Faults:
     def vehicle_restarted(field, uav, _):
         if uav.copter.landed:
             uav.copter.reboot(field.now)
-            uav.acted(field.now, "reboot", 0, 1)
+            uav.acted(field.now, "reboot", "mode", "motors")
 
     def clock_set_an_hour(field, _, seconds):
         jump = HOUR * field.rng.choice([-1, 1])
@@ -384,24 +496,45 @@ class Faults:
         if field.now >= field.service.down_until:
             field.service.ask("POST", "/fleets/north/acknowledgements", row)
 
-    def pilot_takes_over(field, uav, seconds):
-        def act():
-            modes = [mode for mode in MODES if mode != GUIDED]
-            if uav.copter.change_mode(modes[field.rng.integers(len(modes))]):
-                uav.acted(field.now, "mode", 0)
+    def pilot_chooses(field, uav):
+        """A mode by his switch, or by another station (BRAKE)."""
+        modes = [mode for mode in MODES if mode != GUIDED]
+        mode = modes[field.rng.integers(len(modes))]
+        changed = [*["mode"] * (uav.copter.mode != mode), *["switch"] * (mode in SWITCH)]
+        if uav.copter.change_mode(mode):
+            uav.acted(field.now, f"mode {mode}", *changed)
 
-        field.after(seconds, act)
+    def another_station_sends_it_elsewhere(field, uav):
+        copter, place = uav.copter, uav.copter.place + 60 * np.exp(2j * np.pi * field.rng.random())
+        latitude, longitude = (round(each * 1e7) for each in copter.degrees(place))
+        go = mavlink.MAV_CMD_DO_REPOSITION, 0, 0, -1, 0, 0, 0, latitude, longitude, 20.0
+        message = mavlink.MAVLink_command_int_message(copter.system, 1, 6, *go)
+        message.pack(mavlink.MAVLink(None, 255, 190))
+        if copter.mode == GUIDED and not copter.landed:
+            copter.receive(message)
+            uav.acted(field.now, "go-to", "aim")
+
+    def pilot_takes_over(field, uav, seconds):
+        field.after(seconds, lambda: Faults.pilot_chooses(field, uav))
+
+    def pilot_acts_in_any_state(field, uav, _):
+        acts = [Faults.pilot_chooses, Faults.another_station_sends_it_elsewhere]
+        act = acts[field.rng.integers(2)]
+        states = ["ground", "accept", *FLIGHT] if act is acts[0] else ["climb", "cruise"]
+        wait = field.rng.uniform(0, 8)
+        then = lambda: field.after(wait, lambda: act(field, uav))  # noqa: E731
+        uav.wait = states[field.rng.integers(len(states))], then
 
     def pilot_takes_over_as_the_motors_start(field, uav, seconds, tries=400):
         if uav.copter.armed and uav.copter.landed and uav.copter.change_mode(LOITER):
-            uav.acted(field.now, "mode", 0)
+            uav.acted(field.now, "mode", "mode", "switch")
         elif tries:
             again = Faults.pilot_takes_over_as_the_motors_start
             field.after(TICK, lambda: again(field, uav, seconds, tries - 1))
 
     def pilot_stops_the_motors(field, uav, _):
         if uav.copter.armed:
-            uav.copter.disarm(force=field.rng.random() < 0.3) and uav.acted(field.now, "disarm", 1)
+            uav.copter.disarm(force=field.rng.random() < 0.3) and uav.acted(field.now, "disarm", "motors")
 
     def position_lost(field, uav, seconds):
         uav.copter.fix = False
@@ -426,12 +559,17 @@ class Faults:
         field.command("return", None, 30 + 3 * seconds)
 
 
-FAULTS = [fault for name, fault in vars(Faults).items() if not name.startswith("_")]
+ACTS = (Faults.pilot_chooses, Faults.another_station_sends_it_elsewhere)
+FAULTS = [each for name, each in vars(Faults).items() if not name.startswith("_") and each not in ACTS]
 INVARIANTS = (
     "no two bound to one point",
     "no two at one point",
     "no two paths too near",
+    "one bridge a UAV",
+    "no way through a zone",
+    "no command on an old picture",
     "no command after a pilot's act",
+    "a pilot's act is heeded",
     "airborne is commanded",
     "an answer never changes",
     "no report is lost",

@@ -18,17 +18,19 @@ class Vehicle(Copter):
         self.results: dict[int, int] = {}
         self.orders: list[Any] = []
         self.silent = self.deaf = False
+        self.mute: tuple[str, ...] = ()
+        """Types of messages that get lost."""
         self.kind, self.sensors, self.receiver, self.acknowledges_to = (2, 3), (0, 0), None, None
         super().__init__(HOME, system=system, drain=0.0)
 
     def commands(self, *numbers: int) -> list[int]:
         """The commands that it has heard, but those that ask for telemetry."""
-        heard = [each.command for each in self.orders if each.command != 511]
+        heard = [each.command for each in self.orders if each.command not in (511, 512)]
         return [each for each in heard if not numbers or each in numbers]
 
     def step(self, now: float, messages: Any = ()) -> list[Any]:
         sent = super().step(now, [] if self.deaf else messages)
-        return [] if self.silent else sent
+        return [each for each in sent if not self.silent and each.get_type() not in self.mute]
 
     def obey(self, command: Any, *rest: Any) -> int:
         self.orders.append(command)

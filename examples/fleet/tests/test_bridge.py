@@ -1,8 +1,12 @@
 """The bridge in virtual time, against the copter model and a scripted service."""
 
+import random
+
 import pytest
+import scripted
 from scripted import BEGIN, GOAL, HOME, Vehicle, World
 
+from damian.field.rows import Report, validated
 from damian_fleet.bridge import Answer, Bridge
 from damian_fleet.vehicles import GUIDED, LAND, LOITER, RTL, mavlink
 
@@ -61,14 +65,23 @@ def in_state(state: str) -> World:
 
 
 def watches(world: World) -> bool:
-    """Whether the bridge gives the vehicle to the pilot, and commands nothing afterwards."""
-    world.until("watch")
+    """Whether the bridge gives the vehicle to the pilot, and commands nothing before that, nor afterwards."""
     before = len(world.vehicle.commands())
-    world.heal().run(60)
+    world.until("watch").heal().run(60)
     return len(world.vehicle.commands()) == before and world.bridge.state == "watch"
 
 
+def go_to(vehicle: Vehicle, place=(HOME[0], HOME[1] + 0.001)) -> None:
+    """Another station sends it somewhere."""
+    x, y = (round(each * 1e7) for each in place)
+    message = mavlink.MAVLink_command_int_message(1, 1, 6, REPOSITION, 0, 0, -1, 0, 0, 0, x, y, 5.0)
+    message.pack(mavlink.MAVLink(None, 255, 190))
+    vehicle.receive(message)
+    vehicle.orders.pop()
+
+
 ACTS = {
+    "land": lambda vehicle: vehicle.change_mode(LAND),
     "loiter": lambda vehicle: vehicle.change_mode(LOITER),
     "rtl": lambda vehicle: vehicle.change_mode(RTL),
     "motors": Vehicle.switch_motors,
@@ -83,8 +96,131 @@ SEEN = [each for each in SEEN if each[1] != "failsafe" or each[0] in ("join", "g
 def test_after_an_act_of_somebody_else_it_commands_nothing(state, act):
     world = in_state(state)
     ACTS[act](world.vehicle)
-    assert world.run(10, lambda: world.bridge.state == "watch")
+    world.run(1.25)  # until it is heard
     assert watches(world)
+
+
+@pytest.mark.parametrize("state", ["climb", "cruise"])
+def test_another_station_may_send_it_elsewhere(state):
+    world = in_state("arm")
+    world.heal().until("climb" if state == "climb" else "cruise").run(2)
+    assert (world.bridge.state, world.vehicle.landed) == (state, False)
+    go_to(world.vehicle)
+    world.run(0.75)
+    assert watches(world)
+    assert abs(world.vehicle.place - world.vehicle.metres(HOME[0], HOME[1] + 0.001)) < 1
+
+
+@pytest.mark.parametrize("is_lost", [False, True], ids=["before its command", "whose own command got lost"])
+def test_a_landing_that_may_be_of_somebody_else_is_the_pilots(is_lost):
+    world = in_state("cruise")
+    world.vehicle.switch = None  # no receiver: nobody sees a switch
+    if is_lost:
+        world.vehicle.results = {TO_LAND: TEMPORARILY}
+        world.until("landing")
+        assert world.run(3, lambda: world.vehicle.commands(TO_LAND))
+    world.vehicle.enter(LAND)
+    before = len(world.vehicle.commands(ARM, SET_MODE))
+    world.until("watch").run(60)
+    assert len(world.vehicle.commands(ARM, SET_MODE)) == before
+
+
+@pytest.mark.parametrize("command", [SET_MODE, ARM, TAKEOFF, REPOSITION, TO_LAND])
+def test_nothing_is_sent_again_until_mode_and_motors_are_heard_then_it_watches(command):
+    world = World()
+    world.vehicle.results = {command: TEMPORARILY}
+    assert world.run(90, lambda: world.vehicle.commands(command))
+    before, world.vehicle.mute = len(world.vehicle.commands()), ("HEARTBEAT",)
+    world.run(4.5)
+    assert (len(world.vehicle.commands()), world.bridge.state == "watch") == (before, False)
+    world.run(3)
+    assert (len(world.vehicle.commands()), world.bridge.state) == (before, "watch")
+
+
+def test_nothing_is_commanded_by_a_mode_that_is_old():
+    world = in_state("cruise")
+    world.run(3)
+    world.vehicle.mute = ("HEARTBEAT",)
+    world.run(3)
+    world.service.command = "hold"
+    before = len(world.vehicle.commands())
+    assert world.run(1.9, lambda: world.bridge.state == "landing")
+    assert len(world.vehicle.commands()) == before
+    world.vehicle.mute = ()
+    world.run(2)
+    assert world.vehicle.commands()[before:] == [TO_LAND]
+
+
+@pytest.mark.parametrize("cause", ["watches", "hears nothing"])
+def test_a_copter_that_nobody_commands_is_landed_by_its_failsafe(cause):
+    world = in_state("cruise")
+    world.vehicle.station = 255
+    world.run(3)
+    if cause == "watches":
+        world.bridge._hands_off("a mistake")
+    else:
+        world.vehicle.silent = True
+    said = []
+    world.others = lambda _: said.extend(m.text for m in world._out if m.get_type() == "STATUSTEXT") or []
+    assert world.run(60, lambda: world.vehicle.mode == LAND)
+    assert any("nobody commands it" in text for text in said)
+    world.run(60)
+    assert world.vehicle.landed
+
+
+def test_a_pilot_who_flies_keeps_it_whoever_watches():
+    world = in_state("cruise")
+    world.vehicle.station = 255
+    world.vehicle.change_mode(LOITER)
+    world.until("watch").run(90)
+    assert (world.vehicle.mode, world.vehicle.landed) == (LOITER, False)
+
+
+def test_messages_up_to_five_seconds_late_are_no_boot_and_no_act():
+    """At 50 messages a second, out of order."""
+    draw, world, under_way = random.Random(5), in_state("cruise"), []
+    heard = world.vehicle.step
+
+    def late(now, messages):
+        sent = heard(now, messages)
+        world.vehicle.mav.seq = (world.vehicle.mav.seq + 9) % 256
+        under_way.extend((now + draw.uniform(0, 5), each) for each in sent)
+        due = [each for at, each in sorted(under_way, key=lambda each: each[0]) if at <= now]
+        under_way[:] = [each for each in under_way if each[0] > now]
+        return due
+
+    world.vehicle.step, world.vehicle.station = late, 255
+    assert world.run(120, lambda: world.vehicle.landed), "by its bridge, or else by its failsafe"
+    assert (world.bridge.order.boots, "not heard" in world.bridge.why) == (0, True)
+    world.vehicle.reboot(world.now)
+    assert world.run(40, lambda: world.bridge.order.boots == 1)
+
+
+def test_another_bridge_has_it_and_both_say_so(caplog):
+    caplog.set_level("INFO")
+    world = in_state("ground")
+    world.service.bad = lambda request, answer: (
+        answer._replace(status=409, body={"error": "bridge: 1 speaks for UAV A"})
+        if request.method == "POST"
+        else answer
+    )
+    world.run(40)
+    assert "the service says bridge: 1 speaks for UAV A" in caplog.text
+    assert world.vehicle.commands() == []
+    world.service.bad = lambda request, answer: answer._replace(
+        body={**answer.body, "warning": "2 has tried"}
+    )
+    world.run(10)
+    assert "the service warns: 2 has tried" in caplog.text
+
+
+def test_it_flies_beyond_2038(monkeypatch):
+    monkeypatch.setattr(scripted, "BEGIN", 2.2e9)
+    world = World()
+    assert world.until_said("x-1", "landed")
+    for row in world.service.reports:
+        row.pop("came")
+        validated(Report, row)
 
 
 @pytest.mark.parametrize("act", ["loiter", "motors"])
@@ -105,7 +241,8 @@ def test_without_a_memory_a_flight_is_left_to_the_pilot():
 def test_what_is_refused_before_the_flight_gives_the_vehicle_back(command, state):
     world = World()
     world.vehicle.results = {command: REFUSED}
-    assert watches(world.until(state))
+    world.until(state).run(2)
+    assert watches(world)
     assert world.vehicle.commands(command) == [command]
 
 
@@ -237,8 +374,9 @@ def test_an_operator_is_heard_in_every_state_of_a_flight(state):
 
 def test_after_a_lost_link_it_reports_before_it_asks():
     world = in_state("cruise")
-    world.vehicle.silent = world.vehicle.deaf = True
     world.vehicle.speed = 0.5
+    world.run(2)  # it has heard that its commands are followed
+    world.vehicle.silent = world.vehicle.deaf = True
     world.run(10)
     n_sent, world.service.log = len(world.vehicle.orders), []
     world.run(10)
@@ -350,6 +488,7 @@ def test_what_waits_says_so(state, caplog):
     world = World() if state == "connect" else in_state("ground" if state == "watch" else state)
     if state == "watch":
         world.vehicle.change_mode(LOITER)
+    world.run(2 * (state != "connect"))
     world.vehicle.silent = state in ("connect", "cruise", "landing")
     world.run(75)
     assert caplog.text.count(f"A: {state} for ") in (1, 2)

@@ -12,7 +12,7 @@ import pytest
 from scripted import Service, Vehicle, mavlink
 
 from damian_fleet.bridge import Answer, Memory, Request
-from damian_fleet.link import ask, main
+from damian_fleet.link import ask, main, memory_of, parsed_vehicles
 
 
 @pytest.fixture
@@ -106,3 +106,32 @@ def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(served, t
     assert service.members == []
     memory = Memory.model_validate_json((tmp_path / "north.A.json").read_text(encoding="utf-8"))
     assert (memory.system, memory.number) == (1, service.reports[-1]["number"] + 1)
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        (["A=udpin:127.0.0.1:1", "A=udpin:127.0.0.1:2"], "A is given twice"),
+        (["A=udpin:127.0.0.1:1", "B=udpin:0.0.0.0:1#2"], "A and B are both on 1"),
+        (["A=udp:127.0.0.1:1", "B=udpin:127.0.0.1:1"], "A and B are both on 1"),
+        (["A=/dev/ttyUSB0", "B=/dev/ttyUSB0"], "A and B are both on /dev/ttyUSB0"),
+        (["A="], "A= is not as A=udpin:127.0.0.1:14551#1"),
+    ],
+)
+def test_vehicles_that_are_one_are_refused_by_name(given, problem):
+    with pytest.raises(ValueError, match=problem):
+        parsed_vehicles(given)
+    good = ["A=udpin:127.0.0.1:1#7", "B=udpin:127.0.0.1:2", "C=tcp:10.0.0.1:1"]
+    assert parsed_vehicles(good)["A"] == ("udpin:127.0.0.1:1", 7)
+
+
+def test_a_memory_is_of_one_bridge(tmp_path):
+    path = tmp_path / "north.A.json"
+    memory, lock = memory_of(path)
+    with pytest.raises(ValueError, match="another bridge works with this memory"):
+        memory_of(path)
+    lock.close()
+    path.write_text("{", encoding="utf-8")
+    with pytest.raises(ValueError, match="it is not the memory of a bridge"):
+        memory_of(path)
+    assert memory is None

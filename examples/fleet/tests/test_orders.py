@@ -6,9 +6,11 @@ from dataclasses import replace
 import pytest
 from field import EAST, SCENARIO, WEST, Field
 from reports import START
+from shapely import LineString, box
 
 from damian.common.errors import InputError
 from damian.world.config import ActionConfig, BatteryConfig
+from damian.world.regions.geodesy import to_latlon
 from damian_fleet.fleet import GRACE
 
 
@@ -296,3 +298,70 @@ def test_nobody_is_sent_on_a_way_that_is_not_straight():
     assert told(field, "A", 1) == ("hold", "detour")
     field.wishes[0] = WEST
     assert told(field, "A", 11)[0] == "fly", "it chooses again"
+
+
+def holed(*uavs: str) -> tuple[Field, float, float]:
+    """A field with a zone of 60 m, and the middle of that, in its own metres."""
+    x, y = Field(uavs="A").fleet.ground.points[200].tolist()
+    zone = [[x - 30, y - 30], [x + 30, y - 30], [x + 30, y + 30], [x - 30, y + 30]]
+    closed = replace(SCENARIO, region=replace(SCENARIO.region, zones=[zone]))
+    return Field(uavs=uavs or "A", scenario=closed), x, y
+
+
+def stand(field: Field, x: float, y: float) -> None:
+    """A reports from a place."""
+    region = field.fleet.ground.region
+    lat, lon = (float(each) for each in to_latlon(x, y, region.origin))
+    field.now += 11
+    field.report("A", 0, lat=lat, lon=lon)
+
+
+@pytest.mark.parametrize(
+    ("aside", "bends"),
+    [(0.0, False), (-7.0, True), (-14.0, True), (5.0, False)],
+    ids=["the point", "in the margin", "over the zone", "farther away"],
+)
+def test_a_way_is_checked_from_where_the_uav_stands_with_a_margin(aside, bends):
+    """Past the upper edge of a zone, whose margin is 10 m."""
+    field, x, y = holed()
+    points, fleet = field.fleet.ground.points, field.fleet
+    goal = min(range(len(points)), key=lambda i: abs(points[i][0] - x - 90) + abs(points[i][1] - y - 41))
+    stand(field, x - 60, y + 41 + aside - (points[goal][1] - y - 41))
+    field.ask("A")
+    told = fleet._decision(fleet.uavs["A"], None, goal)
+    middle = (told.start[1] + points[goal][1]) / 2 - y
+    assert told.start[0] == pytest.approx(x - 60, abs=0.1)
+    assert (fleet._bends(told), middle < 40) == (bends, bends)
+
+
+def test_a_uav_is_led_home_around_a_zone_by_way_of_landing_points():
+    field, x, y = holed()
+    fleet = field.fleet
+    stand(field, x + 70, y)  # its home
+    stand(field, x - 70, y)
+    field.command("return", ["A"])
+    region, zone = fleet.ground.region.polygon, box(x - 30, y - 30, x + 30, y + 30)
+    here, hops = (x - 70, y), 0
+    while (told := field.ask("A", 11)).state == "return":
+        goal = fleet.ground.local((told.lat, told.lon))
+        way = LineString([here, goal])
+        assert region.covers(way)
+        assert way.distance(zone) > 0
+        for word in ("accepted", "taken off", "landed"):
+            field.say("A", told.answer, word, 1)
+        here, hops = goal, hops + 1
+        stand(field, *here)
+    assert math.dist(here, (x + 70, y)) < 20
+    assert hops > 1
+
+
+def test_an_offer_is_not_accepted_from_where_its_way_crosses_a_zone():
+    field, x, y = holed()
+    stand(field, x - 70, y + 60)
+    told = field.ask("A", 1)
+    assert told.state == "fly"
+    gx, gy = field.fleet.ground.points[field.fleet.uavs["A"].offer.goal]
+    lat, lon = (float(each) for each in to_latlon(2 * x - gx, 2 * y - gy, field.fleet.ground.region.origin))
+    field.now += 1
+    field.report("A", 0, lat=lat, lon=lon)
+    assert field.say("A", told.answer, "accepted") == "lapsed"

@@ -1,13 +1,22 @@
 """The service over HTTP: what it answers, and what it refuses."""
 
+import contextlib
 import functools
 import json
 import random
+import socket
+import threading
+import time
 
+import httpx2
 import pytest
+import uvicorn
 from starlette.testclient import TestClient
 
+from damian_fleet import door
+from damian_fleet.fleet import LEASE
 from damian_fleet.program import config_of, make_fleets
+from damian_fleet.rows import MOST_ROWS
 from damian_fleet.service import MAX_BODY, Clock, make_app
 from damian_fleet.store import Fleets
 
@@ -183,3 +192,88 @@ def test_a_jump_of_the_system_clock_is_shown_and_the_service_keeps_its_time(jump
     hands |= {"system": NOW + 2 + jump, "monotonic": 7.0}
     assert (clock(), clock.system_ahead) == (NOW + 2, jump)
     assert Clock(NOW + 9e6, lambda: hands["system"])() == pytest.approx(NOW + 9e6), "after what is stored"
+
+
+def test_one_bridge_speaks_for_a_uav_and_for_a_vehicle_until_it_is_gone(client):
+    begin(client)
+
+    def report(uav: str, bridge: str, vehicle: str = "", after: float = 1.0):
+        client.wait(after)
+        said = row(uav, bridge=bridge, vehicle=vehicle) | {"time": None, "AoI": 0}
+        return client.post(f"{NORTH}/reports", json=said)
+
+    def says(answer) -> str:
+        assert answer.status_code == 409
+        return answer.json()["error"]
+
+    assert report("A", "first", "board 1").json()["ignored"] == []
+    assert says(report("A", "second", "board 2")).startswith(
+        "bridge: first speaks for UAV A, not second: end"
+    )
+    assert "first speaks for the vehicle of UAV A, here called B" in says(report("B", "third", "board 1"))
+    assert report("B", "third", "board 3").status_code == 200
+    for path, said in (
+        ("advice", {"uavs": ["A"], "bridge": "second"}),
+        ("acknowledgements", {"ID": "A", "answer": "x", "status": "landed", "bridge": "second"}),
+        ("acknowledgements", {"ID": "A", "answer": "x", "status": "landed"}),
+        ("uavs", {"leave": ["A"], "bridge": "second"}),
+    ):
+        assert "first speaks for UAV A" in says(client.post(f"{NORTH}/{path}", json=said)), path
+    told = report("A", "first", "board 1").json()
+    assert told["warning"].startswith("bridge "), "it is told as well"
+    assert "warning" not in report("A", "first", "board 1").json()
+    assert report("A", "second", "board 2", after=LEASE + 1).status_code == 200
+    assert says(report("A", "first", "board 1")).startswith("bridge: second speaks for UAV A")
+    said = {"leave": ["A"], "bridge": "second"}
+    assert client.post(f"{NORTH}/uavs", json=said).json() == {"uavs": ["B"]}
+    client.post(f"{NORTH}/uavs", json={"join": ["A"]})
+    assert report("A", "first", "board 1").status_code == 200, "it has been handed over"
+
+
+def test_a_bridge_keeps_its_uav_for_a_flight(client):
+    client.wait(1)
+    client.post(f"{NORTH}/reports", json=[row("A", bridge="first"), row("B")])
+    told = client.post(f"{NORTH}/advice", json={"uavs": ["A"], "bridge": "first"}).json()["advice"][0]
+    said = {"ID": "A", "answer": told["answer"], "status": "accepted", "bridge": "first"}
+    assert client.post(f"{NORTH}/acknowledgements", json=said).json() == {"status": ["accepted"]}
+    client.wait(2 * told["duration"])
+    answer = client.post(f"{NORTH}/reports", json=row("A", number=3, bridge="second"))
+    assert answer.status_code == 409
+    client.wait(120)
+    assert client.post(f"{NORTH}/reports", json=row("A", number=3, bridge="second")).status_code == 200
+
+
+@pytest.mark.parametrize("kind", ["application/json", "text/csv"])
+def test_many_rows_are_refused_before_others_wait_for_them(client, kind):
+    rows = [row("A", number=n) for n in range(MOST_ROWS + 1)]
+    table = "\n".join(["ID,lat,lon", *["A,52.8110,-4.1283"] * len(rows), ""])
+    body = json.dumps(rows) if kind == "application/json" else table
+    answer = client.post(f"{NORTH}/reports", content=body, headers={"Content-Type": kind})
+    assert (answer.status_code, str(MOST_ROWS) in answer.json()["error"]) == (413, True)
+
+
+def test_strangers_are_few_and_do_not_stay(monkeypatch):
+    monkeypatch.setattr(door, "MOST_STRANGERS", 3)
+    monkeypatch.setattr(door, "PATIENCE", 0.3)
+    app = make_app(Fleets(made(), ":memory:", {}), TOKEN)
+    config = uvicorn.Config(app, port=0, log_level="error", http=door.door(TOKEN), limit_concurrency=8)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    address = server.servers[0].sockets[0].getsockname()[:2]
+    silent = [socket.create_connection(address) for _ in range(20)]
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with httpx2.Client(base_url="http://{}:{}".format(*address), headers=headers) as known:
+        for _ in range(2):
+            assert known.get("/fleets").status_code == 200
+            for each in silent:  # all have been closed the second time, but not who has shown the token
+                each.settimeout(5)
+                with contextlib.suppress(ConnectionResetError):
+                    assert each.recv(1) == b""
+        assert len(server.server_state.connections) == 1
+    for each in silent:
+        each.close()
+    server.should_exit = True
+    thread.join()

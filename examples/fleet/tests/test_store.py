@@ -17,7 +17,7 @@ from damian.baselines.script import script_policy
 from damian.common.errors import InputError, RunError
 from damian.field.fitting import fit, read_log
 from damian.field.playback import episodes_of
-from damian_fleet.fleet import Fleet
+from damian_fleet.fleet import Fleet, Held
 from damian_fleet.store import Fleets
 
 TOKEN = "a-token-of-the-service"
@@ -85,6 +85,17 @@ def test_whatever_happens_a_restart_remembers_it_all(tmp_path, seed):
     for episode in episodes_of(path, lambda n: field.parts(n)[0], {}):
         assert episode.names in ([*"ABC"], [*"ABCD"])
     assert len(fit(read_log(path))) > 10
+
+
+def test_a_restart_knows_which_bridge_speaks_for_a_uav(tmp_path):
+    field = Field(tmp_path / "fleets.db")
+    for uav, point in (("A", 200), ("B", 300)):
+        field.report(uav, point, bridge=f"of {uav}", vehicle="")
+    field.now += 500
+    field.restart()
+    with pytest.raises(Held, match="bridge: of A speaks for UAV A, not second"):
+        field.report("A", 200, bridge="second")
+    assert field.report("A", 200, bridge="of A") == ["new"]
 
 
 def test_a_restart_never_decides_again(tmp_path):
