@@ -15,6 +15,7 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import write_csv
 from damian.common.text_files import named
+from damian.delays.clocks import are_right, in_order, notes_of
 from damian.delays.law_fit import fit_laws
 from damian.field.advice import next_landings
 from damian.field.fitting import (
@@ -80,7 +81,11 @@ def check_motion(config: AdviseConfig) -> None:
 def fit_delays(config: AdviseConfig, folder: Path) -> None:
     """Write the delays of a log of reports as a trace, and tell and draw which law fits them best."""
     log = Path(str(config.fit))
-    check_clocks(fitted := fit(read_log(log)), log)
+    messages = in_order(read_log(log))
+    check_clocks(messages, right := are_right(messages), log)
+    for note in notes_of(messages, right):
+        print(f"note: {note}, which are left out")
+    fitted = fit(messages, right)
     save_config(config, folder)
     trace = folder / "trace.csv"
     write_atomically(trace, "\n".join(["delay", *trace_rows(fitted), ""]))

@@ -1,7 +1,6 @@
 """The delays of real reports, and those that never came in, as a trace to replay and as the law that fits."""
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,64 +10,81 @@ import pandas as pd
 from damian.common.errors import InputError
 from damian.common.plotting import COLOURS
 from damian.common.text_files import named
+from damian.delays.clocks import Flags, are_right, in_order, notes_of
 from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers, LawFit
 from damian.delays.laws import LOST, in_steps
 from damian.field.journal import SUFFIX, read_journal
-from damian.field.rows import Report, read_file
+from damian.field.rows import Rows, read_file
 
-LATEST_MEDIAN = 1800.0
-"""Longest median delay of a UAV [s]; a longer one is a clock of another time zone, or one since the start."""
 LONGEST_GAP = 1000
 """Most messages that are taken as lost between two that came in: longer gaps are pauses."""
 
 
-def read_log(path: Path) -> list[Report]:
-    """The reports of a journal, or of a table with a column ``receive time``; each says when it came in."""
+def read_log(path: Path) -> pd.DataFrame:
+    """The log in a journal, or in a table with a column ``receive time``, as of ``damian.delays.clocks``."""
     if path.suffix == SUFFIX:
         _, lines = read_journal(path)
-        reports = [report for _, line in lines for report in line.reports]
+        rows = [(where, report) for where, line in lines for report in line.reports]
     else:
         with named(path):
-            rows = read_file(path)
-            for where, report in rows:
-                said = report.model_fields_set
-                if "time" not in said or not {"received", "aoi"} & said:
-                    raise InputError(f"{where}: it needs time and receive time, or time and AoI")
-                report.stamp(math.nan, file=True)
-        reports = [report for _, report in rows]
-    if len(reports) < 2:
-        raise InputError(f"{path}: {len(reports)} reports are too few to tell how late they are")
-    return reports
+            rows = [(f"{path}: {where}", report) for where, report in read_file(path)]
+        for where, report in rows:
+            said = report.model_fields_set
+            if "time" not in said or not {"received", "aoi"} & said:
+                raise InputError(f"{where}: it needs time and receive time, or time and AoI")
+            report.stamp(math.nan, file=True)
+    if len(rows) < 2:
+        raise InputError(f"{path}: {len(rows)} reports are too few to tell how late they are")
+    return log_of(rows)
 
 
-def fit(reports: Iterable[Report]) -> pd.DataFrame:
-    """A row for each message, those of one UAV after those of another, in the order of their generation.
+def log_of(rows: Rows) -> pd.DataFrame:
+    """Reports that say when they came in as a log."""
+    columns = ["where", "uav", "time", "received", "sequence"]
+    cells = [(where, each.id, each.time, each.received, each.sequence) for where, each in rows]
+    return pd.DataFrame(cells, columns=columns).astype({"sequence": float})
+
+
+def fit(messages: pd.DataFrame, right: Flags) -> pd.DataFrame:
+    """A row for each message from a right clock, in the order of ``in_order``, whose columns these are.
 
     Columns: ``uav`` (ID), ``time`` when it was generated [s], ``received`` when it came in first [s], and its
-    ``delay`` [s], 0 if clocks differ so that it came in before its time; the last two are nan for a message
-    that never came in, whose time is estimated: one whose number (``sequence``) is missing. Where a UAV does
-    not number its reports, no loss can be seen.
+    ``delay`` [s], 0 if clocks differ a little, so that it came in before its time; the last two are nan for a
+    message that never came in, whose time is estimated: one whose number is missing. Where a UAV does not
+    number its reports, no loss can be seen.
     """
-    told = pd.DataFrame(
-        [(each.id, each.time, each.sequence, each.received) for each in reports],
-        columns=["uav", "time", "sequence", "received"],
-    ).astype({"sequence": float})
-    identity = ["uav", "time", "sequence"]  # a UAV that starts anew counts from 0
-    told = told.sort_values([*identity, "received"], na_position="first").drop_duplicates(identity)
+    told = messages.assign(right=right).drop_duplicates(["uav", "run", "time", "sequence", "right"])
     parts = []
     for uav, own in told.groupby("uav"):
-        gaps = own.sequence.diff().sub(1).fillna(0).clip(lower=0)
+        gaps = own.groupby("run").sequence.diff().sub(1).fillna(0)
         rows = np.arange(len(own)) + gaps.where(gaps <= LONGEST_GAP, 0).cumsum().to_numpy(int)
-        every = own.set_index(rows)[["time", "received"]].reindex(range(rows[-1] + 1))
-        parts.append(every.assign(uav=uav, time=every.time.interpolate()))
-    messages = pd.concat(parts, ignore_index=True)
-    return messages.assign(delay=(messages.received - messages.time).clip(lower=0))
+        every = own.set_index(rows)[["time", "received", "right"]].reindex(range(rows[-1] + 1))
+        counts = every.right.bfill().astype(bool)  # what was lost before a message counts if that does
+        time = every.time.where(counts).interpolate(limit_direction="both")
+        part = every.assign(uav=uav, time=time)[counts].drop(columns="right")
+        parts.append(part.sort_values("time", kind="stable") if own.sequence.isna().all() else part)
+    fitted = pd.concat(parts, ignore_index=True)
+    return fitted.assign(delay=(fitted.received - fitted.time).clip(lower=0))
 
 
-def check_clocks(messages: pd.DataFrame, path: Path) -> None:
-    """Refuse a log whose messages mostly came in before they were generated, or far too late."""
-    for uav, typical in (messages.received - messages.time).groupby(messages.uav).median().items():
-        if not 0 <= typical <= LATEST_MEDIAN:
+def wrong_clocks(rows: Rows) -> tuple[set[int], pd.DataFrame]:
+    """Which reports tell the time of a wrong clock, which is printed, and the others as of ``fit``.
+
+    Of a UAV whose clock was never right, what it says counts.
+    """
+    messages = in_order(log_of(rows))
+    right = are_right(messages)
+    right |= ~pd.Series(right, messages.index).groupby(messages.uav).transform("any").to_numpy(bool)
+    for note in notes_of(messages, right):
+        print(f"note: {note}, which are left out")
+    return {*messages.index[~right]}, fit(messages, right)
+
+
+def check_clocks(messages: pd.DataFrame, right: Flags, path: Path) -> None:
+    """Refuse a log with a sender whose clock was never right."""
+    for uav, late in (messages.received - messages.time).groupby(messages.uav):
+        if not right[(messages.uav == uav).to_numpy()].any():
+            typical = late.median()
             raise InputError(
                 f"{path}: the clocks of {uav} and of the receiver differ: receive times are in the median "
                 f"{abs(typical):.3g} s {'before' if typical < 0 else 'after'} times; correct one of them"

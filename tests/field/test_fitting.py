@@ -6,6 +6,7 @@ import shlex
 import pytest
 from matplotlib.figure import Figure
 
+from damian.delays.clocks import are_right, in_order
 from damian.delays.laws import Trace
 from damian.field.fitting import fit, read_log, summary, trace_rows
 from damian.recipes.cli import settings
@@ -28,6 +29,11 @@ def table(numbered: bool = True, period: float = 1.0, uavs: int = 2, start: floa
     return "\n".join(["ID,time,receive time,lat,lon,sequence", *lines])
 
 
+def fitted_log(path):
+    messages = in_order(read_log(path))
+    return fit(messages, are_right(messages))
+
+
 @pytest.fixture
 def log(tmp_path):
     def written(text: str, name: str = "reports.csv"):
@@ -40,7 +46,7 @@ def log(tmp_path):
 
 @pytest.mark.parametrize("period", [1.0, 0.25])
 def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, period):
-    fitted = fit(read_log(log(table(period=period))))
+    fitted = fitted_log(log(table(period=period)))
     rows = trace_rows(fitted)
     found = [None if row == "lost" else float(row.removesuffix("s")) for row in rows]
     assert found == [None if d is None else pytest.approx(d, abs=1e-6) for d in DELAYS * 2]
@@ -48,7 +54,7 @@ def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, period):
 
 
 def test_without_numbers_no_loss_can_be_seen(log):
-    rows = trace_rows(fit(read_log(log(table(numbered=False)))))
+    rows = trace_rows(fitted_log(log(table(numbered=False))))
     assert (len(rows), "lost" in rows) == (16, False)
 
 
@@ -70,13 +76,13 @@ def test_a_journal_is_a_log(log):
     ]
     lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]
     path = log("".join(f"{json.dumps(line)}\n" for line in lines) + '{"cut', "x.jsonl")
-    assert trace_rows(fit(read_log(path))) == ["0.250000s"] * 4
+    assert trace_rows(fitted_log(path)) == ["0.250000s"] * 4
 
 
 def test_numbered_reports_of_one_second_are_different_messages_also_without_places(log):
     numbers = [n for n in range(300) if n % 50 != 7]
     lines = [f"A,{n // 5},{n // 5 + 0.9},{n}" for n in [*numbers, 100]]  # one of them twice
-    fitted = fit(read_log(log("\n".join(["ID,time,receive time,sequence", *lines]))))
+    fitted = fitted_log(log("\n".join(["ID,time,receive time,sequence", *lines])))
     assert summary(fitted).startswith("300 messages of 1 UAVs over 59 s; lost: 6 (2.0%)")
     assert trace_rows(fitted)[7] == "lost"
 
@@ -96,7 +102,7 @@ def test_clocks_that_differ_are_named_before_anything_is_written(log, tmp_path, 
 def test_a_few_messages_that_came_in_before_their_time_are_named(log):
     few = log("\n".join(["ID,time,receive time", "A,0,0.5", "A,1,0.8", "A,2,2.5"]))
     told = "1 came in before their time, because clocks differ, and count as 0 s late; the earliest by 0.2 s"
-    assert summary(fit(read_log(few))).endswith(told)
+    assert summary(fitted_log(few)).endswith(told)
 
 
 def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys, monkeypatch):

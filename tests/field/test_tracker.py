@@ -182,6 +182,7 @@ def test_two_reports_of_one_instant_count_and_tell_of_the_landing_before():
     [
         ({"uav": "d"}, "ID: 'd' is not a UAV of this fleet: a, b, c"),
         ({"time": START + 60}, "time: 1700000060 s is 59.9 s after it came in"),
+        ({"time": 5.0}, "time: 5 s is 1.7e+09 s before it came in: the clock of a is not set"),
         ({"source_lat": 52.8}, "places are pairs lat, lon [deg], or all of them x, y [m]"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
         ({"time": START + 2e6, "receive_time": START + 2e6}, "time: the first reports are more than 1e+06 s"),
@@ -191,3 +192,16 @@ def test_what_no_uav_can_say_is_refused(changed, message):
     with pytest.raises(InputError) as error:
         followed(told("a", START, 3) | changed, until=START)
     assert message in str(error.value)
+
+
+def test_a_report_numbered_after_one_that_was_generated_later_is_refused():
+    tracker = followed(told("a", START + 30, 210, sequence=7), until=START + 31)
+    late, back = (
+        Report(id="a", time=START + 10, sequence=n, lat=52.811, lon=-4.129, receive_time=START + 31)
+        for n in (6, 8)
+    )
+    tracker.check(late)
+    with pytest.raises(
+        InputError, match=r"s is 20\.0 s before that of number 7: the clock of a was set back"
+    ):
+        tracker.check(back)
