@@ -1,7 +1,6 @@
 """Advise real UAVs: from a table of their reports, where each should land next, by a policy or the script.
 
 damian advise checkpoint=runs/first table=reports.csv     (one table, one answer; docs/advise.md)
-damian advise fit=journals/north.jsonl                    (only the delays, as a trace to train with)
 """
 
 import time
@@ -15,19 +14,7 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import write_csv
 from damian.common.text_files import named
-from damian.delays.clocks import are_right, in_order, notes_of
-from damian.delays.law_fit import fit_laws
 from damian.field.advice import next_landings
-from damian.field.fitting import (
-    check_clocks,
-    fit,
-    law_summary,
-    plot_fit,
-    read_log,
-    steps_of,
-    summary,
-    trace_rows,
-)
 from damian.field.node import Node, for_uavs, scenario_of_reports
 from damian.field.rows import read_file
 from damian.world.vehicles import MOTION_MODELS
@@ -39,18 +26,8 @@ from .shared.runs import run_folder, save_config, start, stored_values
 
 
 def advise(config: AdviseConfig, folder: Path) -> None:
-    """Answer a table of reports, or write the delays of a log."""
-    given = [name for name in ("table", "fit") if getattr(config, name) is not None]
-    problem = "is not the only one of table=FILE, fit=FILE: give one"
-    checks.require(len(given) == 1, "table", " and ".join(given) or "nothing", problem)
-    if config.fit is not None:
-        fit_delays(config, folder)
-    else:
-        answer_table(config, folder)
-
-
-def answer_table(config: AdviseConfig, folder: Path) -> None:
     """Print where each UAV of a table should land next, and write it into the run folder."""
+    checks.require(config.table is not None, "table", "it", "is missing: give table=FILE")
     scenario_of_reports(config)
     check_motion(config)
     if config.observation.own and config.learnt:
@@ -76,24 +53,6 @@ def check_motion(config: AdviseConfig) -> None:
         if MOTION_MODELS.get(kind, "motion.kind").instant:
             problem = "the policy's UAVs were at their targets at once: train one with motion=polynomial"
             raise InputError(f"motion: {kind}: {problem}, or give instant=true to have it advise")
-
-
-def fit_delays(config: AdviseConfig, folder: Path) -> None:
-    """Write the delays of a log of reports as a trace, and tell and draw which law fits them best."""
-    log = Path(str(config.fit))
-    messages = in_order(read_log(log))
-    check_clocks(messages, right := are_right(messages), log)
-    for note in notes_of(messages, right):
-        print(f"note: {note}, which are left out")
-    fitted = fit(messages, right)
-    save_config(config, folder)
-    trace = folder / "trace.csv"
-    write_atomically(trace, "\n".join(["delay", *trace_rows(fitted), ""]))
-    print(summary(fitted))
-    print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
-    laws = fit_laws(steps_of(fitted, config.clock.dt))
-    print(law_summary(*laws, config.clock.dt))
-    plot_fit(fitted, laws[0], config.clock.dt, folder / "fit.png")
 
 
 @cli.program("advise")

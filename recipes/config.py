@@ -6,7 +6,7 @@ from typing import Any
 from damian.common import checks
 from damian.common.fields import Settings, constant, rules, setting
 from damian.compare.config import SCORES, STORED
-from damian.envs.config import ScenarioConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.runs.config import LoggerConfig
 
@@ -169,12 +169,21 @@ class AdviseConfig(FlownPolicyConfig):
         choices=("deterministic", "sampled", "script"),
     )
     table: str | None = setting(None, "Table of reports, CSV or JSON: where should each UAV land next?")
-    fit: str | None = setting(
-        None, "Journal, or table with receive times: only write its delays as a trace, ``trace.csv``."
-    )
     instant: bool = setting(
         False, "Whether a policy may advise whose UAVs were at their targets at once in training."
     )
+
+
+@dataclass
+class FitConfig(Settings):
+    """All settings of ``damian fit``."""
+
+    log: str = setting("", "Journal, or table of reports with receive times, whose delays to fit.")
+    clock: ClockConfig = setting(ClockConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.refuse(not self.log, "log", "is missing: the journal or table whose delays to fit")
 
 
 @dataclass

@@ -12,6 +12,8 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from damian.common.errors import InputError
+
 AGREE = 1.0
 """How far the clocks of a sender and of the receiver may differ [s]."""
 LATEST_MEDIAN = 1800.0
@@ -130,6 +132,18 @@ def _level_steps(late: Floats, received: Floats, number: Floats) -> Flags:
     gap = gaps[WINDOW - 1 : len(gaps) - WINDOW + 1]
     comes_as_usual = np.abs(gap - usual * number[WINDOW : len(late) - WINDOW + 1]) < step / 2
     return (step > AGREE) & is_level & comes_as_usual
+
+
+def check_clocks(messages: pd.DataFrame, right: Flags) -> None:
+    """Refuse a log with a sender whose clock was never right."""
+    was_right = pd.Series(right, messages.index).groupby(messages.uav).any()
+    for uav, late in (messages.received - messages.time).groupby(messages.uav):
+        if not was_right[uav]:
+            typical = late.median()
+            raise InputError(
+                f"the clocks of {uav} and of the receiver differ: receive times are in the median "
+                f"{abs(typical):.3g} s {'before' if typical < 0 else 'after'} times; correct one of them"
+            )
 
 
 def notes_of(messages: pd.DataFrame, right: Flags) -> list[str]:

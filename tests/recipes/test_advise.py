@@ -56,7 +56,7 @@ def test_a_trained_policy_answers_as_it_was_trained(run, advise, capsys):
 
 
 REFUSALS = [
-    (["policy=script"], "table: nothing is not the only one of table=FILE, fit=FILE: give one"),
+    (["policy=script"], "table: it is missing: give table=FILE"),
     (["table=nothing.csv"], "nothing.csv: no such file"),
     (["table=table.csv", "links=updown"], "links: updown is not server: reports are what the server node"),
     (["table=far.csv"], "far.csv: line 2: lat, lon: 48, 11 is "),

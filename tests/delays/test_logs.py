@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 
 from damian.delays.clocks import are_right, in_order
 from damian.delays.laws import Trace
-from damian.field.fitting import fit, read_log, summary, trace_rows
+from damian.delays.logs import delays_of, read_log, trace_rows
 from damian.recipes.cli import settings
 from damian.recipes.command import main
+from damian.recipes.fit import summary
 
 DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
 """Of the messages of a UAV [s]; None: lost."""
@@ -31,7 +32,7 @@ def table(numbered: bool = True, period: float = 1.0, uavs: int = 2, start: floa
 
 def fitted_log(path):
     messages = in_order(read_log(path))
-    return fit(messages, are_right(messages))
+    return delays_of(messages, are_right(messages))
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_without_numbers_no_loss_can_be_seen(log):
 
 def test_a_law_reads_the_trace(log, tmp_path, capsys):
     out = tmp_path / "run" / "trace.csv"
-    main(["advise", f"fit={log(table())}", f"hydra.run.dir={out.parent}"])
+    main(["fit", f"log={log(table())}", f"hydra.run.dir={out.parent}"])
     printed = capsys.readouterr().out.splitlines()
     assert f'train with "delay.obs={{law: trace, path: {out}}}"' in printed
     sampler = Trace(str(out)).sampler()
@@ -92,7 +93,7 @@ def test_clocks_that_differ_are_named_before_anything_is_written(log, tmp_path, 
     lines = [f"{uav},{i},{i + 0.5 + own}" for i in range(10, 30) for uav, own in (("A", 0), ("B", shift))]
     path = log("\n".join(["ID,time,receive time", *lines]))
     with pytest.raises(SystemExit):
-        main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+        main(["fit", f"log={path}", f"hydra.run.dir={tmp_path / 'run'}"])
     (line,) = capsys.readouterr().err.splitlines()
     start = f"error: {path}: the clocks of B and of the receiver differ: receive times are in the median"
     assert line.startswith(f"{start} {said} times; correct one of them")
@@ -110,7 +111,7 @@ def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys,
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: drawn.append((figure.axes[0], path)))
     lines = [f"A,{i},{i + (5.5 if i % 25 < 5 else 0.5)},53.1,-4.5,{i}" for i in range(500) if i % 25]
     path = log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))
-    main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+    main(["fit", f"log={path}", f"hydra.run.dir={tmp_path / 'run'}"])
     *_, law, _, bad, _ = capsys.readouterr().out.splitlines()
     assert bad == "a bad fit: take the trace"  # bursts of the same length, in regular distances
     delay = settings(*shlex.split(law.removeprefix("best law: "))).delay
