@@ -27,10 +27,10 @@ import damian
 from damian.common.errors import InputError, RunError
 from damian.common.plotting import UAV_COLOURS
 from damian.common.text_files import one_line, show
-from damian.field.rows import Found, Report, reports_of, rows_of_csv, rows_of_json, validated, written
 from damian.show.geojson import on_earth
 from damian.show.replay_page import PAGE
 from damian_fleet.fleet import Fleet, Waiting
+from damian_fleet.reports import Found, Report, reports_of, rows_of_csv, rows_of_json, validated, written
 from damian_fleet.rows import Acknowledgement, Advice, Asking, Change, Command, FleetStatus, Members
 from damian_fleet.store import Fleets, NoFleet
 

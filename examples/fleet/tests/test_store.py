@@ -17,8 +17,8 @@ from damian.baselines.script import script_policy
 from damian.common.errors import InputError, RunError
 from damian.delays.clocks import are_right, in_order
 from damian.delays.logs import delays_of, read_log
-from damian.field.playback import episodes_of
 from damian_fleet.fleet import Fleet
+from damian_fleet.playback import episodes_of
 from damian_fleet.store import Fleets
 
 TOKEN = "a-token-of-the-service"

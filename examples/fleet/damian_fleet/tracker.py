@@ -17,11 +17,11 @@ from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, named, show
 from damian.delays.clocks import AGREE, UNSET
-from damian.field.known import FilledReport, UavLog, messages_of
-from damian.field.node import LateMessage, Memories, Node, Reported
-from damian.field.rows import Report, Rows
 from damian.world.messages import Messages
 from damian.world.state import State
+from damian_fleet.known import FilledReport, UavLog, messages_of
+from damian_fleet.node import LateMessage, Memories, Node, Reported
+from damian_fleet.reports import Report, Rows
 
 NEVER_DECIDED = 2**31
 """Steps since the latest decision of a UAV that is ready to choose."""

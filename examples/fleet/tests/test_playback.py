@@ -13,11 +13,11 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.field.node import Node, for_uavs
-from damian.field.playback import episodes_of
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.show.episode import Episode, record
 from damian.world.config import BatteryConfig, MotionConfig, SourceConfig
+from damian_fleet.node import Node, for_uavs
+from damian_fleet.playback import episodes_of
 
 N_STEPS = 60
 SCENARIO = ScenarioConfig(

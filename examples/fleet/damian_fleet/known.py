@@ -16,12 +16,12 @@ from torch import Tensor
 
 from damian.common.errors import InputError
 from damian.delays.clocks import AGREE
-from damian.field.rows import DEGREES, METRES, Place, Report
 from damian.server.server import Server
 from damian.world.airspace import Airspace
 from damian.world.battery import observed
 from damian.world.messages import Messages
 from damian.world.regions.geodesy import to_latlon, to_local
+from damian_fleet.reports import DEGREES, METRES, Place, Report
 
 
 class Ground:

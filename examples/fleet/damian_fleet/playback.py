@@ -20,13 +20,13 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common.errors import InputError
-from damian.field.fitting import wrong_clocks
-from damian.field.journal import Line, read_journal
-from damian.field.node import Node
-from damian.field.rows import Place, Report, Rows, written
-from damian.field.tracker import Tracker
 from damian.show.episode import Episode, at_instant, episode_of
 from damian.world.state import Truth
+from damian_fleet.clocks import wrong_clocks
+from damian_fleet.journal import Line, read_journal
+from damian_fleet.node import Node
+from damian_fleet.reports import Place, Report, Rows, written
+from damian_fleet.tracker import Tracker
 
 
 def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, Any]) -> list[Episode]:

@@ -4,7 +4,7 @@ import pandas as pd
 
 from damian.delays.clocks import are_right, in_order, notes_of
 from damian.delays.logs import delays_of
-from damian.field.rows import Rows
+from damian_fleet.reports import Rows
 
 
 def wrong_clocks(rows: Rows) -> tuple[set[int], pd.DataFrame]:

@@ -11,11 +11,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.common.text_files import named
-from damian.field.fitting import wrong_clocks
-from damian.field.node import Node
-from damian.field.rows import Rows
-from damian.field.tracker import Tracker
 from damian.learners.recurrent import AgentGRU
+from damian_fleet.clocks import wrong_clocks
+from damian_fleet.node import Node
+from damian_fleet.reports import Rows
+from damian_fleet.tracker import Tracker
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
