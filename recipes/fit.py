@@ -16,7 +16,7 @@ from damian.common.atomic_files import write_atomically
 from damian.common.plotting import COLOURS
 from damian.common.text_files import named
 from damian.compare.figures import save
-from damian.delays.clocks import are_right, check_clocks, in_order, notes_of
+from damian.delays.clocks import are_right, check_clocks, in_order, note_on
 from damian.delays.law_fit import LawFit, fit_laws
 from damian.delays.logs import delays_of, read_log, steps_of, trace_rows
 
@@ -31,8 +31,8 @@ def fit(config: FitConfig, folder: Path) -> None:
     right = are_right(messages)
     with named(log):
         check_clocks(messages, right)
-    for note in notes_of(messages, right):
-        print(f"note: {note}, which are left out")
+    if not right.all():
+        print(note_on(messages, right))
     delays = delays_of(messages, right)
     trace = folder / "trace.csv"
     write_atomically(trace, "\n".join(["delay", *trace_rows(delays), ""]))

@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from damian.common.errors import InputError
+from damian.common.text_files import listed
 
 AGREE = 1.0
 """How far the clocks of a sender and of the receiver may differ [s]."""
@@ -22,8 +23,6 @@ UNSET = 1e6
 """A message that seems later than that [s] tells the time of a clock that was not set yet."""
 WINDOW = 10
 """Messages before and after a step of a clock that must show it, where numbers do not."""
-MOST_NOTES = 10
-"""Most lines about wrong clocks; another one says how many more there would be."""
 
 Floats, Flags = NDArray[np.floating], NDArray[np.bool_]
 
@@ -101,14 +100,11 @@ def _steps(own: pd.DataFrame) -> Flags:
     time, received = own.time.to_numpy(), own.received.to_numpy()
     steps = np.zeros(len(own), bool)
     if own.sequence.notna().all():
-        number = own.sequence.diff().where(own.run.diff() == 0, 1).to_numpy()
-        back = np.diff(time, prepend=time[:1]) < -AGREE
         is_behind = time < np.maximum.accumulate(time) - AGREE
-        catches_up = np.diff(is_behind, prepend=False)
-        steps |= back | catches_up
-    else:
-        number = np.ones(len(own))
-    steps[WINDOW : len(own) - WINDOW + 1] |= _level_steps(received - time, received, number)
+        steps[1:] = (np.diff(time) < -AGREE) | np.diff(is_behind)
+    if len(own) >= 2 * WINDOW:
+        number = own.sequence.diff().where(own.run.diff() == 0).fillna(1).to_numpy()
+        steps[WINDOW : len(own) - WINDOW + 1] |= _level_steps(received - time, received, number)
     return steps
 
 
@@ -117,8 +113,6 @@ def _level_steps(late: Floats, received: Floats, number: Floats) -> Flags:
 
     If it was the link that got slower or faster, messages would have come in later or sooner than usual.
     """
-    if len(late) < 2 * WINDOW:
-        return np.zeros(max(len(late) - 2 * WINDOW + 1, 0), bool)
     lates, times = (sliding_window_view(values, WINDOW) for values in (late, received))
     level, spread, span = np.median(lates, 1), np.ptp(lates, 1), np.ptp(times, 1)
     before, after = slice(None, -WINDOW), slice(WINDOW, None)
@@ -136,27 +130,24 @@ def _level_steps(late: Floats, received: Floats, number: Floats) -> Flags:
 
 def check_clocks(messages: pd.DataFrame, right: Flags) -> None:
     """Refuse a log with a sender whose clock was never right."""
-    was_right = pd.Series(right, messages.index).groupby(messages.uav).any()
-    for uav, late in (messages.received - messages.time).groupby(messages.uav):
-        if not was_right[uav]:
-            typical = late.median()
-            raise InputError(
-                f"the clocks of {uav} and of the receiver differ: receive times are in the median "
-                f"{abs(typical):.3g} s {'before' if typical < 0 else 'after'} times; correct one of them"
-            )
+    late = messages.received - messages.time
+    never = late[~messages.uav.isin(messages.uav[right])].groupby(messages.uav).median()
+    for uav, typical in never.items():
+        raise InputError(
+            f"the clocks of {uav} and of the receiver differ: receive times are in the median "
+            f"{abs(typical):.3g} s {'before' if typical < 0 else 'after'} times; correct one of them"
+        )
 
 
-def notes_of(messages: pd.DataFrame, right: Flags) -> list[str]:
-    """A line for each stretch of messages from a wrong clock: where it begins, whose it is, and how wrong."""
+def note_on(messages: pd.DataFrame, right: Flags) -> str:
+    """A line about stretches of messages from wrong clocks: where each begins, whose it is, and how wrong."""
     late, is_right = messages.received - messages.time, pd.Series(right, messages.index)
     typical = late[is_right].groupby(messages.uav[is_right]).median()
     begins = (messages.uav != messages.uav.shift()) | (is_right != is_right.shift())
-    notes = []
+    places = []
     for _, part in messages[~is_right].groupby(begins.cumsum()):
-        uav = part.uav.iloc[0]
+        (where, uav), n = part[["where", "uav"]].iloc[0], len(part)
         behind = late[part.index].median() - typical.get(uav, 0.0)
         wrong = f"{abs(behind):.3g} s {'behind' if behind > 0 else 'ahead'}"
-        place = part["where"].iloc[0]
-        notes.append(f"{place}: the clock of {uav} is {wrong} in {len(part)} messages from here on")
-    more = [f"and at {len(notes) - MOST_NOTES} more places"] if len(notes) > MOST_NOTES else []
-    return [*notes[:MOST_NOTES], *more]
+        places.append(f"{where}: the clock of {uav} is {wrong} in {n} messages from here on")
+    return f"note: {listed(places)}: they are left out"

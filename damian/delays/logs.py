@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from json import JSONDecodeError, loads
+from json import loads
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +41,13 @@ def seconds_of(text: str) -> float:
 
 
 def read_log(path: Path) -> pd.DataFrame:
-    """The log in a journal, or in a table (CSV, JSON) with receive times, as of ``damian.delays.clocks``."""
+    """The log in a journal, or in a CSV table with receive times, as of ``damian.delays.clocks``."""
     with named(path):
         text = read_text(path)
-        rows = _journal_rows(text) if path.suffix == JOURNAL else _table_rows(text, path.suffix)
+        if path.suffix == JOURNAL:
+            rows = _journal_rows(text)
+        else:
+            rows = [(f"line {row.line}", row.cells, None) for row in parse_table(text, [])]
         log = []
         for where, report, came in rows:
             with named(where):
@@ -54,32 +57,19 @@ def read_log(path: Path) -> pd.DataFrame:
     return pd.DataFrame(log)
 
 
-def _table_rows(text: str, suffix: str) -> list[tuple[str, Any, None]]:
-    """Rows of a table with their places."""
-    if suffix.lower() != ".json":
-        return [(f"line {row.line}", row.cells, None) for row in parse_table(text, [])]
-    found = _parsed(text)
-    rows = found if isinstance(found, list) else [found]
-    return [(f"row {n}", row, None) for n, row in enumerate(rows, 1)]
-
-
 def _journal_rows(text: str) -> list[tuple[str, Any, Any]]:
     """Reports of a journal, but for an unfinished last line, with their places and when they came in."""
     rows, lines = [], text.rpartition("\n")[0].split("\n")
     for n, line in enumerate(lines, 1):
         with named(where := f"line {n}"):
-            said = _parsed(line)
-            if not isinstance(said, dict) or (n == 1 and "journal" not in said):
+            try:
+                said = loads(line)
+            except ValueError as error:
+                raise InputError(f"it is not JSON: {error}") from None
+            if not isinstance(said, dict):
                 raise InputError("it is not a line of a journal")
         rows += [(where, report, said.get("received")) for report in said.get("reports", ())]
     return rows
-
-
-def _parsed(text: str) -> Any:
-    try:
-        return loads(text)
-    except (JSONDecodeError, RecursionError) as error:
-        raise InputError(f"it is not JSON: {error}") from None
 
 
 def _row(said: Any, came: Any) -> dict[str, Any]:

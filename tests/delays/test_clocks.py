@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from damian.delays.clocks import are_right, in_order, notes_of
+from damian.delays.clocks import are_right, in_order, note_on
 
 N, START = 400, 1.77e9
 TIMES = START + np.arange(N)
@@ -63,10 +63,11 @@ def test_a_step_of_a_clock_is_found_where_it_is(case, numbered):
     messages = in_order(log)
     right = are_right(messages)
     assert sorted(messages.index[~right]) == np.flatnonzero(wrong).tolist()
-    (note,) = notes_of(messages, right)
+    note = note_on(messages, right)
     side = "behind" if behind[wrong][0] > 0 else "ahead"
     first = f"line {np.flatnonzero(wrong)[0] + 2}: the clock of u1 is "
-    assert note == f"{first}{abs(behind[wrong].mean()):.3g} s {side} in {wrong.sum()} messages from here on"
+    wrong_by = f"{abs(behind[wrong].mean()):.3g} s {side} in {wrong.sum()} messages from here on"
+    assert note == f"note: {first}{wrong_by}: they are left out"
 
 
 def test_numbers_show_a_step_that_is_smaller_than_the_spread_of_the_delays():

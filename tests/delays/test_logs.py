@@ -6,6 +6,7 @@ import shlex
 import pytest
 from matplotlib.figure import Figure
 
+from damian.common.errors import InputError
 from damian.delays.clocks import are_right, in_order
 from damian.delays.laws import Trace
 from damian.delays.logs import delays_of, read_log, trace_rows
@@ -126,3 +127,24 @@ def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys,
     ]  # the first is not missed
     assert points[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
     assert points[:, 1] == pytest.approx([1, *[0.2] * 5], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("A,noon,3,1", "line 3: time: 'noon' is neither seconds nor a date of ISO 8601"),
+        ("A,1.7e12,3,1", "line 3: time: 1.7e12: give seconds since 1970, no milliseconds or microseconds"),
+        ("A,1,NA,1", "line 3: it needs ID, time and receive time, or ID, time and AoI"),
+        ("NA,1,2,1", "line 3: it needs ID, time and receive time, or ID, time and AoI"),
+        ("A,1,2,one", "line 3: sequence: 'one' is not the number of a report"),
+    ],
+)
+def test_what_is_no_report_is_refused_with_its_line(log, row, said):
+    path = log(f"id,Time,Receive_Time,number\nA,2026-05-01T12:00:00Z,1777636801,0\n{row}\n")
+    with pytest.raises(InputError) as error:
+        read_log(path)
+    assert str(error.value) == f"{path}: {said}"
+
+
+def test_the_age_of_a_report_tells_when_it_came_in(log):
+    assert trace_rows(fitted_log(log("ID,time,AoI\nA,1,0.5\nA,2,0.25\n"))) == ["0.500000s", "0.250000s"]

@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from damian.delays.clocks import are_right, in_order, notes_of
+from damian.delays.clocks import are_right, in_order, note_on
 from damian.delays.logs import delays_of
 from damian_fleet.reports import Rows
 
@@ -17,6 +17,6 @@ def wrong_clocks(rows: Rows) -> tuple[set[int], pd.DataFrame]:
     messages = in_order(pd.DataFrame(cells, columns=columns).astype({"sequence": float}))
     right = are_right(messages)
     right |= ~pd.Series(right, messages.index).groupby(messages.uav).transform("any").to_numpy(bool)
-    for note in notes_of(messages, right):
-        print(f"note: {note}, which are left out")
+    if not right.all():
+        print(note_on(messages, right))
     return {*messages.index[~right]}, delays_of(messages, right)

@@ -222,7 +222,7 @@ def _fleets(fleets: Fleets, token: str, now: Clock) -> APIRouter:
 
     @router.get("/{name}/journal", response_class=PlainTextResponse)
     async def journal(name: str) -> str:
-        """What happened to the fleet, as a journal for ``damian fly`` and ``damian advise``."""
+        """What happened to the fleet, as a journal for ``damian-playback`` and ``damian fit``."""
         return "\n".join([*fleets.journal(name), ""])
 
     return router

@@ -154,8 +154,8 @@ def test_reports_of_a_wrong_clock_are_left_out_of_the_flight_and_named(tmp_path,
     path = write_journal(tmp_path / "x.jsonl", *lines, uavs=names_of(3))
     (episode,) = played(path, replace(SCENARIO, observation=ObservationConfig()))
     assert capsys.readouterr().out.splitlines() == [
-        f"note: {path}: line 48: the clock of uav-1 is 30 s behind in 25 messages from here on, "
-        "which are left out"
+        f"note: {path}: line 48: the clock of uav-1 is 30 s behind in 25 messages from here on: "
+        "they are left out"
     ]
     assert not episode.lost.any()
     assert episode.sent.sum(0).tolist() == [39, 14, 39]

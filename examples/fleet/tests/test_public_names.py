@@ -7,7 +7,8 @@ from pathlib import Path
 from damian.interop.fleet import PUBLIC
 
 FILES = sorted((Path(__file__).parents[1] / "damian_fleet").rglob("*.py"))
-NAMES = {(module, name) for module, names in PUBLIC.items() for name in names.split()}
+TABLE = dict(line.split(": ") for line in PUBLIC.strip().splitlines())
+NAMES = {(module, name) for module, names in TABLE.items() for name in names.split(", ")}
 
 
 def imported() -> set[tuple[str, str]]:
