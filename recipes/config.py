@@ -5,16 +5,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from damian.common import checks
-from damian.common.fields import Settings, constant, rules, setting
+from damian.common.fields import Settings, constant, setting
 from damian.compare.config import STORED
-from damian.envs.config import ScenarioConfig
+from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.learners.config import LEARNERS, LearnerConfig, MappoConfig
 from damian.models.config import MODELS, MlpConfig, ModelConfig
 from damian.runs.config import LoggerConfig
 from damian.runs.measures import check_score
 
 FORMATS = ("gif", "mp4", "png", "html", "geojson")
-FILMS = FORMATS[:2]
 COMPILE_FROM = 1_000_000
 """Environment steps from which on compiling saves more time than it takes, half a minute."""
 
@@ -107,33 +106,7 @@ class TrainConfig(ScenarioConfig):
 
 
 @dataclass
-class FlownPolicyConfig(TrainConfig):
-    """All settings of ``damian train``, and which policy flies: the first choice flies a checkpoint."""
-
-    policy: str | None = setting(None, choices=STORED)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        problem = "is for damian train: nothing is trained here; give the run folder as checkpoint"
-        self.refuse(self.resume is not None, "resume", problem)
-        problem = "needs checkpoint: the run folder with the policy to fly"
-        self.refuse(self.learnt and not self.checkpoint, "policy", problem)
-        problem = "flies no checkpoint: leave it out"
-        self.refuse(self.policy and self.checkpoint and not self.learnt, "policy", problem)
-
-    @property
-    def flown(self) -> str:
-        """The policy that flies."""
-        return self.policy or (rules(type(self))["policy"].choices[0] if self.checkpoint else "script")
-
-    @property
-    def learnt(self) -> bool:
-        """Whether it is that of a checkpoint."""
-        return self.flown in STORED
-
-
-@dataclass
-class FlyConfig(FlownPolicyConfig):
+class FlyConfig(TrainConfig):
     """All settings of ``damian fly``: those of ``damian train``, and what to fly and to keep."""
 
     eval_episodes: int = setting(1, "Episodes to fly.")
@@ -153,36 +126,42 @@ class FlyConfig(FlownPolicyConfig):
     views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
     shown: list[str] = setting(
         [],
-        "UAVs that films tell apart, by number, or by ID in a journal; if none, all of up to 6, 3 of more.",
-    )
-    journal: str | None = setting(
-        None, "Journal of a fleet whose flight to show, instead of flying, with the settings given here."
+        "UAVs that films tell apart, by number; if none, all of up to 6, 3 of more.",
     )
     replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
-        numbered = not self.journal and not {*self.shown} <= {*map(str, range(self.agents))}
-        self.refuse(numbered, "shown", f"is not a list of UAVs from 0 to {self.agents - 1}")
+        problem = "is for damian train: nothing is trained here; give the run folder as checkpoint"
+        self.refuse(self.resume is not None, "resume", problem)
+        problem = "needs checkpoint: the run folder with the policy to fly"
+        self.refuse(self.learnt and not self.checkpoint, "policy", problem)
+        problem = "flies no checkpoint: leave it out"
+        self.refuse(self.policy and self.checkpoint and not self.learnt, "policy", problem)
+        known = {*self.shown} <= {*map(str, range(self.agents))}
+        self.refuse(not known, "shown", f"is not a list of UAVs from 0 to {self.agents - 1}")
+
+    @property
+    def flown(self) -> str:
+        """The policy that flies."""
+        return self.policy or ("sampled" if self.checkpoint else "script")
+
+    @property
+    def learnt(self) -> bool:
+        """Whether it is that of a checkpoint."""
+        return self.flown in STORED
 
 
 @dataclass
-class AdviseConfig(FlownPolicyConfig):
-    """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
+class FitConfig(Settings):
+    """All settings of ``damian fit``."""
 
-    policy: str | None = setting(
-        None,
-        "deterministic (default with checkpoint), sampled, or script.",
-        choices=("deterministic", "sampled", "script"),
-    )
-    table: str | None = setting(None, "Table of reports, CSV or JSON: where should each UAV land next?")
-    fit: str | None = setting(
-        None, "Journal, or table with receive times: only write its delays as a trace, ``trace.csv``."
-    )
-    instant: bool = setting(
-        False, "Whether a policy may advise whose UAVs were at their targets at once in training."
-    )
+    log: str = setting("", "Journal, or table of reports with receive times, whose delays to fit.")
+    clock: ClockConfig = setting(ClockConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.refuse(not self.log, "log", "is missing: the journal or table whose delays to fit")
 
 
 @dataclass

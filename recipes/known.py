@@ -21,7 +21,7 @@ from damian.common.text_files import read_text
 from damian.compare.config import CompareConfig
 from damian.learners.config import LEARNERS
 
-from .config import AdviseConfig, ExportConfig, FlyConfig, ResultsConfig, SubmitConfig, TrainConfig
+from .config import ExportConfig, FitConfig, FlyConfig, ResultsConfig, SubmitConfig, TrainConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 """Folder of the configuration files: one for each program, and in folders one for each option of a group."""
@@ -29,8 +29,8 @@ SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
     "evaluate": TrainConfig,
     "fly": FlyConfig,
-    "advise": AdviseConfig,
     "compare": CompareConfig,
+    "fit": FitConfig,
     "export": ExportConfig,
     "results": ResultsConfig,
     "submit": SubmitConfig,

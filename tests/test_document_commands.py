@@ -14,7 +14,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from reports import write_journal as write_reports
 
 import damian
 
@@ -42,9 +41,6 @@ INSTEAD = {
 }
 """What stands instead of some words: fewer runs, a map that is there, and no Slurm."""
 PARK = [[-4.134, 52.808], [-4.122, 52.808], [-4.122, 52.817], [-4.134, 52.817], [-4.134, 52.808]]
-TABLE = (
-    "ID,lat,lon,source spotted,AoI\nA,52.8110,-4.1283,0,2\nB,52.8133,-4.1264,0,0.5\nC,52.8154,-4.1281,1,NA\n"
-)
 
 
 def commands(text: str) -> list[list[str]]:
@@ -61,7 +57,7 @@ def shortened(words: list[str]) -> list[str]:
         words = [word.replace(",mp4", "") for word in words]
     if any(word.startswith("resume=") for word in words):
         return [re.sub(r"^frames=.*", "frames=128", word) for word in words]
-    if any(word.startswith(("journal=", "replay=")) for word in words):  # nothing is flown
+    if any(word.startswith("replay=") for word in words):  # nothing is flown
         return words
     shorter = SHORTER.get(words[0], [])
     if any(word.startswith("checkpoint=") for word in words):  # the region is that of the training
@@ -103,7 +99,6 @@ def trained(tmp_path_factory) -> Path:
     shape = {"type": "Polygon", "coordinates": [PARK]}
     park = {"type": "Feature", "properties": {"name": "park"}, "geometry": shape}
     (folder / "park.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [park]}))
-    (folder / "reports.csv").write_text(TABLE)
     for file in (ROOT / "examples" / "extending").glob("*.py"):
         shutil.copy(file, folder)
     return folder
@@ -111,12 +106,12 @@ def trained(tmp_path_factory) -> Path:
 
 def write_journal(path: Path) -> None:
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines: list[dict] = []
+    lines: list[dict] = [{"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A", "B"]}]
     for n in range(60):
         row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
     path.parent.mkdir(exist_ok=True)
-    write_reports(path, *lines, uavs=["A", "B"])
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -22,7 +22,6 @@ from damian.server.belief import (
 from damian.server.server import Server
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.entries import Entries, add_spec, existing
-from damian.transforms.timeline import ObservationTimeline
 from damian.world.coverage import KnownCoverage
 
 
@@ -254,22 +253,3 @@ class EpisodeTotals(WorldTransform):
         add_spec(observation_spec, keys.EPISODE_REWARD, reward.shape, reward.dtype)
         add_spec(observation_spec, keys.STEP_COUNT, (*observation_spec.shape, 1), torch.long)
         return observation_spec
-
-
-# Reports that arrive late (``damian.field``).
-
-
-def note_late(transform: StatefulTransform, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-    """Note an agent's packed message [M] that arrives in the next step, ``lag`` >= 1 steps late.
-
-    Of a single world; what a belief remembers is changed in place.
-    """
-    if isinstance(transform, ObservationTimeline):
-        return transform.noted_late(memory, message, agent, lag)
-    if isinstance(transform, Belief) and lag <= transform.longest:
-        messages = transform.server.messages(message.view(1, 1, -1))
-        slot = (memory["slot"] + 1 - lag) % len(memory["report"])
-        source, level = torch.arange(len(slot), device=slot.device), transform.server.level(messages)
-        memory["report"][slot, agent, source] = report_rows(transform.grid, messages, level).view(-1)
-        memory["delay"][slot, agent] = lag
-    return memory

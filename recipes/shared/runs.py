@@ -92,7 +92,7 @@ def _carry_out(
 
 def only_named_code(values: Mapping[str, Any]) -> AbstractContextManager[None]:
     """While a run takes settings from a file, only code that the present command line names is imported."""
-    if not any(values.get(key) for key in ("checkpoint", "resume", "journal")):
+    if not any(values.get(key) for key in ("checkpoint", "resume")):
         return nullcontext()
     return stored_settings([*texts(values)], bool(values["trust"]))
 

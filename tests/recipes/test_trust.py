@@ -54,7 +54,6 @@ PROGRAMS = {
     "export": lambda: main(["export", "run"]),
     "evaluate": lambda: main(["evaluate", "checkpoint=run", "hydra.run.dir=new"]),
     "fly": lambda: main(["fly", "checkpoint=run", "formats=[]", "hydra.run.dir=new"]),
-    "advise": lambda: main(["advise", "checkpoint=run", "table=table.csv", "hydra.run.dir=new"]),
     "train": lambda: main(["train", "checkpoint=run", "hydra.run.dir=new"]),
     "resume": lambda: main(["train", "resume=run", "frames=96"]),
 }

@@ -26,12 +26,12 @@ from damian import keys
 from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, named, show
-from damian.field.advice import Adviser, Policy
-from damian.field.known import FilledReport, UavLog
-from damian.field.node import Node
-from damian.field.rows import Report, Rows, validated, written
 from damian.world.battery import flight_drain
 from damian.world.vehicles import check_levels
+from damian_fleet.advice import Adviser, Policy
+from damian_fleet.known import FilledReport, UavLog
+from damian_fleet.node import Node
+from damian_fleet.reports import Report, Rows, validated, written
 from damian_fleet.rows import (
     MOST_UAVS,
     Acknowledgement,

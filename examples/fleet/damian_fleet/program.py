@@ -22,9 +22,9 @@ from damian import keys
 from damian.baselines.script import script_policy
 from damian.common.errors import InputError, RunError
 from damian.common.fields import rules
-from damian.field.node import Node, for_uavs, scenario_of_reports
 from damian_fleet.door import MOST_STRANGERS, door
 from damian_fleet.fleet import MOST_STEPS, Fleet
+from damian_fleet.node import Node, for_uavs, scenario_of_reports
 from damian_fleet.service import make_app
 from damian_fleet.settings import FleetConfig
 from damian_fleet.store import Fleets

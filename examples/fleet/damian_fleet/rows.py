@@ -4,7 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from damian.field.rows import Latitude, Longitude, Row, UavId, column_of
+from damian.delays.logs import column_of
+from damian_fleet.reports import Latitude, Longitude, Row, UavId
 
 MOST_UAVS = 100
 """Most UAVs of a fleet."""

@@ -27,10 +27,10 @@ import damian
 from damian.common.errors import InputError, RunError
 from damian.common.plotting import UAV_COLOURS
 from damian.common.text_files import one_line, show
-from damian.field.rows import Found, Report, reports_of, rows_of_csv, rows_of_json, validated, written
 from damian.show.geojson import on_earth
 from damian.show.replay_page import PAGE
 from damian_fleet.fleet import Fleet, Held, Waiting
+from damian_fleet.reports import Found, Report, reports_of, rows_of_csv, rows_of_json, validated, written
 from damian_fleet.rows import (
     MOST_ROWS,
     Acknowledgement,
@@ -237,7 +237,7 @@ def _fleets(fleets: Fleets, token: str, now: Clock) -> APIRouter:
 
     @router.get("/{name}/journal", response_class=PlainTextResponse)
     async def journal(name: str) -> str:
-        """What happened to the fleet, as a journal for ``damian fly`` and ``damian advise``."""
+        """What happened to the fleet, as a journal for ``damian-playback`` and ``damian fit``."""
         return "\n".join([*fleets.journal(name), ""])
 
     return router

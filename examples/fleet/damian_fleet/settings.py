@@ -4,7 +4,7 @@ import os
 import secrets
 from dataclasses import dataclass
 
-from damian.common import checks
+from damian.common.checks import require
 from damian.common.fields import Settings, setting
 
 
@@ -54,4 +54,4 @@ class FleetConfig(Settings):
         self.is_made = not (token := self.token or os.environ.get("DAMIAN_TOKEN"))
         self.token = token or secrets.token_urlsafe(24)
         good = len(self.token) >= 16 and self.token.isascii() and self.token.isprintable()
-        checks.require(good, "token", "it", "is not a password of at least 16 printable ASCII characters")
+        require(good, "token", "it", "is not a password of at least 16 printable ASCII characters")

@@ -159,7 +159,7 @@ class Fleets:
         self.loaded.pop(name, None)
 
     def journal(self, name: str) -> Iterator[str]:
-        """What happened to a fleet, also to one that has ended, for ``damian fly`` and ``damian advise``."""
+        """What happened to a fleet, also to one that has ended, for ``damian-playback`` and ``damian fit``."""
         line = "SELECT id, head FROM fleets WHERE name = ? ORDER BY id DESC"
         found = self._base.execute(line, (name,)).fetchone() or (self._id(name), "")
         yield found[1]

@@ -10,10 +10,10 @@ from reports import LLANBEDR, START, Reporter, names_of, read_json
 from damian import keys
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
-from damian.field.node import Node, for_uavs
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.world.config import ActionConfig, MotionConfig, SourceConfig
 from damian_fleet.fleet import Fleet
+from damian_fleet.node import Node, for_uavs
 from damian_fleet.rows import Acknowledgement, Asking, Change, Command
 from damian_fleet.settings import FleetConfig
 from damian_fleet.store import Fleets

@@ -6,8 +6,8 @@ import pytest
 import scripted
 from scripted import BEGIN, GOAL, HOME, Vehicle, World
 
-from damian.field.rows import Report, validated
 from damian_fleet.bridge import Answer, Bridge
+from damian_fleet.reports import Report, validated
 from damian_fleet.vehicles import GUIDED, LAND, LOITER, RTL, mavlink
 
 FLIGHT = ["ground", "accept", "guided", "arm", "climb", "cruise", "landing"]

@@ -9,10 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AliasChoices, BaseModel, Field, model_validator
 
 from damian.common.text_files import named, read_text
-from damian.field.rows import Report, Time, UavId, parsed_json, validated
-
-SUFFIX = ".jsonl"
-"""End of the name of a journal."""
+from damian_fleet.reports import Report, Time, UavId, parsed_json, validated
 
 
 class Head(BaseModel):

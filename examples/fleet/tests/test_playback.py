@@ -13,11 +13,11 @@ from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.field.node import Node, for_uavs
-from damian.field.playback import episodes_of
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.show.episode import Episode, record
 from damian.world.config import BatteryConfig, MotionConfig, SourceConfig
+from damian_fleet.node import Node, for_uavs
+from damian_fleet.playback import episodes_of
 
 N_STEPS = 60
 SCENARIO = ScenarioConfig(
@@ -141,3 +141,22 @@ def test_another_episode_begins_when_uavs_join_and_leave(tmp_path):
     assert (before.n_steps, after.n_steps) == (0, 3)
     assert after.age[-1].tolist() == [5.0, 3.0, 5.0]
     assert np.array_equal(after.believed[-1, 2], ground.points[300].astype(np.float32))
+
+
+def test_reports_of_a_wrong_clock_are_left_out_of_the_flight_and_named(tmp_path, capsys):
+    ground, lines = Node(SCENARIO, 3).ground, []
+    for second in range(40):
+        for uav in names_of(3):
+            sets_back = 30.0 if uav == "uav-1" and second >= 15 else 0.0
+            row = {"ID": uav, "time": 1000.0 + second - sets_back, "sequence": second}
+            row["lat"], row["lon"] = ground.place(100 + second)
+            lines.append({"received": 1000.2 + second, "reports": [row]})
+    path = write_journal(tmp_path / "x.jsonl", *lines, uavs=names_of(3))
+    (episode,) = played(path, replace(SCENARIO, observation=ObservationConfig()))
+    assert capsys.readouterr().out.splitlines() == [
+        f"note: {path}: line 48: the clock of uav-1 is 30 s behind in 25 messages from here on: "
+        "they are left out"
+    ]
+    assert not episode.lost.any()
+    assert episode.sent.sum(0).tolist() == [39, 14, 39]
+    assert episode.age[-1].tolist() == [0.0, 25.0, 0.0]

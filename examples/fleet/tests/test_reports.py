@@ -6,7 +6,7 @@ import pytest
 from reports import read_json
 
 from damian.common.errors import InputError
-from damian.field.rows import Report, reports_of, rows_of_csv, rows_of_json
+from damian_fleet.reports import Report, reports_of, rows_of_csv, rows_of_json
 
 ROW = {"ID": "B", "time": 1.75e9, "lat": 52.8, "lon": -4.1, "source_spotted": 0, "battery": 80.0}
 

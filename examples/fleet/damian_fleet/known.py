@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from damian.common.errors import InputError
-from damian.field.rows import DEGREES, METRES, Place, Report
+from damian.delays.clocks import AGREE
 from damian.server.server import Server
 from damian.world.airspace import Airspace
 from damian.world.battery import observed
 from damian.world.messages import Messages
 from damian.world.regions.geodesy import to_latlon, to_local
+from damian_fleet.reports import DEGREES, METRES, Place, Report
 
 
 class Ground:
@@ -116,7 +117,7 @@ class UavLog:
         return self.reports[-1] if self.reports else None
 
     def check(self, report: Report) -> None:
-        """Require complete places near landing points, and as many readings as the sensors give."""
+        """Require complete places near landing points, the readings of all sensors, and no clock set back."""
         report.check_places()
         if report.columns != self.ground.columns:
             own = ", ".join(self.ground.columns)
@@ -128,6 +129,19 @@ class UavLog:
         given, n = report.readings, self.n_readings
         if given is not None and len(given) != n:
             raise InputError(f"readings: {len(given)} numbers are not {n}, as in the training")
+        self._check_clock(report)
+
+    def _check_clock(self, report: Report) -> None:
+        """Refuse the time of a new report that was generated earlier than the one numbered before it."""
+        own = report.sequence
+        if own is None or self.has(report):
+            return
+        numbered = [(each.report.sequence, each.report.time) for each in self.reports]
+        below = [(number, -time) for number, time in numbered if number is not None and number < own]
+        number, time = max(below, default=(0, math.inf))
+        if report.time < -time - AGREE:
+            back = f"{report.time:.13g} s is {-time - report.time:.1f} s before that of number {number}"
+            raise InputError(f"time: {back}: the clock of {report.id} was set back")
 
     def has(self, report: Report) -> bool:
         """Has this report come in before."""

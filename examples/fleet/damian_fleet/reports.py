@@ -23,31 +23,17 @@ from pydantic_core import from_json
 
 from damian.common.errors import InputError
 from damian.common.text_files import parse_table, read_text, show
+from damian.delays.logs import LATEST, UNKNOWN, column_of, seconds_of
 
 DEGREES, METRES = ("lat", "lon"), ("x", "y")
 """Columns of a place: latitude and longitude [deg], or over a region without a place on Earth x and y [m]."""
 Place = tuple[float, float]
 """A place in the columns that its row has."""
 
-UNKNOWN = ("", "na", "nan", "none", "null")
-"""Cells that mean that a value is not known."""
 GROUND = 0.5
 """Altitude up to which a UAV whose motors do not turn stands on the ground [m]."""
-LATEST = 4e9
-"""Latest time that is understood [s since 1970]."""
 CALENDAR = 1e8
 """From this time on [s], times count from 1970 and are written as dates."""
-
-
-def _seconds(value: Any) -> Any:
-    """Seconds of ISO 8601, which is UTC if it names no zone; another value as it is."""
-    if not isinstance(value, str):
-        return value
-    try:  # digits alone are seconds, though ISO 8601 would read a date from eight of them
-        return float(value)
-    except ValueError:
-        time = datetime.fromisoformat(value.strip())
-        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
 def _below(limit: float, problem: str) -> BeforeValidator:
@@ -93,7 +79,8 @@ FOREIGN = {
 """Columns of common logs: which column says the same here, and in which unit."""
 Number: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
 _of_a_clock = _below(1e11, "give seconds, not milliseconds or microseconds")
-Time: TypeAlias = Annotated[float, Field(ge=0, le=LATEST), BeforeValidator(_seconds), _of_a_clock]
+_dated = BeforeValidator(lambda value: seconds_of(value) if isinstance(value, str) else value)
+Time: TypeAlias = Annotated[float, Field(ge=0, le=LATEST), _dated, _of_a_clock]
 """A time [s], as a number or as ISO 8601."""
 Count: TypeAlias = Annotated[int, Field(ge=0, le=2**31)]
 Flag: TypeAlias = Annotated[
@@ -227,11 +214,6 @@ class Report(Row):
             raise InputError("places are pairs lat, lon [deg], or all of them x, y [m]; the UAV's is needed")
         if True in pairs[1] and self.source_time is None and not self.source_spotted:
             raise InputError("source time: it is missing: when the source was detected at this place [s]")
-
-
-def column_of(name: str) -> str:
-    """A name of a column as ``Row`` has it: small letters, and spaces between words."""
-    return name.strip().lower().replace("_", " ").replace("-", " ")
 
 
 Found = list[tuple[str, Any]]

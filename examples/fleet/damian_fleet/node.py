@@ -13,18 +13,19 @@ from torch import Tensor
 from torchrl.envs import Compose
 
 from damian import keys
-from damian.common import checks
+from damian.common.errors import InputError
 from damian.common.tensors import tree_map
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.nodes import ServerNode, note_late
+from damian.envs.nodes import Belief, ServerNode
 from damian.envs.pipeline import observation_transforms, remembering_transforms
 from damian.envs.uav_env import Outputs, UavEnv
-from damian.field.known import Ground
+from damian.server.belief import report_rows
 from damian.server.server import Features
-from damian.transforms import StatefulTransform
+from damian.transforms import ObservationTimeline, StatefulTransform
 from damian.transforms.entries import Entries
 from damian.world.state import PackedState, State
+from damian_fleet.known import Ground
 
 REMEMBERED_STEPS = 32
 """Steps that the belief looks back at least: real messages may be later than those of the training."""
@@ -63,8 +64,8 @@ class ReportedEnv(UavEnv):
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         told = {"source.count": scenario.source.count == 1, "requests.rate": not scenario.requests.slots}
         for key, is_told in told.items():
-            problem = "is not told by reports, which know one source and no requests"
-            checks.require(is_told, key, "it", problem)
+            if not is_told:
+                raise InputError(f"{key}: it is not told by reports, which know one source and no requests")
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
         super().__init__(scenario, 1, seed, extras=extras, messages_only=True)
 
@@ -155,10 +156,29 @@ def _copies(memories: Memories) -> Memories:
     return [{name: value.clone() for name, value in memory.items()} for memory in memories]
 
 
+def note_late(
+    transform: StatefulTransform, memory: dict[str, Tensor], message: Tensor, agent: int, lag: int
+) -> dict[str, Tensor]:
+    """Note an agent's packed message [M] that arrives in the next step, ``lag`` >= 1 steps late.
+
+    Of a single world; what a belief remembers is changed in place.
+    """
+    if isinstance(transform, ObservationTimeline):
+        return transform.noted_late(memory, message, agent, lag)
+    if isinstance(transform, Belief) and lag <= transform.longest:
+        messages = transform.server.messages(message.view(1, 1, -1))
+        slot = (memory["slot"] + 1 - lag) % len(memory["report"])
+        source, level = torch.arange(len(slot), device=slot.device), transform.server.level(messages)
+        memory["report"][slot, agent, source] = report_rows(transform.grid, messages, level).view(-1)
+        memory["delay"][slot, agent] = lag
+    return memory
+
+
 def scenario_of_reports(scenario: ScenarioConfig) -> ScenarioConfig:
     """The scenario as reports tell it: own messages are known as late as others."""
-    problem = "is not server: reports are what the server node knows, not what links bring to a UAV"
-    checks.require(scenario.links.kind == "server", "links", scenario.links.kind, problem)
+    if scenario.links.kind != "server":
+        problem = "is not server: reports are what the server node knows, not what links bring to a UAV"
+        raise InputError(f"links: {scenario.links.kind} {problem}")
     return replace(scenario, observation=replace(scenario.observation, own=False))
 
 

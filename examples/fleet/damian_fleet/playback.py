@@ -7,6 +7,7 @@ hindsight, and between two reports on the straight way to the later one. Nobody 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,13 +20,13 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common.errors import InputError
-from damian.field.fitting import fit
-from damian.field.journal import Line, read_journal
-from damian.field.node import Node
-from damian.field.rows import Place, Report, Rows, written
-from damian.field.tracker import Tracker
 from damian.show.episode import Episode, at_instant, episode_of
 from damian.world.state import Truth
+from damian_fleet.clocks import wrong_clocks
+from damian_fleet.journal import Line, read_journal
+from damian_fleet.node import Node
+from damian_fleet.reports import Place, Report, Rows, written
+from damian_fleet.tracker import Tracker
 
 
 def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, Any]) -> list[Episode]:
@@ -36,6 +37,14 @@ def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, 
     ``node_of`` gives a node for a number of UAVs, which writes the terms of the reward.
     """
     head, lines = read_journal(path)
+    rows = [(where, report) for where, line in lines for report in line.reports]
+    problem = f"{path}: the fleet never began: not every UAV has reported"
+    if not rows:
+        raise InputError(problem)
+    wrong, fitted = wrong_clocks(rows)
+    numbers = count()
+    for _, line in lines:
+        line.reports = [report for report in line.reports if next(numbers) not in wrong]
     told = {"policy": head.about.get("policy"), "checkpoint": head.about.get("checkpoint")}
     episodes = []
     for uavs, part in _parts(head.uavs, lines):
@@ -44,9 +53,9 @@ def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, 
             continue  # not every UAV has reported
         tracker = Tracker(node_of(len(uavs)), uavs, rows)
         steps = range(tracker.first_step, tracker.step_of(part[-1][1].time) + 1)
-        episodes.append(_episode(tracker, rows, steps, {**told, **about, "fleet": head.fleet}))
+        episodes.append(_episode(tracker, rows, fitted, steps, {**told, **about, "fleet": head.fleet}))
     if not episodes:
-        raise InputError(f"{path}: the fleet never began: not every UAV has reported")
+        raise InputError(problem)
     return episodes
 
 
@@ -63,8 +72,10 @@ def _parts(
     yield uavs, part
 
 
-def _episode(tracker: Tracker, rows: Rows, steps: Sequence[int], about: Mapping[str, Any]) -> Episode:
-    """The flight of these steps."""
+def _episode(
+    tracker: Tracker, rows: Rows, fitted: pd.DataFrame, steps: Sequence[int], about: Mapping[str, Any]
+) -> Episode:
+    """The flight of these steps; ``fitted`` has its messages, as of ``fit``."""
     node, numbers, known = tracker.node, np.array(steps), list[Any]()
     taken = tracker.steps(tracker.start + steps[-1] * node.dt)
     known += [outputs[0] for outputs in tqdm(taken, unit=" steps", delay=1)]
@@ -72,7 +83,7 @@ def _episode(tracker: Tracker, rows: Rows, steps: Sequence[int], about: Mapping[
     flown = [_hindsight(tracker, own, numbers) for own in reports.values()]
     columns = {name: np.stack([each[name] for each in flown], 1) for name in flown[0]}
     columns["age"] = torch.stack([each[keys.AGE][:, 0] for each in known]).numpy() * node.dt
-    columns["sent"], columns["delay"] = _messages(tracker, reports, numbers)
+    columns["sent"], columns["delay"] = _messages(tracker, fitted, numbers)
     instants = cast(TensorDictBase, torch.stack([at_instant(each) for each in known]))  # type: ignore[arg-type]
     for rewards in (instants[keys.REWARD], *instants.get(keys.REWARD_TERMS, {}).values()):
         rewards[0] = 0  # of a step before
@@ -127,11 +138,14 @@ def _hindsight(
 
 
 def _messages(
-    tracker: Tracker, reports: Mapping[str, Sequence[Report]], steps: NDArray[np.int64]
+    tracker: Tracker, fitted: pd.DataFrame, steps: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N] each."""
-    sent, number = np.zeros((len(steps), len(reports)), bool), {uav: i for i, uav in enumerate(reports)}
-    delay, found = np.zeros(sent.shape, int), fit(report for own in reports.values() for report in own)
+    sent, number = (
+        np.zeros((len(steps), len(tracker.uavs)), bool),
+        {uav: i for i, uav in enumerate(tracker.uavs)},
+    )
+    delay, found = np.zeros(sent.shape, int), fitted[fitted.uav.isin(tracker.uavs)]
     # Of those of one step, the first that has arrived counts.
     found = found.sort_values("delay", ascending=False, na_position="first")
     for uav, time, received in found[["uav", "time", "received"]].itertuples(index=False):

@@ -11,10 +11,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.common.text_files import named
-from damian.field.node import Node
-from damian.field.rows import Rows
-from damian.field.tracker import Tracker
 from damian.models.memory import AgentGRU
+from damian_fleet.clocks import wrong_clocks
+from damian_fleet.node import Node
+from damian_fleet.reports import Rows
+from damian_fleet.tracker import Tracker
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -78,6 +79,8 @@ def next_landings(rows: Rows, node: Node, policy: Policy, now: float, drawn: boo
         with named(where):
             report.stamp(now, file=True)
     uavs = [*dict.fromkeys(report.id for _, report in rows)]
+    wrong, _ = wrong_clocks(rows)
+    rows = [row for number, row in enumerate(rows) if number not in wrong]
     adviser = Adviser(node, uavs, policy, drawn, rows=rows)
     latest = max(report.received for _, report in rows)
     for _ in adviser.steps(latest):

@@ -16,14 +16,13 @@ from damian import keys
 from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, named, show
-from damian.field.known import FilledReport, UavLog, messages_of
-from damian.field.node import LateMessage, Memories, Node, Reported
-from damian.field.rows import Report, Rows
+from damian.delays.clocks import AGREE, UNSET
 from damian.world.messages import Messages
 from damian.world.state import State
+from damian_fleet.known import FilledReport, UavLog, messages_of
+from damian_fleet.node import LateMessage, Memories, Node, Reported
+from damian_fleet.reports import Report, Rows
 
-FUTURE = 1.0
-"""How far the clock of a UAV may be ahead of that of the server [s]."""
 NEVER_DECIDED = 2**31
 """Steps since the latest decision of a UAV that is ready to choose."""
 _ROUNDING = 1e-3
@@ -86,9 +85,12 @@ class Tracker:
         if log is None and report.id not in self.logs:
             raise InputError(f"ID: {show(report.id)} is not a UAV of this fleet: {listed(self.uavs)}")
         for name, time in (("time", report.time), ("source time", report.source_time)):
-            if time is not None and time > report.received + FUTURE:
+            if time is not None and time > report.received + AGREE:
                 late = f"{time:.13g} s is {time - report.received:.1f} s after it came in"
                 raise InputError(f"{name}: {late}: set the clock of the UAV")
+        if report.received - report.time > UNSET:
+            early = f"{report.time:.13g} s is {report.received - report.time:.3g} s before it came in"
+            raise InputError(f"time: {early}: the clock of {report.id} is not set")
         (log or self.logs[report.id]).check(report)
 
     def step_of(self, time: float) -> int:

@@ -6,10 +6,13 @@ import shlex
 import pytest
 from matplotlib.figure import Figure
 
+from damian.common.errors import InputError
+from damian.delays.clocks import are_right, in_order
 from damian.delays.laws import Trace
-from damian.field.fitting import fit, read_log, summary, trace_rows
+from damian.delays.logs import delays_of, read_log, trace_rows
 from damian.recipes.cli import settings
 from damian.recipes.command import main
+from damian.recipes.fit import summary
 
 DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
 """Of the messages of a UAV [s]; None: lost."""
@@ -28,6 +31,11 @@ def table(numbered: bool = True, period: float = 1.0, uavs: int = 2, start: floa
     return "\n".join(["ID,time,receive time,lat,lon,sequence", *lines])
 
 
+def fitted_log(path):
+    messages = in_order(read_log(path))
+    return delays_of(messages, are_right(messages))
+
+
 @pytest.fixture
 def log(tmp_path):
     def written(text: str, name: str = "reports.csv"):
@@ -40,7 +48,7 @@ def log(tmp_path):
 
 @pytest.mark.parametrize("period", [1.0, 0.25])
 def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, period):
-    fitted = fit(read_log(log(table(period=period))))
+    fitted = fitted_log(log(table(period=period)))
     rows = trace_rows(fitted)
     found = [None if row == "lost" else float(row.removesuffix("s")) for row in rows]
     assert found == [None if d is None else pytest.approx(d, abs=1e-6) for d in DELAYS * 2]
@@ -48,13 +56,13 @@ def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, period):
 
 
 def test_without_numbers_no_loss_can_be_seen(log):
-    rows = trace_rows(fit(read_log(log(table(numbered=False)))))
+    rows = trace_rows(fitted_log(log(table(numbered=False))))
     assert (len(rows), "lost" in rows) == (16, False)
 
 
 def test_a_law_reads_the_trace(log, tmp_path, capsys):
     out = tmp_path / "run" / "trace.csv"
-    main(["advise", f"fit={log(table())}", f"hydra.run.dir={out.parent}"])
+    main(["fit", f"log={log(table())}", f"hydra.run.dir={out.parent}"])
     printed = capsys.readouterr().out.splitlines()
     assert f'train with "delay.obs={{law: trace, path: {out}}}"' in printed
     sampler = Trace(str(out)).sampler()
@@ -70,13 +78,13 @@ def test_a_journal_is_a_log(log):
     ]
     lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]
     path = log("".join(f"{json.dumps(line)}\n" for line in lines) + '{"cut', "x.jsonl")
-    assert trace_rows(fit(read_log(path))) == ["0.250000s"] * 4
+    assert trace_rows(fitted_log(path)) == ["0.250000s"] * 4
 
 
 def test_numbered_reports_of_one_second_are_different_messages_also_without_places(log):
     numbers = [n for n in range(300) if n % 50 != 7]
     lines = [f"A,{n // 5},{n // 5 + 0.9},{n}" for n in [*numbers, 100]]  # one of them twice
-    fitted = fit(read_log(log("\n".join(["ID,time,receive time,sequence", *lines]))))
+    fitted = fitted_log(log("\n".join(["ID,time,receive time,sequence", *lines])))
     assert summary(fitted).startswith("300 messages of 1 UAVs over 59 s; lost: 6 (2.0%)")
     assert trace_rows(fitted)[7] == "lost"
 
@@ -86,7 +94,7 @@ def test_clocks_that_differ_are_named_before_anything_is_written(log, tmp_path, 
     lines = [f"{uav},{i},{i + 0.5 + own}" for i in range(10, 30) for uav, own in (("A", 0), ("B", shift))]
     path = log("\n".join(["ID,time,receive time", *lines]))
     with pytest.raises(SystemExit):
-        main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+        main(["fit", f"log={path}", f"hydra.run.dir={tmp_path / 'run'}"])
     (line,) = capsys.readouterr().err.splitlines()
     start = f"error: {path}: the clocks of B and of the receiver differ: receive times are in the median"
     assert line.startswith(f"{start} {said} times; correct one of them")
@@ -96,7 +104,7 @@ def test_clocks_that_differ_are_named_before_anything_is_written(log, tmp_path, 
 def test_a_few_messages_that_came_in_before_their_time_are_named(log):
     few = log("\n".join(["ID,time,receive time", "A,0,0.5", "A,1,0.8", "A,2,2.5"]))
     told = "1 came in before their time, because clocks differ, and count as 0 s late; the earliest by 0.2 s"
-    assert summary(fit(read_log(few))).endswith(told)
+    assert summary(fitted_log(few)).endswith(told)
 
 
 def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys, monkeypatch):
@@ -104,7 +112,7 @@ def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys,
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure.axes[0]))
     lines = [f"A,{i},{i + (5.5 if i % 25 < 5 else 0.5)},53.1,-4.5,{i}" for i in range(500) if i % 25]
     path = log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))
-    main(["advise", f"fit={path}", f"hydra.run.dir={tmp_path / 'run'}"])
+    main(["fit", f"log={path}", f"hydra.run.dir={tmp_path / 'run'}"])
     *_, law, _, bad, _ = capsys.readouterr().out.splitlines()
     assert bad == "a bad fit: take the trace"  # bursts of the same length, in regular distances
     delay = settings(*shlex.split(law.removeprefix("best law: "))).delay
@@ -120,3 +128,24 @@ def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys,
     ]  # the first is not missed
     assert points[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
     assert points[:, 1] == pytest.approx([1, *[0.2] * 5], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("A,noon,3,1", "line 3: time: 'noon' is neither seconds nor a date of ISO 8601"),
+        ("A,1.7e12,3,1", "line 3: time: 1.7e12: give seconds since 1970, no milliseconds or microseconds"),
+        ("A,1,NA,1", "line 3: it needs ID, time and receive time, or ID, time and AoI"),
+        ("NA,1,2,1", "line 3: it needs ID, time and receive time, or ID, time and AoI"),
+        ("A,1,2,one", "line 3: sequence: 'one' is not the number of a report"),
+    ],
+)
+def test_what_is_no_report_is_refused_with_its_line(log, row, said):
+    path = log(f"id,Time,Receive_Time,number\nA,2026-05-01T12:00:00Z,1777636801,0\n{row}\n")
+    with pytest.raises(InputError) as error:
+        read_log(path)
+    assert str(error.value) == f"{path}: {said}"
+
+
+def test_the_age_of_a_report_tells_when_it_came_in(log):
+    assert trace_rows(fitted_log(log("ID,time,AoI\nA,1,0.5\nA,2,0.25\n"))) == ["0.500000s", "0.250000s"]

@@ -7,9 +7,9 @@ from typing import Any
 import torch
 
 from damian import keys
-from damian.field.known import Ground
-from damian.field.rows import Rows, reports_of, rows_of_json
 from damian.world.config import RegionConfig
+from damian_fleet.known import Ground
+from damian_fleet.reports import Rows, reports_of, rows_of_json
 
 START = 1.7e9
 """When the simulated flights begin [s since 1970]."""

@@ -1,0 +1,99 @@
+"""Fit a law to recorded delays: how late the messages of a log were, as a trace to train with, and as a law.
+
+damian fit log=reports.csv                                          (a table with times and receive times)
+damian fit log=journals/north.jsonl clock.simulation=0.5s           (the journal of a service for fleets)
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from damian.common.atomic_files import write_atomically
+from damian.common.plotting import COLOURS
+from damian.common.text_files import named
+from damian.compare.figures import save
+from damian.delays.clocks import are_right, check_clocks, in_order, note_on
+from damian.delays.law_fit import LawFit, fit_laws
+from damian.delays.logs import delays_of, read_log, steps_of, trace_rows
+
+from . import cli
+from .config import FitConfig
+
+
+def fit(config: FitConfig, folder: Path) -> None:
+    """Write the delays of a log of reports as a trace, and tell and draw which law fits them best."""
+    log, dt = Path(config.log), config.clock.dt
+    messages = in_order(read_log(log))
+    right = are_right(messages)
+    with named(log):
+        check_clocks(messages, right)
+    if not right.all():
+        print(note_on(messages, right))
+    delays = delays_of(messages, right)
+    trace = folder / "trace.csv"
+    write_atomically(trace, "\n".join(["delay", *trace_rows(delays), ""]))
+    print(summary(delays))
+    print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
+    laws = fit_laws(steps_of(delays, dt))
+    print(law_summary(*laws, dt))
+    plot_fit(delays, laws[0], dt, folder / "fit.png")
+    print(f"results: {folder}")
+
+
+def summary(messages: pd.DataFrame) -> str:
+    """The fitted delays and losses as text, with a line about those that came in before their time."""
+    delays, n, time = messages.delay.dropna(), len(messages), messages.time
+    n_lost, early = n - len(delays), (time - messages.received)[messages.received < time]
+    median, most, nearly_all = np.quantile(delays, [0.5, 0.9, 0.99])
+    problem = "came in before their time, because clocks differ, and count as 0 s late; the earliest by"
+    clocks = f"\n{len(early)} {problem} {early.max():.3g} s" if len(early) else ""
+    return (
+        f"{n} messages of {messages.uav.nunique()} UAVs over {time.max() - time.min():.0f} s; lost: {n_lost} "
+        f"({n_lost / n:.1%})\n"
+        f"delay [s]: mean {delays.mean():.3f}, median {median:.3f}, 90 % {most:.3f}, 99 % {nearly_all:.3f}, "
+        f"longest {delays.max():.3f}{clocks}"
+    )
+
+
+def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
+    """The law that ``fit_laws`` finds as settings, and what of the delays it does not repeat, as text."""
+    other, gain = np.abs(best.chances - own.chances).sum() / 2, (own.likelihood - best.likelihood) / best.n
+    law, loss = str(best.written).replace("'", ""), f" delay.loss={best.loss}" * (best.loss > 0)
+    text = f'best law: "delay.obs={law}"{loss} clock.simulation={dt:g}s\n'
+    text += f"it gives {other:.1%} of the messages another delay; "
+    text += f"{own.written} are likelier by {gain:.3f} nats a message"
+    if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
+        text += "\na bad fit: take the trace"
+    return text
+
+
+def plot_fit(messages: pd.DataFrame, law: LawFit, dt: float, path: Path) -> None:
+    """Draw the share of the messages that are later than a delay, or lost: survival curves.
+
+    The law has a point at whole steps of ``dt`` seconds, to which a simulation rounds delays up.
+    """
+    delays = np.sort(messages.delay.dropna())
+    recorded = 1 - np.arange(len(delays) + 1) / len(messages)
+    later, lost = 1 - law.chances[:-1].cumsum(), law.chances[-1]
+    shown = later > max(lost, 0.1 / len(messages))  # rounding leaves a rest where nothing is later
+
+    def panel(axis: Any, _: str) -> None:
+        axis.step([0, *delays], recorded, where="post", color=COLOURS[0], label="recorded")
+        name = law.written["law"] if isinstance(law.written, dict) else "constant"
+        style: Any = {"markersize": 4, "color": COLOURS[1], "label": f"best law: {name}"}
+        axis.plot(np.arange(len(later))[shown] * dt, later[shown], "o", **style)
+        axis.set(xlabel="delay [s]", ylabel="share of messages later, or lost", yscale="log")
+        if lost:
+            axis.axhline(lost, color="0.5", linestyle=":", label="lost")
+
+    save(path, ["fit"], panel, (4.2, 3.0))
+
+
+@cli.program("fit")
+@cli.one_line_errors("fit")
+def main(given: DictConfig) -> None:
+    fit(cli.checked(given, [], "fit"), cli.short(Path(HydraConfig.get().runtime.output_dir)))
