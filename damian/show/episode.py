@@ -146,18 +146,17 @@ class Episode:
 
     def document(self) -> dict[str, Any]:
         """What a file holds of the episode, with numbers of ``DIGITS`` significant digits, times of more."""
-        fixed = {
+        return {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "about": self.about,
+            "meaning": COLUMNS,
+            **{each.name: getattr(self, each.name) for each in fields(self)},
             "region": json.loads(shapely.to_geojson(self.region)),
-            "origin": self.origin,
             "landing_points": _listed(self.landing_points),
-            "radius": self.radius,
-            "instant": self.instant,
-            "success": self.success,
+            **{name: _listed(getattr(self, name)) for name in COLUMNS},
+            "time": _listed(self.time, TIME_DIGITS),
         }
-        columns = {name: _listed(getattr(self, name)) for name in COLUMNS}
-        columns["time"] = _listed(self.time, TIME_DIGITS)
-        head = {"schema": SCHEMA, "version": VERSION, "about": self.about, "meaning": COLUMNS}
-        return {**head, **fixed, **columns}
 
     @classmethod
     def load(cls, path: Path) -> "Episode":
@@ -226,6 +225,25 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         charges = vehicles.chargers.view(airspace.points.shape[:2])[region].cpu()
         about["charging_points"] = _listed(points[charges[: len(points)].numpy()])
     level, source = about.get("drawn", {}).get("source.level_db"), env.scenario.source
+    columns: dict[str, Any] = {
+        "time": time,
+        "position": truth.position,
+        "target": own.target,
+        "track": own.track,
+        "battery": truth.battery,
+        "spotted": own.spotted,
+        "source": truth.source,
+        "emits": truth.emits,
+        "sent": sent,
+        "delay": delay[..., 0],
+        "believed": held.position,
+        "age": (held.age(time) / dt).round() * dt,  # times in messages are float32
+        "reward": cast(Tensor, instants[keys.REWARD])[..., 0],
+        "cells": None if belief is None or grid is None else grid.centres.cpu(),
+        "belief": belief,
+        "requests": truth.requests if env.simulation.widths.requests else None,
+    }
+    arrays: dict[str, Any] = {name: x if x is None else np.asarray(x) for name, x in columns.items()}
     return Episode(
         about={**about, "region": over.name, "damian": damian.__version__},
         region=over.polygon,
@@ -234,23 +252,8 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         radius=footprint_radius(replace(source, level_db=level) if level else source),
         instant=vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
-        time=np.asarray(time),
-        position=np.asarray(truth.position),
-        target=np.asarray(own.target),
-        track=np.asarray(own.track),
-        battery=np.asarray(truth.battery),
-        spotted=np.asarray(own.spotted),
-        source=np.asarray(truth.source),
-        emits=np.asarray(truth.emits),
-        sent=np.asarray(sent),
-        delay=np.asarray(delay[..., 0]),
-        believed=np.asarray(held.position),
-        age=np.asarray((held.age(time) / dt).round() * dt),  # times in messages are float32
-        reward=np.asarray(cast(Tensor, instants[keys.REWARD])[..., 0]),
         reward_terms={name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()},
-        cells=None if belief is None or grid is None else np.asarray(grid.centres.cpu()),
-        belief=None if belief is None else np.asarray(belief),
-        requests=np.asarray(truth.requests) if env.simulation.widths.requests else None,
+        **arrays,
     )
 
 
