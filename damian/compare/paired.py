@@ -26,13 +26,14 @@ def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> p
     succeeds, lines = (rows["success_rate"] > 0).any(), []
     measures = [name for name in MEASURES if succeeds or name not in ("success_rate", "steps")]
     measures = list(dict.fromkeys([*measures, score]))
-    for names, runs in rows.groupby([*groups, "policy"], sort=False):
-        labels = dict(zip([*groups, "policy"], names, strict=True))
-        group = ", ".join(f"{key}={labels[key]}" for key in groups) or "all runs"
-        line = {**labels, "group": group, "n": len(runs), **means_over_seeds(runs[measures])}
-        if groups and labels[groups[0]] != (first := rows[groups[0]].iloc[0]):
-            beside = {**labels, groups[0]: first}
-            line |= difference(runs, rows[(rows[[*beside]] == pd.Series(beside)).all(axis=1)], score)
+    by_names = dict(iter(rows.groupby([*groups, "policy"], sort=False)))
+    first = rows[groups[0]].iloc[0] if groups else None
+    for names, runs in by_names.items():
+        line = {**dict(zip([*groups, "policy"], names, strict=True)), "n": len(runs)}
+        line |= means_over_seeds(runs[measures])
+        others = by_names.get((first, *names[1:]), runs)
+        if others is not runs:
+            line |= difference(runs, others, score)
         lines.append(line)
     return pd.DataFrame(lines)
 
