@@ -21,12 +21,12 @@ def late(config: TrainConfig) -> list[str]:
 
 def measures_hindsight(config: TrainConfig) -> bool:
     """Whether messages or rewards are late."""
-    return bool({"delay.obs", "delay.rew"} & {*late(config)})
+    return config.delays.obs.late or config.delays.rew.late
 
 
 def backupdates(config: TrainConfig) -> bool:
     """Is back-updating switched on, and can any message or reward be late or lost?"""
-    return config.backupdate and (config.delays.obs.late or config.delays.rew.late)
+    return config.backupdate and measures_hindsight(config)
 
 
 def learning_setup(config: TrainConfig) -> LearningSetup:
