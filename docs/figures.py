@@ -25,8 +25,8 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.recipes import cli
 from damian.recipes.compare import includes
-from damian.recipes.shared.comparison_runs import stored_results
 from damian.recipes.shared.environments import compose_scenario
+from damian.recipes.shared.sweeps import stored_results
 from damian.recipes.submit import delaybench
 from damian.runs.run_folder import RANDOM
 from damian.show.episode import record

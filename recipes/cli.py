@@ -4,6 +4,7 @@ Nothing here imports torch. A program is a function that takes what Hydra has co
 ``shared/runs.py`` starts its work in the run folder.
 """
 
+import functools
 import os
 import re
 import shlex
@@ -41,6 +42,8 @@ Work = Callable[[Any, Path], None]
 """The work of a program: takes checked settings and the run folder to fill."""
 ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError)
 """What Hydra raises for words and files that it cannot compose."""
+EXPECTED = (InputError, RunError, OSError, *ERRORS)
+"""What is told in one line."""
 
 
 def _schema(kind: type) -> DictConfig:
@@ -179,7 +182,7 @@ def one_line_errors(program: str = "train") -> Iterator[None]:
     _register_own(sys.argv[1:])
     try:
         yield
-    except (InputError, RunError, OSError, *ERRORS) as error:
+    except EXPECTED as error:
         line, cause = reason(error, program), error.__cause__
         if os.environ.get("DAMIAN_TRACEBACK"):
             traceback.print_exception(error)
@@ -199,8 +202,16 @@ def one_line_errors(program: str = "train") -> Iterator[None]:
 
 def program(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
     """Decorator of a program's ``main``: Hydra composes its argument from ``conf/NAME.yaml`` and words."""
-    composes = hydra.main(config_path="../conf", config_name=name, version_base=None)
-    return lambda main: one_line_errors(name)(composes(main))
+
+    def decorated(main: Callable[[DictConfig], None]) -> Callable[[], None]:
+        @functools.wraps(main)
+        def work(given: DictConfig) -> None:
+            with one_line_errors(name):  # here too: Hydra prints a line about an error that reaches it
+                main(given)
+
+        return one_line_errors(name)(hydra.main("../conf", name, version_base=None)(work))
+
+    return decorated
 
 
 def _sweep_name(sweep: Sequence[str]) -> str:

@@ -53,12 +53,12 @@ def _checked(name: str, words: list[str]) -> list[str] | None:
     """The words for a program; None if it was asked for help, which is printed."""
     if name not in PROGRAMS:
         raise InputError(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}")
-    options = [word for word in words if word.startswith("-") or ("=" not in word and word[0] != "~")]
+    options = [word for word in words if word.startswith("-") or ("=" not in word and word[:1] != "~")]
     rest = [word for word in words if word not in options]
     before = dict(zip(options, ["", *options], strict=False))
-    plain = [word for word in options if word[0] != "-" and before[word][:1] != "-"]
+    plain = [word for word in options if word[:1] != "-" and before[word][:1] != "-"]
     if {"-h", "--help"} & {*options}:
-        print(help_text(name, [word for word in options if word[0] != "-"]))
+        print(help_text(name, [word for word in options if word[:1] != "-"]))
         return None
     if plain and name in FOLDERS:
         options = [word for word in options if word not in plain]

@@ -9,47 +9,134 @@ The same command continues a comparison; keep=true also without the folders of f
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from damian.common import checks
 from damian.common.atomic_files import not_linked, write_atomically
 from damian.common.errors import InputError
 from damian.common.tables import write_csv
+from damian.common.text_files import named
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, RUN, Comparison
-from damian.compare.config import EPISODES, SEEDS, CompareConfig
+from damian.compare.config import EPISODES, SEEDS, CompareConfig, HeldOut
 from damian.compare.figures import plot_curves, plot_profiles, plot_scores
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
+from damian.runs.measures import BUILT_IN
 from damian.runs.processes import end_interrupted
 from damian.runs.run_folder import check_no_links, locked
 
 from . import cli
+from .config import TrainConfig
 from .evaluate import fly
-from .shared.comparison_runs import (
+from .known import key_of
+from .shared.runs import Run, check_policy_fits
+from .shared.settings import check_learning, late
+from .shared.sweeps import (
     FIGURE,
     LOG,
     MARKDOWN,
     NO_RESULTS,
     POINTS,
-    PROFILES,
     ROWS,
     Results,
-    Run,
+    names_of,
     perform_all,
-    plan,
     results_of,
     stored_results,
 )
-from .shared.runs import check_stored
 from .train import train
 
-TABLE, CURVES = "table.csv", "curves.png"
+TABLE, CURVES, PROFILES = "table.csv", "curves.png", "profiles.png"
+
+
+def plan(config: CompareConfig, folder: Path) -> list[Run]:
+    """Every run with its checked settings: seed after seed, and last what flies others' policies."""
+    tasks, delays, runs = config.chosen("tasks"), {NOT_LATE: [], **config.chosen("delays")}, list[Run]()
+    composed = cache(cli.settings)  # several methods differ only in whose policy they fly: 0.2 s each
+    places = [(task, task, HeldOut()) for task in tasks]
+    for name, held_out in config.experiment.held_out.items():
+        places += [(f"{t}{HELD_OUT_MARK}{name}", t, held_out) for t in tasks if _in(held_out.tasks, t)]
+    for (place, task, held_out), (delay, words) in product(places, delays.items()):
+        for name, method in config.chosen("methods").items():
+            fits = method.delayed == (delay != NOT_LATE) and _in(method.tasks, task)
+            if fits and _in(held_out.methods, name) and _in(held_out.delays, delay):
+                overrides = _replaced([*tasks[task], *words], held_out.overrides)
+                runs += _seeds(config, composed, folder / place / delay / name, task, overrides)
+    by_folder = {run.folder: run.config for run in runs}
+    for run in runs:
+        if run.config.checkpoint is not None:
+            with named(_place(run.folder.parent)):
+                check_policy_fits(run.config, by_folder[Path(run.config.checkpoint)])
+    succeeds = any(run.config.episode.can_succeed for run in runs)
+    should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
+    checks.require(succeeds or "success" not in config.score, "score", config.score, should)
+    measured = all(config.score in (*BUILT_IN, *run.config.metrics) for run in runs)
+    should = f"is not measured by every run: add overrides=['metrics=[{config.score}]']"
+    checks.require(measured, "score", config.score, should)
+    return sorted(runs, key=lambda run: (run.stage, run.config.seed))
+
+
+def _in(chosen: Sequence[str] | None, name: str) -> bool:
+    return chosen is None or name in chosen
+
+
+def _place(folder: Path) -> str:
+    """Task, delay and method of a folder."""
+    return "/".join(folder.parts[-3:])
+
+
+def _replaced(words: Sequence[str], by: Sequence[str]) -> list[str]:
+    """Words without those that others replace, and the others: ``delay=paper`` replaces ``delay.obs=4``."""
+    keys = tuple(f"{key_of(word)}." for word in by)
+    return [*(word for word in words if not f"{key_of(word)}.".startswith(keys)), *by]
+
+
+def _seeds(
+    config: CompareConfig,
+    composed: Callable[..., TrainConfig],
+    folder: Path,
+    trained_in: str,
+    overrides: list[str],
+) -> Iterator[Run]:
+    """The runs of one task, delay and method, which the folder names."""
+    task, delay, name = folder.parts[-3:]
+    method, methods = config.experiment.methods[name], config.experiment.methods
+    away = task != trained_in  # a held-out task, where nothing is trained
+    flown = method.policy_of or (name if away and not method.untrained else None)
+    trains = not (method.untrained or flown)
+    words = ["logger=csv", *overrides, *method.overrides, *config.overrides]
+    with named(_place(folder)):
+        unseeded = composed(*words)
+        late_by = [] if method.delayed else late(unseeded.make_delays())
+        if late_by and away:
+            return  # a held-out delay, under which the undelayed method is not flown
+        should = "delays this method, with which others are compared: put delays under experiment.delays"
+        checks.require(not late_by, ", ".join(late_by), "its value", should)
+        if trains:
+            able = not method.teacher or hasattr(unseeded.learner, "teacher")
+            checks.require(able, "learner", unseeded.learner.name, "has no setting teacher")
+            check_learning(unseeded)
+    source, policy = flown or method.source, None
+    for seed in config.every_seed:
+        seeded = replace(unseeded, seed=seed, overrides=[*words, f"seed={seed}"])
+        if source:
+            source_delay = delay if methods[source].delayed else NOT_LATE
+            policy = folder.parents[2] / trained_in / source_delay / source / f"seed_{seed}"
+            if flown or method.starts_from:
+                seeded = replace(seeded, checkpoint=str(policy))
+            else:
+                seeded = replace(seeded, learner=replace(seeded.learner, teacher=str(policy)))
+        stage = int(source is not None) if trains else 2
+        yield Run(train if trains else fly, seeded, folder / f"seed_{seed}", policy, stage)
 
 
 def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
@@ -111,10 +198,10 @@ def compare(config: CompareConfig, folder: Path) -> None:
         runs = _not_kept(plan(config, folder), kept)
     for run in runs:
         not_linked(run.folder, below=folder)
-        check_stored(run.config, run.folder)
+        run.check()
     try:
         if not config.report_only:
-            failed = perform_all(runs, config.processes, train, fly)
+            failed = perform_all(runs, config.processes)
     except KeyboardInterrupt:
         end_interrupted("run the same command again to continue")
     for run in failed:
@@ -122,7 +209,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
     done = [run for run in runs if run.finished]
     if failed and not done:
         sys.exit(1)
-    results = kept.with_those_of(results_of(done, config.chosen("methods")))
+    results = results_of(done, config.chosen("methods"), kept)
     if done:
         for name, rows in zip((ROWS, POINTS), results, strict=True):
             write_csv(folder / name, rows)
@@ -139,14 +226,13 @@ def compare(config: CompareConfig, folder: Path) -> None:
 def _not_kept(runs: list[Run], kept: Results) -> list[Run]:
     """The runs without kept results, or with a folder, and those whose policies they need."""
     done = {*kept.rows[RUN].itertuples(index=False, name=None)}
-    todo = [r for r in runs if (r.task, r.delay, r.method, r.config.seed) not in done or r.folder.exists()]
+    todo = [run for run in runs if tuple(names_of(run).values()) not in done or run.folder.exists()]
     needed = {run.needs for run in todo if not run.finished}
     needed |= {run.needs for run in runs if run.folder in needed}
     return [run for run in runs if run in todo or run.folder in needed]
 
 
 @cli.program("compare")
-@cli.one_line_errors("compare")
 def main(given: DictConfig) -> None:
     running = HydraConfig.get()
     folder = cli.short(Path(running.runtime.output_dir))

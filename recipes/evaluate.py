@@ -27,8 +27,7 @@ from damian.runs.training_state import load_networks
 from . import cli
 from .config import TrainConfig
 from .shared.learning import own_code
-from .shared.runs import only_named_code, save_config, start, with_policy_of
-from .shared.settings import check_components
+from .shared.runs import run_settings, save_config, start
 
 MEANING = """untrained: the same network before any training; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
@@ -87,10 +86,7 @@ def load(
         >>> rollout = env.rollout(50, policy, break_when_any_done=False)
     """
     words = [f"checkpoint='{run}'", *overrides, *["trust=true"] * trust]
-    values = cli.plain(cli.composed(*words), words)
-    with only_named_code(values):
-        config = with_policy_of(values, words)
-        check_components(config)  # imports all of the user's own that is ever needed
+    with run_settings(cli.composed(*words), words) as config:
         eval_seed = config.eval_seed if seed is None else seed
         env = make_env(config, worlds, eval_seed, config.device, ["message"])
         policy = stored_actor(config, env).eval().requires_grad_(False)

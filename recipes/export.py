@@ -124,7 +124,6 @@ def actions(config: ActionConfig, spec: TensorSpec) -> dict[str, Any]:
 
 
 @cli.program("export")
-@cli.one_line_errors("export")
 def main(given: DictConfig) -> None:
     config = cli.checked(given, [], "export")
     if config.checkpoint is None:

@@ -14,8 +14,7 @@ from damian.common.tables import markdown_table
 from damian.runs.run_folder import RESULTS
 
 from . import cli
-from .shared.comparison_runs import MARKDOWN, POINTS, stored_results
-from .shared.sweeps import compared, report, sweep_rows
+from .shared.sweeps import MARKDOWN, POINTS, compared, report, stored_results, sweep_rows
 
 
 def results(folder: str | Path) -> pd.DataFrame:
@@ -47,7 +46,6 @@ def table(folders: list[Path], score: str) -> str:
 
 
 @cli.program("results")
-@cli.one_line_errors("results")
 def main(given: DictConfig) -> None:
     config = cli.checked(given, [], "results")
     print(table([*map(Path, config.folders)], config.score))

@@ -26,8 +26,8 @@ from damian.runs.run_record import read_record
 from . import cli
 from .config import SubmitConfig, TrainConfig
 from .known import key_of
-from .shared.comparison_runs import stored_results
 from .shared.runs import changed_settings
+from .shared.sweeps import stored_results
 
 _NAMES = "agents region motion wind source requests battery reward episode clock links randomise frames"
 OF_TASKS = tuple(f"{name}." for name in f"{_NAMES} delay.obs delay.act delay.rew delay.loss".split())
@@ -102,6 +102,5 @@ def submit(config: SubmitConfig) -> None:
 
 
 @cli.program("submit")
-@cli.one_line_errors("submit")
 def main(given: DictConfig) -> None:
     submit(cli.checked(given, [], "submit"))

@@ -27,6 +27,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.errors import RunError
 from damian.common.fields import leaves
+from damian.compare.figures import plot_training
 from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
 from damian.learners.base import Learner, divergence
@@ -34,7 +35,7 @@ from damian.learners.schedule import SystemClock
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.metrics_log import MetricsLog, make_loggers
 from damian.runs.processes import Interrupt, end_interrupted
-from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
+from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, TRAINED
 from damian.runs.training_state import RandomState, TrainingState, load_networks
 from damian.server.components import not_finite
 
@@ -56,6 +57,8 @@ from .shared.learning import (
 from .shared.runs import run_folder, save_config, start, stored_values
 from .shared.settings import check_learning
 
+FIGURE = "learning_curve.png"
+
 
 def train(config: TrainConfig, folder: Path) -> None:
     """Train, evaluate, and fill the run folder."""
@@ -65,7 +68,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     require_memory(config, env, buffer)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compiles)
-    require_delayed_talk(config, collector.env, learner)
+    require_delayed_talk(config, cast(DelayedEnv, collector.env), learner)
     hindsight = hindsight_returns(config, env)
     state = TrainingState(folder, learner.components(), collector, clock, buffer, hindsight)
     begin(config, state)
@@ -97,7 +100,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         log.show(state.progress.frames, grouped("eval_deterministic/", likeliest))
     module, _, name = config.learner.name.partition(":")
     title = f"{config.agents} UAVs, {name or module.upper()}"
-    plot_learning_curve(log.rows, evaluations, folder / FIGURE, title)
+    plot_training(log.rows, evaluations, folder / FIGURE, title)
     print(f"learning curve: {folder / FIGURE}")
     print(f"fly this policy: damian fly checkpoint={shlex.quote(str(folder))}")
 

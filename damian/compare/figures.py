@@ -1,4 +1,4 @@
-"""Figures of a comparison: learning curves, scores with intervals, and performance profiles."""
+"""Figures of trainings, sweeps and comparisons: learning curves, scores with intervals, profiles."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,8 @@ from pandas.api.types import is_numeric_dtype
 from damian.common.plotting import STYLE, save_figure
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method, sign_of
 from damian.compare.statistics import Floats, bootstrap, normalised
-from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED
+from damian.runs.metrics import Evaluation
+from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED, UNTRAINED
 
 Panel = TypeVar("Panel")
 
@@ -34,6 +35,24 @@ _POINTS = 200
 """Number of points of a learning curve."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
+
+
+def plot_training(
+    rows: Sequence[Mapping[str, float]], evaluations: Mapping[str, Evaluation], path: Path, title: str
+) -> None:
+    """Draw return and success rate of a training, from the untrained policy on."""
+    table = pd.DataFrame(rows).set_index("frames")
+
+    def panel(axis: Axes, measure: str) -> None:
+        levels = {policy: row[_flown(measure)] for policy, row in evaluations.items()}
+        points = pd.concat([pd.Series({0: levels[UNTRAINED]}), table[measure].dropna()])
+        axis.plot(points, color=METHOD_COLOURS[2], marker="o", markevery=[0], label="training")
+        _over_steps(axis, measure, levels, SCRIPT)
+        axis.set(title=title)
+
+    # In hindsight, which is close to what truly happened; what is perceived may rank policies wrongly.
+    succeeds = (table["perceived_success_rate"] > 0).any()
+    save(path, [*LABELS][: 1 + succeeds], panel, (4.4, 3.2), width=2)
 
 
 def plot_curves(comparison: Comparison, path: Path) -> None:
@@ -198,10 +217,7 @@ def save(
 def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, str]) -> None:
     """Draw a measure of all methods in a task under a delay."""
     task, delay, measure = content
-    flown = "return" if measure == "hindsight_return" else measure  # of an evaluation, which knows the truth
-    axis.set(xlabel="environment steps", ylabel=LABELS[measure], title=f"{task}, delay {delay}")
-    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-    table = comparison.table.set_index(["task", "delay", "method", "policy"])[flown]
+    table = comparison.table.set_index(["task", "delay", "method", "policy"])[_flown(measure)]
     for name, method in comparison.methods.items():
         run = (task, delay if method.delayed else NOT_LATE, name)
         style: dict[str, Any] = look(comparison.methods, name) | {"marker": "", "label": name}
@@ -213,9 +229,23 @@ def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, st
         elif (level := table.get((*run, comparison.policy_of(name)))) is not None:
             style |= {"linestyle": ":"}
             axis.axhline(level, **style)
-    for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, f"{SCRIPT}, undelayed", "-.")):
-        if (level := table.get((task, NOT_LATE, policy, policy))) is not None:
-            style = _LEVEL | {"label": label, "linestyle": line}
+    levels = {policy: table.get((task, NOT_LATE, policy, policy)) for policy in (RANDOM, SCRIPT)}
+    _over_steps(axis, measure, levels, f"{SCRIPT}, undelayed")
+    axis.set(title=f"{task}, delay {delay}")
+
+
+def _flown(measure: str) -> str:
+    """The measure of an evaluation, which knows the truth, that a measure in training comes close to."""
+    return "return" if measure == "hindsight_return" else measure
+
+
+def _over_steps(axis: Axes, measure: str, levels: Mapping[str, float | None], script: str) -> None:
+    """Name the axes of learning curves, and draw the levels of the policies that learn nothing."""
+    axis.set(xlabel="environment steps", ylabel=LABELS[measure])
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, script, "-.")):
+        if (level := levels.get(policy)) is not None:  # a region may be too large for the script
+            style: dict[str, Any] = _LEVEL | {"label": label, "linestyle": line}
             axis.axhline(level, **style)
 
 

@@ -26,13 +26,14 @@ def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> p
     known = {name: declared(name) for name in measured_in(rows, score)}
     measures = [name for name, each in known.items() if name == score or "sweep" in each.tables]
     measures = [name for name in measures if name == score or succeeds or known[name].where != "success"]
-    for names, runs in rows.groupby([*groups, "policy"], sort=False):
-        labels = dict(zip([*groups, "policy"], names, strict=True))
-        group = ", ".join(f"{key}={labels[key]}" for key in groups) or "all runs"
-        line = {**labels, "group": group, "n": len(runs), **means_over_seeds(runs[measures])}
-        if groups and labels[groups[0]] != (first := rows[groups[0]].iloc[0]):
-            beside = {**labels, groups[0]: first}
-            line |= difference(runs, rows[(rows[[*beside]] == pd.Series(beside)).all(axis=1)], score)
+    by_names = dict(iter(rows.groupby([*groups, "policy"], sort=False)))
+    first = rows[groups[0]].iloc[0] if groups else None
+    for names, runs in by_names.items():
+        line = {**dict(zip([*groups, "policy"], names, strict=True)), "n": len(runs)}
+        line |= means_over_seeds(runs[measures])
+        others = by_names.get((first, *names[1:]), runs)
+        if others is not runs:
+            line |= difference(runs, others, score)
         lines.append(line)
     return pd.DataFrame(lines)
 

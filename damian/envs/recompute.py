@@ -42,8 +42,7 @@ def server_recompute(
         timeline = timeline_in_hindsight(server, steps) if timed else None
         messages = server.with_own_knowledge(messages, steps[next_key(keys.MESSAGE)])
         held = server.messages(messages)
-        remembered = {"belief": belief, "timeline": timeline}
-        outputs = server(held, elapsed, source_over, **remembered, observers=observers)
+        outputs = server(held, elapsed, source_over, belief=belief, timeline=timeline, observers=observers)
         entries = outputs.entries(reward_terms)
         if belief is not None:
             entries[keys.BELIEF] = belief

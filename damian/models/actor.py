@@ -29,9 +29,12 @@ def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
             return _module(network, keys.OBSERVATION, model, layout, out_keys)
         head = nn.Linear(model.hidden[-1], n_out)
         memory = AgentGRU(*model.make_encoder(layout), model.hidden[-1])
-        return TensorDictSequential(memory, _module(head, keys.HIDDEN, model, layout, out_keys))
+        after = _module(head, keys.HIDDEN, model, layout, out_keys)
+        return TensorDictSequential([memory, after])  # type: ignore[list-item]
 
-    return with_distribution(env, make).to(env.device)
+    actor = with_distribution(env, make)
+    actor.to(env.device)
+    return actor
 
 
 def _network(model: ModelConfig, layout: Layout, n_out: int, n_agents: int) -> nn.Module:

@@ -45,10 +45,8 @@ def end_interrupted(remedy: str = "", number: int = signal.SIGINT) -> NoReturn:
 R = TypeVar("R")
 
 
-def each_in_processes(
-    perform: Callable[[R], None], runs: Sequence[R], processes: int
-) -> Iterator[tuple[R, BaseException | None]]:
-    """Perform runs, and yield each that has ended with its error, or None.
+def each_in_processes(perform: Callable[[R], None], runs: Sequence[R], processes: int) -> Iterator[R]:
+    """Perform runs, and yield each that has ended.
 
     After Ctrl-C or SIGTERM it raises ``KeyboardInterrupt``, when every training has written a checkpoint.
     """
@@ -58,21 +56,15 @@ def each_in_processes(
             yield from _in_pool(perform, runs, processes)
         else:
             for run in runs:
-                error = None
-                try:
-                    perform(run)
-                except Exception as raised:
-                    error = raised
-                yield run, error
+                perform(run)
+                yield run
     except BrokenExecutor as error:
         raise RunError("a worker process was killed; the same command continues all runs") from error
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def _in_pool(
-    perform: Callable[[R], None], runs: Sequence[R], processes: int
-) -> Iterator[tuple[R, BaseException | None]]:
+def _in_pool(perform: Callable[[R], None], runs: Sequence[R], processes: int) -> Iterator[R]:
     waiting, futures = iter(runs), dict[Future[None], R]()
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin) as pool:
         try:
@@ -82,10 +74,8 @@ def _in_pool(
                 if not futures:
                     return
                 for future in wait(futures, return_when=FIRST_COMPLETED).done:
-                    error = future.exception()
-                    if isinstance(error, KeyboardInterrupt | BrokenExecutor):
-                        raise error
-                    yield futures.pop(future), error
+                    future.result()
+                    yield futures.pop(future)
         except KeyboardInterrupt:
             for worker in multiprocessing.active_children():  # a signal to this process alone reaches none
                 os.kill(worker.pid or 0, signal.SIGINT)

@@ -1,6 +1,6 @@
-"""Files of a run folder: their names, its lock, the learning curve, and the table of results."""
+"""Files of a run folder: their names, its lock, and the table of results."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -10,12 +10,10 @@ from filelock import FileLock, Timeout
 from damian.common import checks
 from damian.common.atomic_files import not_linked, write_atomically, writing
 from damian.common.errors import InputError
-from damian.common.plotting import save_figure
 from damian.common.tables import markdown_table, read_csv, write_csv
 from damian.runs.measures import BUILT_IN, declared
 from damian.runs.metrics import Evaluation
 
-FIGURE = "learning_curve.png"
 CHECKPOINT = "checkpoint.pt"
 BEST = "best.pt"
 REPLAY = "replay"
@@ -35,35 +33,6 @@ def check_no_links(folder: Path) -> None:
     for each in (folder, folder / REPLAY, folder / EXPORT):
         for path in each.iterdir() if each.is_dir() else ():
             not_linked(path)
-
-
-def plot_learning_curve(
-    rows: list[dict[str, float]], evaluations: Mapping[str, Evaluation], path: Path, title: str
-) -> None:
-    """Draw return and success rate over environment steps, from the untrained policy on."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, needed once)
-    from matplotlib.ticker import EngFormatter  # noqa: PLC0415
-
-    # In hindsight, which is close to what truly happened; what is perceived may rank policies wrongly.
-    panels, table = {"hindsight_return": "return"}, pd.DataFrame(rows).set_index("frames")
-    if (table["perceived_success_rate"] > 0).any():
-        panels["perceived_success_rate"] = "perceived_success_rate"
-    figure = Figure(figsize=(5 * len(panels), 3.4), layout="tight")
-    axes = figure.subplots(1, len(panels), squeeze=False)
-    for axis, (name, measure) in zip(axes[0], panels.items(), strict=True):
-        levels = {policy: each[measure] for policy, each in evaluations.items()}
-        curve = pd.concat([pd.Series({0: levels[UNTRAINED]}), table[name].dropna()])
-        axis.plot(curve, color="tab:blue", marker="o", markevery=[0], label="training")
-        for policy, style in {SCRIPT: "-.", RANDOM: "--"}.items():
-            if policy in levels:  # a region may be too large for the script
-                axis.axhline(levels[policy], color="tab:gray", linestyle=style, label=policy)
-        label = measure.removeprefix("perceived_").replace("_", " ")
-        axis.set(xlabel="environment steps, all worlds", ylabel=label)
-        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axis.grid(alpha=0.3)
-    axes[0][0].legend(loc="best", fontsize="small")
-    figure.suptitle(title, fontsize="medium")
-    save_figure(figure, path, dpi=120)
 
 
 LATE = """perceived: as far as the server knew; all else as it truly was; age: mean age of the messages at the

@@ -153,18 +153,17 @@ class Episode:
 
     def document(self) -> dict[str, Any]:
         """What a file holds of the episode, with numbers of ``DIGITS`` significant digits, times of more."""
-        fixed = {
+        return {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "about": self.about,
+            "meaning": COLUMNS,
+            **{each.name: getattr(self, each.name) for each in fields(self)},
             "region": json.loads(shapely.to_geojson(self.region)),
-            "origin": self.origin,
             "landing_points": _listed(self.landing_points),
-            "radius": self.radius,
-            "instant": self.instant,
-            "success": self.success,
+            **{name: _listed(getattr(self, name)) for name in COLUMNS},
+            "time": _listed(self.time, TIME_DIGITS),
         }
-        columns = {name: _listed(getattr(self, name)) for name in COLUMNS}
-        columns["time"] = _listed(self.time, TIME_DIGITS)
-        head = {"schema": SCHEMA, "version": VERSION, "about": self.about, "meaning": COLUMNS}
-        return {**head, **fixed, **columns}
 
     @classmethod
     def load(cls, path: Path) -> "Episode":
@@ -234,6 +233,25 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         about["charging_points"] = _listed(points[charges[: len(points)].numpy()])
     level, source = about.get("drawn", {}).get("source.level_db"), env.scenario.source
     n_sources = source.count if env.scenario.seeks_source else 0
+    columns: dict[str, Any] = {
+        "time": time,
+        "position": truth.position,
+        "target": own.target,
+        "track": own.track,
+        "battery": truth.battery,
+        "spotted": own.spotted & (n_sources > 0),
+        "source": truth.source[:, :n_sources],
+        "emits": truth.emits[:, :n_sources],
+        "sent": sent,
+        "delay": delay[..., 0],
+        "believed": held.position,
+        "age": (held.age(time) / dt).round() * dt,  # times in messages are float32
+        "reward": cast(Tensor, instants[keys.REWARD])[..., 0],
+        "cells": None if belief is None or grid is None else grid.centres.cpu(),
+        "belief": belief,
+        "requests": truth.requests if env.simulation.widths.requests else None,
+    }
+    arrays: dict[str, Any] = {name: x if x is None else np.asarray(x) for name, x in columns.items()}
     return Episode(
         about={**about, "region": over.name, "damian": damian.__version__},
         region=over.polygon,
@@ -242,23 +260,8 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         radius=footprint_radius(replace(source, level_db=level) if level else source),
         instant=vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
-        time=np.asarray(time),
-        position=np.asarray(truth.position),
-        target=np.asarray(own.target),
-        track=np.asarray(own.track),
-        battery=np.asarray(truth.battery),
-        spotted=np.asarray(own.spotted) & (n_sources > 0),
-        source=np.asarray(truth.source)[:, :n_sources],
-        emits=np.asarray(truth.emits)[:, :n_sources],
-        sent=np.asarray(sent),
-        delay=np.asarray(delay[..., 0]),
-        believed=np.asarray(held.position),
-        age=np.asarray((held.age(time) / dt).round() * dt),  # times in messages are float32
-        reward=np.asarray(cast(Tensor, instants[keys.REWARD])[..., 0]),
         reward_terms={name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()},
-        cells=None if belief is None or grid is None else np.asarray(grid.centres.cpu()),
-        belief=None if belief is None else np.asarray(belief),
-        requests=np.asarray(truth.requests) if env.simulation.widths.requests else None,
+        **arrays,
     )
 
 

@@ -1,16 +1,16 @@
 """A map and the space above it, into which films and figures draw the frames of an episode."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
-from matplotlib.patches import Circle, Patch, PathPatch
+from matplotlib.patches import Patch
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
@@ -46,16 +46,26 @@ _AROUND = np.array([(1, 0.5), (1, -0.5), (-1, 0.5), (-1, -0.5), (0, 1), (0, -1),
 
 
 class MapView:
-    """The region from above."""
+    """The region from above, into which the frames of an episode are drawn, one after the other."""
 
-    def __init__(self, axis: Axes, episode: Episode) -> None:
+    height: ClassVar[tuple[float, ...]] = ()
+    """What a place on the ground has after east and north."""
+    fill: ClassVar = (0.07, 0.26)
+    """How opaque a footprint is: of a UAV that spots no source, and of one that does."""
+    source: ClassVar[dict[str, Any]] = {"markersize": 13, "zorder": 6}
+    """Style of the marks of sources and requests."""
+    trail: ClassVar[dict[str, Any]] = {"zorder": 3}
+    """Style of the latest ways of UAVs."""
+
+    def __init__(self, axis: Any, episode: Episode) -> None:
         self.axis, self.radius = axis, episode.radius
-        style = {"facecolor": _LAND, "edgecolor": _EDGE, "linewidth": 1.2, "zorder": 0}
-        axis.add_patch(PathPatch(_outline(episode.region), **style))
-        for zone in _zones(episode):
-            axis.add_patch(PathPatch(zone, zorder=0.1, **_ZONE))
-        axis.plot(*episode.landing_points.T, ".", color=_POINT, markersize=2, zorder=1)
-        axis.plot(*_chargers(episode), linestyle="", **_CHARGES)
+        turns = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
+        self._circle = self.radius * np.stack([np.cos(turns), np.sin(turns)], -1)
+        lands = [shapely.get_coordinates(part.exterior) for part in _polygons(episode.region)]
+        self._areas(lands, facecolor=_LAND, edgecolor=_EDGE, linewidth=1.2, zorder=0)
+        self._areas(_zones(episode), zorder=0.6, **_ZONE)
+        axis.plot(*episode.landing_points.T, *self.height, ".", color=_POINT, markersize=2, zorder=1)
+        axis.plot(*_chargers(episode), *self.height, linestyle="", **_CHARGES)
         (west, south), (east, north) = limits(episode)
         axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
         axis.set(xlabel="east [m]", ylabel="north [m]")
@@ -65,60 +75,109 @@ class MapView:
     def draw(self, frame: Frame) -> list[Any]:
         """Draw a frame; returns the artists that were drawn."""
         drawn: list[Any] = []
-        if frame.cells:
-            areas = [PathPatch(_outline(area), fc=HEAT(_NORM(p)), ec="none") for area, p in frame.cells]
-            heat = PatchCollection(areas, match_original=True, zorder=0.5)
-            drawn.append(self.axis.add_collection(heat))
-        drawn += _draw_source(self.axis, frame, (), {"markersize": 13, "zorder": 6})
-        drawn += self._others([uav for uav in frame.uavs if not uav.chosen])
-        drawn += [artist for uav in frame.uavs if uav.chosen for artist in self._uav(uav)]
-        return drawn + _draw_names(self.axis, frame, lambda at: at)
+        heat = [(part, p) for area, p in frame.cells for part in _polygons(area)]
+        if heat:
+            corners = [shapely.get_coordinates(part.exterior) for part, _ in heat]
+            colours = [HEAT(_NORM(probability)) for _, probability in heat]
+            drawn.append(self._areas(corners, facecolor=colours, edgecolor="none", zorder=0.5))
+        for place in frame.requests:
+            drawn += self._plot(place, "s", "none", INK, **{**self.source, "markersize": 7})
+        for place, emits in frame.sources:
+            drawn += self._plot(place, "*", INK if emits else "white", INK, **self.source)
+        others = [uav for uav in frame.uavs if not uav.chosen]
+        if others:  # small, and the denser their footprints, the darker
+            shades = [to_rgba(OTHER, 0.3 if uav.spots else 0.09) for uav in others]
+            drawn.append(self._areas(list(map(self._print, others)), facecolor=shades, lw=0, zorder=1.5))
+            drawn += self._marks_of_others(others)
+        for uav in frame.uavs:
+            drawn += self._uav(uav) if uav.chosen else []
+        return drawn + self._names(frame)
 
-    def _others(self, uavs: list[Uav]) -> list[Any]:
-        """Draw the UAVs that are not told apart: small, and the denser their footprints, the darker."""
-        if not uavs:
-            return []
-        places = [uav.path[-1, :2] for uav in uavs]
-        prints = [Circle(tuple(place), self.radius) for place in places]
-        density = PatchCollection(prints, facecolor=_shades(uavs), linewidth=0, zorder=1.5)
-        marks = self.axis.scatter(*np.transpose(places), s=_SMALL**2, color=OTHER, zorder=3.5)
-        marks.set_paths([DART.transformed(Affine2D().rotate(-uav.heading).scale(0.5)) for uav in uavs])
-        return [self.axis.add_collection(density), marks]
+    def _plot(self, place: Floats, marker: str, fill: str, color: str, **style: Any) -> list[Any]:
+        """Mark a place on the ground, [2]."""
+        return self.axis.plot(*place, *self.height, marker, color=color, markerfacecolor=fill, **style)
+
+    def _print(self, uav: Uav) -> Floats:
+        """Corners of a footprint, [C, 2]."""
+        return uav.path[-1, :2] + self._circle
 
     def _uav(self, uav: Uav) -> list[Any]:
         """Draw a UAV with its path and footprint, and where the server believes it to be."""
-        colour, axis, true = uav.colour, self.axis, uav.path[-1, :2]
-        strength, edge = (0.26, 1.6) if uav.spots else (0.07, 0.5)
-        inside = Circle(tuple(true), self.radius, facecolor=colour, alpha=strength, linewidth=0, zorder=2)
-        ring = Circle(tuple(true), self.radius, fill=False, edgecolor=colour, linewidth=edge, zorder=2.1)
-        parts, fading = _trail(uav.path[:, :2])
-        trail = LineCollection(parts, colors=colour, alpha=fading, linewidths=1.6, zorder=3)
-        drawn: list[Any] = [axis.add_collection(trail), axis.add_patch(inside), axis.add_patch(ring)]
-        dart = DART.transformed(Affine2D().rotate(-uav.heading))
-        style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
-        drawn += axis.plot(*true, marker=dart, color=colour, **style)
+        inside = to_rgba(uav.colour, self.fill[uav.spots])
+        edge = {"edgecolor": uav.colour, "linewidth": 1.6 if uav.spots else 0.5}
+        drawn = [self._areas([self._print(uav)], facecolor=inside, zorder=2, **edge)]
+        parts = list(np.stack([uav.path[:-1], uav.path[1:]], 1))
+        if parts:
+            fading = np.linspace(0.1, 0.7, len(parts))
+            drawn.append(self._ways(parts, colors=uav.colour, alpha=fading, linewidths=1.6, **self.trail))
+        drawn += self._mark_of(uav)
         if uav.age > 0:
-            drawn += axis.plot(*np.stack([true, uav.believed]).T, ":", color=colour, linewidth=1.1, zorder=3)
-            hollow = {"markerfacecolor": "none", "markersize": 12, "markeredgewidth": 1.5, "zorder": 4}
-            drawn += axis.plot(*uav.believed, "o", color=colour, **hollow)
+            ring = {"markersize": 12, "markeredgewidth": 1.5, "zorder": 4}
+            drawn += self._plot(uav.believed, "o", "none", uav.colour, **ring)
         return drawn
 
+    def _names(self, frame: Frame) -> list[Any]:
+        """Name UAVs and rings where their names cover least."""
+        axis = self.axis
+        axis.apply_aspect()
+        uavs = [uav for uav in frame.uavs if uav.chosen]
+        named = [(uav, uav.path[-1], _short(uav.id)) for uav in uavs]
+        named += [(uav, uav.believed, f"{_short(uav.id)}, {uav.age:g} s") for uav in uavs if uav.age > 0]
+        shown = np.array([self._seen(place) for _, place, _ in named])
+        points = axis.transData.transform(shown) * 72 / axis.figure.dpi
+        covered = [np.stack([points - 5, points + 5], 1)]
+        drawn: list[Any] = []
+        for (uav, _, text), anchor, place in zip(named, shown, points, strict=True):
+            half = np.array([2.4 * len(text), 4.0])
+            middles = place + np.concatenate([_AROUND * (half + near) for near in (5, 13, 24)])
+            middles = middles.clip(half, np.multiply(axis.figure.bbox.size, 72 / axis.figure.dpi) - half)
+            boxes = np.stack([middles - half, middles + half], 1)
+            low, high = np.concatenate(covered).transpose(1, 0, 2)
+            common = np.minimum(boxes[:, None, 1], high) - np.maximum(boxes[:, None, 0], low)
+            best = int(common.clip(0).prod(-1).sum(-1).round().argmin())
+            covered.append(boxes[best : best + 1])
+            line = {"arrowstyle": "-", "color": uav.ink, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 3}
+            style: dict[str, Any] = {"color": uav.ink, "arrowprops": line, "ha": "center", "va": "center"}
+            drawn.append(axis.annotate(text, tuple(anchor), tuple(middles[best] - place), **style, **_NAME))
+        return drawn
 
-class SpaceView:
+    def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
+        return self.axis.add_collection(PolyCollection(corners, **style))
+
+    def _ways(self, parts: Sequence[Floats], **style: Any) -> Any:
+        return self.axis.add_collection(LineCollection([part[:, :2] for part in parts], **style))
+
+    def _marks_of_others(self, uavs: list[Uav]) -> list[Any]:
+        places = np.transpose([uav.path[-1, :2] for uav in uavs])
+        marks = self.axis.scatter(*places, s=_SMALL**2, color=OTHER, zorder=3.5)
+        marks.set_paths([DART.transformed(Affine2D().rotate(-uav.heading).scale(0.5)) for uav in uavs])
+        return [marks]
+
+    def _mark_of(self, uav: Uav) -> list[Any]:
+        """A dart that points where the UAV flies, and a line to where the server believes it to be."""
+        true, dart = uav.path[-1, :2], DART.transformed(Affine2D().rotate(-uav.heading))
+        style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
+        drawn = self.axis.plot(*true, marker=dart, color=uav.colour, **style)
+        if uav.age > 0:
+            line = {"color": uav.colour, "linewidth": 1.1, "zorder": 3}
+            drawn += self.axis.plot(*np.stack([true, uav.believed]).T, ":", **line)
+        return drawn
+
+    def _seen(self, place: Floats) -> Floats:
+        return place[:2]
+
+
+class SpaceView(MapView):
     """The region and the space above it, which turns slowly; ``room`` is what it may fill [px], [2]."""
 
+    height, fill = (0.0,), (0.12, 0.35)
+    source: ClassVar = {"markersize": 12, "zorder": 5}
+    trail: ClassVar = {"zorder": 6}
+
     def __init__(self, axis: Any, episode: Episode, room: Floats) -> None:
-        self.axis, self.radius = axis, episode.radius
-        self.dt = float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
-        self._turn = lambda steps: axis.view_init(elev=34, azim=-65 + TURN * steps)
+        super().__init__(axis, episode)
+        self._dt = _step_of(episode)
         axis.computed_zorder = False  # the middle of the large ground says nothing about what it hides
-        for part in shapely.get_parts(episode.region):
-            shell, *holes = [shapely.get_coordinates(ring) for ring in shapely.get_rings(part)]
-            land = {"facecolor": _LAND, "edgecolor": _EDGE, "linewidth": 1.0}
-            for ring, style in [(shell, land), *((hole, _ZONE) for hole in holes)]:
-                axis.add_collection3d(Poly3DCollection([_on_ground(ring)], zorder=0, **style))
-        axis.plot(*episode.landing_points.T, 0, ".", color=_POINT, markersize=1.5, zorder=1)
-        axis.plot(*_chargers(episode), 0, linestyle="", **_CHARGES)
         (west, south), (east, north) = limits(episode)
         size, highest = np.array([east - west, north - south]), float(episode.position[..., 2].max())
         height = 1.1 * max(highest, 0.001 * size.max())
@@ -132,25 +191,12 @@ class SpaceView:
         self.scale = f"{size[0]:.0f} m x {size[1]:.0f} m{heights}"
 
     def draw(self, frame: Frame) -> list[Any]:
-        """Draw a frame; returns the artists that were drawn."""
-        self._turn(frame.time / self.dt)
-        pieces = [
-            (_on_ground(shapely.get_coordinates(part.exterior)), HEAT(_NORM(probability)))
-            for area, probability in frame.cells
-            for part in _polygons(area)
-        ]
-        drawn: list[Any] = []
-        if pieces:
-            corners, colours = zip(*pieces, strict=True)
-            heat = Poly3DCollection(corners, facecolor=colours, zorder=0.5)
-            drawn.append(self.axis.add_collection3d(heat))
-        drawn += _draw_source(self.axis, frame, (0,), {"markersize": 12, "zorder": 5})
-        drawn += self._others([uav for uav in frame.uavs if not uav.chosen])
-        drawn += [artist for uav in frame.uavs if uav.chosen for artist in self._uav(uav)]
-        seen = self.axis.get_proj()
-        return drawn + _draw_names(
-            self.axis, frame, lambda at: proj_transform(at[0], at[1], at[2:].sum(), seen)
-        )
+        """Draw a frame, as it is seen by then; returns the artists that were drawn."""
+        self._turn(frame.time / self._dt)
+        return super().draw(frame)
+
+    def _turn(self, steps: float) -> None:
+        self.axis.view_init(elev=34, azim=-65 + TURN * steps)
 
     def _fit(self, corners: Floats, shape: Floats, room: Floats) -> None:
         """Draw a box of this shape so large that these corners in it, [3, C], are always in the room."""
@@ -163,43 +209,31 @@ class SpaceView:
             far.append(np.abs(axis.transData.transform(seen) - np.mean(axis.bbox, 0)).max(0))
         axis.set_box_aspect(shape, zoom=float((room / 2 / np.max(far, 0)).min()))
 
-    def _others(self, uavs: list[Uav]) -> list[Any]:
-        """Draw the UAVs that are not told apart: small, and the denser their footprints, the darker."""
-        if not uavs:
-            return []
-        prints = [_on_ground(self._print(uav)) for uav in uavs]
-        density = Poly3DCollection(prints, facecolor=_shades(uavs), linewidth=0, zorder=1.5)
-        places = np.transpose([uav.path[-1] for uav in uavs])
+    def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
+        ground = [np.column_stack([each, np.zeros(len(each))]) for each in corners]
+        return self.axis.add_collection3d(Poly3DCollection(ground, **style))
+
+    def _ways(self, parts: Sequence[Floats], **style: Any) -> Any:
+        return self.axis.add_collection3d(Line3DCollection(parts, **style))
+
+    def _marks_of_others(self, uavs: list[Uav]) -> list[Any]:
         style = {"color": OTHER, "markersize": 0.5 * _SMALL, "zorder": 3.5}
-        return [self.axis.add_collection3d(density), *self.axis.plot(*places, "o", **style)]
+        return self.axis.plot(*np.transpose([uav.path[-1] for uav in uavs]), "o", **style)
 
-    def _print(self, uav: Uav) -> Floats:
-        """Corners of a footprint, [C, 2]."""
-        turns = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
-        return uav.path[-1, :2] + self.radius * np.stack([np.cos(turns), np.sin(turns)], -1)
-
-    def _uav(self, uav: Uav) -> list[Any]:
-        """Draw a UAV with its path, what it stands above, and where the server believes it to be."""
-        colour, axis, (x, y, z) = uav.colour, self.axis, uav.path[-1]
-        ground = [_on_ground(self._print(uav))]
-        footprint = Poly3DCollection(ground, facecolor=colour, alpha=0.35 if uav.spots else 0.12, zorder=2)
-        drawn: list[Any] = [axis.add_collection3d(footprint)]
-        drawn += axis.plot([x, x], [y, y], [0, z], color=colour, lw=0.8, zorder=6)
-        parts, fading = _trail(uav.path)
-        if parts:
-            trail = Line3DCollection(parts, colors=colour, alpha=fading, linewidths=1.6, zorder=6)
-            drawn.append(axis.add_collection3d(trail))
+    def _mark_of(self, uav: Uav) -> list[Any]:
+        """A ball, and a line down to what the UAV stands above."""
+        x, y, z = uav.path[-1]
+        drawn = self.axis.plot([x, x], [y, y], [0, z], color=uav.colour, lw=0.8, zorder=6)
         style = {"markersize": 8, "markeredgecolor": uav.edge, "markeredgewidth": 0.8, "zorder": 7}
-        drawn += axis.plot(x, y, z, "o", color=colour, **style)
-        if uav.age > 0:
-            hollow = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 1.5, "zorder": 4}
-            drawn += axis.plot(*uav.believed, 0, "o", color=colour, **hollow)
-        return drawn
+        return drawn + self.axis.plot(x, y, z, "o", color=uav.colour, **style)
+
+    def _seen(self, place: Floats) -> Floats:
+        return np.array(proj_transform(place[0], place[1], place[2:].sum(), self.axis.get_proj())[:2])
 
 
 def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> None:
     """Draw a row for each of these UAVs, in its colour, with its messages over the time of sending."""
-    dt = float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
+    dt = _step_of(episode)
     for row, (uav, colour) in enumerate(colours.items()):
         sent = np.flatnonzero(episode.sent[:, uav])
         begin, delay = episode.time[sent], episode.delay[sent, uav]
@@ -253,75 +287,20 @@ def legend_marks(episode: Episode, n_chosen: int | None = None) -> list[Any]:
     return marks
 
 
-def _draw_source(axis: Any, frame: Frame, height: tuple[float, ...], style: dict[str, Any]) -> list[Any]:
-    """Draw the sources, filled while they emit, if anybody knows them, and the open requests."""
-    drawn = []
-    for place in frame.requests:
-        drawn += axis.plot(
-            *place, *height, "s", color=INK, markerfacecolor="none", **style | {"markersize": 7}
-        )
-    for place, emits in frame.sources:
-        fill = INK if emits else "white"
-        drawn += axis.plot(*place, *height, "*", color=INK, markerfacecolor=fill, **style)
-    return drawn
-
-
-def _draw_names(axis: Axes, frame: Frame, flat: Any) -> list[Any]:
-    """Name UAVs and rings where their names cover least; ``flat`` tells where the picture shows a place."""
-    axis.apply_aspect()
-    uavs = [uav for uav in frame.uavs if uav.chosen]
-    rings = [(uav, uav.believed, f"{_short(uav.id)}, {uav.age:g} s") for uav in uavs if uav.age > 0]
-    named = [*((uav, uav.path[-1], _short(uav.id)) for uav in uavs), *rings]
-    shown = np.array([flat(place)[:2] for _, place, _ in named])
-    points = axis.transData.transform(shown) * 72 / axis.figure.dpi
-    covered = [np.stack([points - 5, points + 5], 1)]
-    drawn: list[Any] = []
-    for (uav, _, text), anchor, place in zip(named, shown, points, strict=True):
-        half = np.array([2.4 * len(text), 4.0])
-        middles = place + np.concatenate([_AROUND * (half + near) for near in (5, 13, 24)])
-        middles = middles.clip(half, np.multiply(axis.figure.bbox.size, 72 / axis.figure.dpi) - half)
-        boxes = np.stack([middles - half, middles + half], 1)
-        low, high = np.concatenate(covered).transpose(1, 0, 2)
-        common = np.minimum(boxes[:, None, 1], high) - np.maximum(boxes[:, None, 0], low)
-        best = int(common.clip(0).prod(-1).sum(-1).round().argmin())
-        covered.append(boxes[best : best + 1])
-        line = {"arrowstyle": "-", "color": uav.ink, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 3}
-        style: dict[str, Any] = {"color": uav.ink, "arrowprops": line, "ha": "center", "va": "center"}
-        drawn.append(axis.annotate(text, tuple(anchor), tuple(middles[best] - place), **style, **_NAME))
-    return drawn
-
-
-def _trail(path: Floats) -> tuple[list[Floats], Floats | None]:
-    """The parts of a path [P, D], [2, D] each, and how strong each is drawn."""
-    parts = list(np.stack([path[:-1], path[1:]], 1))
-    return parts, np.linspace(0.1, 0.7, len(parts)) if parts else None
-
-
-def _shades(uavs: list[Uav]) -> list[Any]:
-    """Colours of the footprints of UAVs that are not told apart."""
-    return [to_rgba(OTHER, 0.3 if uav.spots else 0.09) for uav in uavs]
-
-
-def _on_ground(corners: Floats) -> Floats:
-    """Places [C, 2] as points on the ground, [C, 3]."""
-    return np.column_stack([corners, np.zeros(len(corners))])
-
-
 def _polygons(area: Any) -> list[shapely.Polygon]:
     """The polygons of a geometry; where a cell touches a border, it may have lines or points too."""
     return [part for part in shapely.get_parts(area) if part.geom_type == "Polygon" and not part.is_empty]
 
 
-def _outline(area: Any) -> Path:
-    """A region, or a part of it, with its holes as a path."""
-    rings = shapely.get_rings(shapely.orient_polygons(_polygons(area)))
-    return Path.make_compound_path(*[Path(shapely.get_coordinates(ring), closed=True) for ring in rings])
-
-
-def _zones(episode: Episode) -> list[Path]:
-    """The holes of the region, which are its no-fly zones."""
+def _zones(episode: Episode) -> list[Floats]:
+    """Corners of the holes of the region, which are its no-fly zones, [C, 2] each."""
     holes = [hole for part in _polygons(episode.region) for hole in part.interiors]
-    return [Path(shapely.get_coordinates(hole), closed=True) for hole in holes]
+    return [shapely.get_coordinates(hole) for hole in holes]
+
+
+def _step_of(episode: Episode) -> float:
+    """Time between two instants [s]."""
+    return float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
 
 
 def _chargers(episode: Episode) -> Floats:

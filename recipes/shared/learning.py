@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from damian import keys
 from damian.common import checks
@@ -67,7 +67,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     return learner
 
 
-def require_delayed_talk(config: TrainConfig, env: EnvBase, learner: Learner) -> None:
+def require_delayed_talk(config: TrainConfig, env: DelayedEnv, learner: Learner) -> None:
     """Refuse an actor by which UAVs read at once in each other's rows what these know late or never."""
     own, links = config.observation.own and env.delays.obs.late, config.links.kind
     if config.learner.talks or not (own or links != "server"):

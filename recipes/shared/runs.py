@@ -1,12 +1,15 @@
-"""Runs in their folders: starting and resuming them, and taking settings and policy of a stored one."""
+"""Runs in their folders, each alone or one of many: how they begin, go on and are refused.
+
+A run may also take settings and policy of a stored one.
+"""
 
 import json
 import random
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields, replace
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +22,8 @@ from omegaconf import DictConfig
 
 from damian.common.atomic_files import not_linked, remove_unfinished, write_atomically
 from damian.common.devices import keep_freed_memory
-from damian.common.errors import InputError, RunError
-from damian.common.fields import default_of, filled, has, leaves, nested, set_at, value_at
+from damian.common.errors import InputError
+from damian.common.fields import filled, has, leaves, nested, set_at, value_at
 from damian.common.registry import stored_settings
 from damian.common.text_files import read_text, show
 from damian.learners.config import LearnerConfig
@@ -29,7 +32,7 @@ from damian.runs.run_folder import CHECKPOINT, CONFIG, FAILED, RESULTS, check_no
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
 
-from ..cli import ERRORS, Work, command, one_line_errors, options_in, plain, reason, short
+from ..cli import EXPECTED, Work, command, options_in, plain, reason, short
 from ..config import TrainConfig
 from ..known import SCHEMAS, key_of, known_settings
 from .settings import check_components
@@ -42,59 +45,123 @@ POLICY = "policy_sha256"
 """Entry of a run that begins with a stored policy: the SHA-256 of its checkpoint."""
 
 
-def start(work: Work, given: DictConfig, program: str = "train") -> None:
-    """Do the work of a program with what Hydra has composed, in the folder that Hydra has made.
+@dataclass(frozen=True)
+class Run:
+    """A run in its folder: one that has begun goes on, and one that is finished is not repeated."""
 
-    A run of a sweep goes on with what is there, and keeps what goes wrong in its folder, so that the others
-    go on.
-    """
+    work: Work
+    config: TrainConfig
+    folder: Path
+    needs: Path | None = None
+    """Folder of the run whose policy this one flies, starts from, or imitates, if it does so."""
+    stage: int = 0
+    """Runs of a later stage need some of the earlier ones."""
+
+    @property
+    def name(self) -> str:
+        return "/".join(self.folder.parts[-4:])
+
+    @property
+    def finished(self) -> bool:
+        """Whether the folder holds results, and of the policy that the checkpoint holds now."""
+        return (self.folder / RESULTS).exists() and self._same_policy
+
+    @property
+    def _same_policy(self) -> bool:
+        policy = read_record(self.folder).get(POLICY)
+        return policy is None or policy == digest(checkpoint_file(Path(str(self.config.checkpoint))))
+
+    def check(self) -> None:
+        """Check that the folder has no links, and is empty or holds a run with the same settings."""
+        check_no_links(self.folder)
+        if not (self.folder / CONFIG).exists():
+            return
+        for key, old, new in changed_settings(self.config, self.folder, "hydra.run.dir"):
+            if key not in ("resume", "checkpoint", "learner.teacher", "trust"):
+                raise InputError(
+                    f"{self.folder}: {key} is {old} in this stored run, and {new} is asked "
+                    "for: delete the folder, or choose another one with hydra.run.dir"
+                )
+
+    def carry_out(self) -> None:
+        """Do the work, or what is missing of it, after a check of what is there."""
+        if self.needs is not None and not (self.needs / RESULTS).exists():
+            raise InputError(f"checkpoint: {self.needs} has no finished policy")
+        self.check()
+        if not self.finished:
+            self.perform()
+
+    def perform(self, key: str = "hydra.run.dir") -> None:
+        """Do the work in one thread with the run's seed; the setting ``key`` names the folder."""
+        torch.set_num_threads(1)
+        keep_freed_memory()
+        seed_generators(self.config.seed)
+        config, folder = self.config, self.folder
+        if config.region.zones and config.motion.kind == "instant":
+            print(f"note: {CROSSES_ZONES}")
+        with locked(folder, key):
+            if (folder / CONFIG).exists() and (folder / CHECKPOINT).exists() and self._same_policy:
+                config = replace(config, resume=str(folder))
+            if not config.resume:
+                (folder / RESULTS).unlink(missing_ok=True)  # those of a policy that is not there any more
+            remove_unfinished(folder)
+            with timed(folder):
+                self.work(config, folder)
+        print(f"results: {folder}")
+
+
+def start(work: Work, given: DictConfig, program: str = "train") -> None:
+    """Do the work of a program with what Hydra has composed, in the folder that Hydra has made."""
     running = HydraConfig.get()
     folder, words = short(Path(running.runtime.output_dir)), [*running.overrides.task]
-    if running.mode is not RunMode.MULTIRUN:
-        with one_line_errors(program):
-            _carry_out(work, plain(given, words, program), words, program, folder)
-        return
-    not_linked(folder, below=short(Path(running.sweep.dir).absolute()))
+    of_sweep = running.mode is RunMode.MULTIRUN
+    if of_sweep:
+        not_linked(folder, below=short(Path(running.sweep.dir).absolute()))
+    errors = errors_kept_in(folder, words, program) if of_sweep else nullcontext()
+    with errors, run_settings(given, words, program) as config:
+        if program == "train" and config.resume:
+            Run(work, config, Path(config.resume)).perform("resume")
+        elif of_sweep:
+            Run(work, config, folder).carry_out()
+        else:
+            if (folder / CONFIG).exists():
+                remedy = f"choose another folder, or continue the run with resume={folder}"
+                raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
+            Run(work, config, folder).perform()
+
+
+@contextmanager
+def errors_kept_in(folder: Path, words: Sequence[str], program: str = "train") -> Iterator[None]:
+    """Keep what goes wrong with one of many runs in its folder, so that the others go on."""
     try:
         (folder / FAILED).unlink(missing_ok=True)
-        _carry_out(work, plain(given, words, program), words, program, folder, of_sweep=True)
-    except Exception as error:  # a run of a sweep stands alone, whatever its settings and the user's code do
-        if not isinstance(error, (InputError, RunError, OSError, *ERRORS)):
+        yield
+    except Exception as error:  # a run stands alone, whatever its settings and the user's code do
+        if not isinstance(error, EXPECTED):
             traceback.print_exc()
         line = reason(error, program) or type(error).__name__
         print(f"failed: {folder}: {line}", file=sys.stderr)
-        write_atomically(folder / FAILED, json.dumps({OVERRIDES: words, "error": line}) + "\n")
+        write_atomically(folder / FAILED, json.dumps({OVERRIDES: [*words], "error": line}) + "\n")
 
 
-def _carry_out(
-    work: Work, values: Any, words: list[str], program: str, folder: Path, of_sweep: bool = False
-) -> None:
-    with only_named_code(values):
-        resumes = program == "train" and values["resume"] is not None
-        if resumes:
-            folder = short(Path(values["resume"]))
-            config: Any = resumed(folder, values, words)
-        elif values.get("checkpoint") is None:
-            config = filled(SCHEMAS[program], values)
-        else:
+@contextmanager
+def run_settings(given: DictConfig, words: Sequence[str], program: str = "train") -> Iterator[Any]:
+    """The settings of a run, from what Hydra has composed and, if the words name one, from a stored run.
+
+    If they name a file of settings, only code that the words name too is imported while those are in use.
+    """
+    values = plain(given, words, program)
+    from_file = any(values.get(key) for key in ("checkpoint", "resume", "journal"))
+    with stored_settings([*texts(values)], bool(values["trust"])) if from_file else nullcontext():
+        if program == "train" and values["resume"] is not None:
+            config: Any = resumed(short(Path(values["resume"])), values, words)
+        elif values.get("checkpoint") is not None:
             config = with_policy_of(values, words, program)
-        config.overrides = words
+        else:
+            config = filled(SCHEMAS[program], values)
+        config.overrides = [*words]
         check_components(config)
-        if not resumes and (folder / CONFIG).exists():
-            if not of_sweep:
-                remedy = f"choose another folder, or continue the run with resume={folder}"
-                raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
-            check_stored(config, folder)
-            if finished(config, folder):
-                return
-        perform(config, folder, work, "resume" if resumes else "hydra.run.dir")
-
-
-def only_named_code(values: Mapping[str, Any]) -> AbstractContextManager[None]:
-    """While a run takes settings from a file, only code that the present command line names is imported."""
-    if not any(values.get(key) for key in ("checkpoint", "resume")):
-        return nullcontext()
-    return stored_settings([*texts(values)], bool(values["trust"]))
+        yield config
 
 
 def texts(values: Any) -> Iterator[str]:
@@ -104,16 +171,6 @@ def texts(values: Any) -> Iterator[str]:
     elif isinstance(values, Mapping | Sequence):
         for each in values.values() if isinstance(values, Mapping) else values:
             yield from texts(each)
-
-
-def finished(config: TrainConfig, folder: Path) -> bool:
-    """Whether a folder holds the results of a run, and of the policy that its checkpoint holds now."""
-    return (folder / RESULTS).exists() and _same_policy(config, folder)
-
-
-def _same_policy(config: TrainConfig, folder: Path) -> bool:
-    policy = read_record(folder).get(POLICY)
-    return policy is None or policy == digest(checkpoint_file(Path(str(config.checkpoint))))
 
 
 def changed_settings(config: TrainConfig, folder: Path, key: str) -> Iterator[tuple[str, Any, Any]]:
@@ -127,44 +184,10 @@ def changed_settings(config: TrainConfig, folder: Path, key: str) -> Iterator[tu
             yield name, old, new
 
 
-def check_stored(config: TrainConfig, folder: Path) -> None:
-    """Check that a run folder has no links, and is empty or holds a run with the same settings."""
-    check_no_links(folder)
-    if not (folder / CONFIG).exists():
-        return
-    for key, old, new in changed_settings(config, folder, "hydra.run.dir"):
-        if key not in ("resume", "checkpoint", "learner.teacher", "trust"):
-            raise InputError(
-                f"{folder}: {key} is {old} in this stored run, and {new} is asked "
-                "for: delete the folder, or choose another one with hydra.run.dir"
-            )
-
-
 CROSSES_ZONES = (
     "with motion=instant nobody lands in a no-fly zone, but ways cross it (motion=polynomial: around it)"
 )
 """What is said of jumps, which take no way at all."""
-
-
-def perform(config: TrainConfig, folder: Path, work: Work, key: str = "hydra.run.dir") -> None:
-    """Do the work of a program in one thread with the seed of its settings; a run goes on that has begun.
-
-    ``key`` is the setting that names the folder.
-    """
-    torch.set_num_threads(1)
-    keep_freed_memory()
-    seed_generators(config.seed)
-    if config.region.zones and config.motion.kind == "instant":
-        print(f"note: {CROSSES_ZONES}")
-    with locked(folder, key):
-        if (folder / CONFIG).exists() and (folder / CHECKPOINT).exists() and _same_policy(config, folder):
-            config = replace(config, resume=str(folder))
-        if not config.resume:
-            (folder / RESULTS).unlink(missing_ok=True)  # those of a policy that is not there any more
-        remove_unfinished(folder)
-        with timed(folder):
-            work(config, folder)
-    print(f"results: {folder}")
 
 
 def seed_generators(seed: int) -> None:
@@ -244,13 +267,12 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
     Words lie over what is stored: a group's option replaces the settings that its options set, a key its
     value. What is not mentioned stays, and so do the histories that the policy observes.
     """
-    folder = run_folder(Path(values["checkpoint"]))
-    stored = stored_config(folder, "checkpoint")
+    stored = stored_config(run_folder(Path(values["checkpoint"])), "checkpoint")
     merged = nested(stored)
-    common = [(each.name, default_of(each)) for each in fields(TrainConfig)]
-    own = {f.name for f in fields(SCHEMAS[program]) if (f.name, default_of(f)) not in common}
     kept = {key: value_at(merged, key) for key in ("delay.history", "delay.messages")}
-    given = {key_of(word).partition("@")[0] for word in words} | (own & {*values})
+    kinds = [kind for kind in SCHEMAS[program].__mro__ if kind not in TrainConfig.__mro__]
+    own = {name for kind in kinds for name in kind.__annotations__}  # what only this program has
+    given = {key_of(word).partition("@")[0] for word in words} | own
     mentioned = {"checkpoint", "resume", "trust"}.union(*(reach(key, program) for key in given))
     for key in sorted(mentioned):  # a section before its keys
         set_at(merged, key, value_at(values, key))

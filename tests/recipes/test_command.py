@@ -47,6 +47,7 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
     ("words", "message"),
     [
         (["trian"], "trian: no such program; the programs are train, evaluate"),
+        (["train", ""], ": this word is not of the form KEY=VALUE"),
         (["train", "agents"], "agents: this word is not of the form KEY=VALUE"),
         (["train", "+delay.obz=1"], "delay.obz: unknown setting; did you mean delay.obs?"),
         (["train", "num_envs=8"], "num_envs: unknown setting; did you mean worlds?"),

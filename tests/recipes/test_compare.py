@@ -13,9 +13,9 @@ from helpers import check_refused
 
 from damian.compare.comparison import TRAINED, Method
 from damian.compare.config import CompareConfig, Experiment, HeldOut
-from damian.recipes.compare import includes
-from damian.recipes.shared.comparison_runs import plan
+from damian.recipes.compare import includes, plan
 from damian.recipes.shared.runs import POLICY
+from damian.recipes.train import train
 from damian.runs.checkpoint import digest
 from damian.runs.run_folder import locked
 from damian.runs.run_record import read_record
@@ -201,6 +201,7 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
         compare(*words, "processes=2", "hydra.run.dir=runs/usecases/other")
     assert stopped.value.code == 1
     assert "failed: usecase2/none/undelayed/seed_8; see " in capsys.readouterr().err
+    assert (broken / "failed.json").exists()
     assert "missing: usecase2/none/undelayed/seed_8" in (folder / "other" / "table.md").read_text()
 
 
@@ -264,11 +265,12 @@ def test_runs_go_seed_by_seed_and_a_held_out_delay_replaces_the_one_of_the_train
     experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, methods, held_out, first_seed=3)
     config = CompareConfig(experiment, seeds=2)
     runs = plan(config, Path("runs"))
+    trains = [run for run in runs if run.work is train]
     trained = [
         f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
     ]
-    assert [run.name for run in runs if run.trains] == trained
-    flown = {(run.task, run.method): run.config.delay.obs for run in runs if not run.trains}
+    assert [run.name for run in trains] == trained
+    flown = {run.folder.parts[1:-1:2]: run.config.delay.obs for run in runs if run not in trains}
     assert flown.keys() == {("b", "flown"), ("a@six", "naive"), ("a@burst", "naive")}
     assert (flown["a@six", "naive"], flown["a@burst", "naive"]["law"]) == (6, "burst")
     stored = pd.DataFrame({"task": ["a@six", "a@seven"], "delay": "late", "method": "naive", "seed": 3})

@@ -11,11 +11,14 @@ import pytest
 from stopped_runs import counted_updates, killed_after
 
 import damian
+from damian.common.errors import InputError
 from damian.compare.paired import difference
 from damian.compare.statistics import probability_of_improvement
 from damian.learners.mappo import Mappo
 from damian.recipes import cli
 from damian.recipes.command import main
+from damian.recipes.shared.runs import Run
+from damian.recipes.shared.sweeps import perform_all
 
 TINY = ["frames=64", "worlds=2", "learner.steps=16", "eval_episodes=2", "model.hidden=[4]", "logger=csv"]
 TINY += ["region.lattice_step=90", "episode.max_steps=8", "learner.minibatches=1", "agents=1"]
@@ -79,6 +82,27 @@ def test_the_same_command_goes_on_with_what_is_missing_after_a_kill(sweep, capsy
     assert sweep(*words) == 1
     error = json.loads((folder / "seed-2" / "failed.json").read_text())["error"]
     assert "seed-2: seed is 1 in this stored run, and 2 is asked for: delete the folder" in error
+
+
+def test_of_many_runs_one_that_fails_is_kept_and_the_others_go_on(tmp_path):
+    done = []
+
+    def work(config, folder):
+        done.append(folder.name)
+        if folder.name == "wrong" and len(done) < 4:
+            raise InputError("frames: of the user's own code")
+        (folder / "result.csv").touch()
+
+    config, names = cli.settings("agents=1"), ["first", "wrong", "last"]
+    runs = [Run(work, config, tmp_path / name) for name in names]
+    runs.append(Run(work, config, tmp_path / "later", needs=tmp_path / "wrong", stage=1))
+    assert [run.folder.name for run in perform_all(runs, 1)] == ["wrong", "later"]
+    told = [json.loads((tmp_path / name / "failed.json").read_text())["error"] for name in ("wrong", "later")]
+    assert told == ["frames: of the user's own code", f"checkpoint: {tmp_path}/wrong has no finished policy"]
+    assert told[0] in (tmp_path / "wrong" / "log.txt").read_text()
+    assert perform_all(runs, 1) == []
+    assert done == [*names, "wrong", "later"]
+    assert not [*tmp_path.glob("*/failed.json")]
 
 
 def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, capsys):
