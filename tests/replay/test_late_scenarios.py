@@ -21,7 +21,7 @@ from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.world.config import RequestConfig, SourceConfig
+from damian.world.config import MotionConfig, RequestConfig, SourceConfig
 
 STEPS, WORLDS, LONGEST = 40, 4, 5
 LATE = {"law": "uniform", "low": 0, "high": LONGEST}
@@ -71,7 +71,8 @@ def backupdated(
     return late, in_order(buffer)
 
 
-REQUESTS = {
+REQUESTS: dict[str, Any] = {
+    "source": SourceConfig(level_db=142.0),
     "requests": RequestConfig(rate=40.0, most=3),
     "observation": ObservationConfig(["served"], ["others", "requests"], own=True),
     "reward": RewardConfig(spotted=0.0, served=1.0),
@@ -104,7 +105,6 @@ CASES: dict[str, dict[str, Any]] = {
         "delay": DelayConfig(obs=LATE),
         "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7, stops=2, own=True),
     },
-    "late requests": {"delay": DelayConfig(obs=LATE), **REQUESTS},
     "late truth": {
         "delay": DelayConfig(obs=LATE),
         "source": UNSURE,
@@ -118,7 +118,6 @@ CASES: dict[str, dict[str, Any]] = {
 }
 FLYING = {
     "late messages of two stops, timeline",
-    "late requests",
     "late messages",
     "late messages, slow server",
     "late and summed rewards",
@@ -152,13 +151,20 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
             assert not late[key][..., :n_features].equal(true[key][..., :n_features])
 
 
-def test_a_served_request_is_paid_in_hindsight_once_where_its_message_arrived():
-    scenario = square(source=SourceConfig(level_db=142.0), episode=EpisodeConfig(30), **REQUESTS)
-    late, found = backupdated(replace(scenario, delay=DelayConfig(obs=LATE, loss=0.5)), ["reward"])
-    true = fly(training_env(scenario))["next", "agents", "reward"]
-    arrived, known = late["next", "agents", "delay"] >= 0, STEPS - LONGEST
-    assert found["next", "agents", "reward"][:known].equal((true * arrived)[:known])
-    assert 5 < late["next", "agents", "reward"].sum() < true.sum()
+@pytest.mark.parametrize("loss", [0.0, 0.5])
+def test_in_hindsight_requests_are_known_at_once_and_paid_once_where_the_message_arrived(loss):
+    flying = MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0)
+    scenario = square(agents=1, motion=flying, episode=EpisodeConfig(30), **REQUESTS)  # nobody else tells
+    delayed = replace(scenario, delay=DelayConfig(obs=LATE, loss=loss))
+    rollouts = (*backupdated(delayed, ["reward", "critic"], 16), fly(training_env(scenario, 16)))
+    late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
+    reward, critic = next_key(keys.REWARD), next_key(keys.GLOBAL_OBSERVATION)
+    arrived = late[next_key(keys.DELAY)] >= 0
+    lost = true[next_key(keys.MESSAGE_SENT)].unsqueeze(-1) & ~arrived
+    assert found[reward].equal(true[reward] * ~lost)
+    assert found[critic].equal(true[critic]) == (loss == 0)
+    assert 5 < late[reward].sum() <= true[reward].sum()
+    assert not late[reward].equal(true[reward])
 
 
 @pytest.mark.parametrize("corrected", [["reward"], ["critic"]], ids="+".join)
