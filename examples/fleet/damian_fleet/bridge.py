@@ -22,8 +22,9 @@ until its effect is seen or its acknowledgement has come.
 commanded, a move of the mode switch, a restart of the vehicle, and before the flight a refusal or a failsafe,
 lead to *watch* from every state; so does what has changed while the bridge was off. Nothing is commanded
 unless mode and motors were heard since the last command; if they are not for 5 s: *watch*. Where a vehicle is
-in the air in GUIDED and nobody is known to command it, the bridge is silent: so its failsafe lands it. **To hand over again**, the pilot switches the vehicle from another mode to
-GUIDED, on the ground with its motors off. An operator's hold leads from each state of a flight to *landing*;
+in the air in GUIDED and nobody is known to command it, the bridge is silent: so its failsafe lands it. **To
+hand over again**, the pilot switches the vehicle from another mode to GUIDED, on the ground with its motors
+off. An operator's hold leads from each state of a flight to *landing*;
 a missing answer of the service ends none. In a state that lasts, the log says every 30 s what is waited for.
 """
 
@@ -582,14 +583,14 @@ class Bridge:
         if self.mode in own and (self.mode == LAND or self.state in ("join", "ground", "accept")):
             memory.mode = self.mode  # from now on no other
         failed = self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(self.state, True)
+        is_other = self.mode not in {memory.mode, *own}
+        has_armed = self.armed != MOTORS.get(self.state, self.armed)
         acts = {
             "it has booted again": has_booted,
             "the mode switch was moved": self._has_switched,
-            f"mode {name_of('COPTER_MODE', self.mode)} by somebody else": self.mode
-            not in {memory.mode, *own},
+            f"mode {name_of('COPTER_MODE', self.mode)} by somebody else": is_other,
             "a failsafe of the vehicle": failed,
-            f"motors {'on' if self.armed else 'off'} by somebody else": self.armed
-            != MOTORS.get(self.state, self.armed),
+            f"motors {'on' if self.armed else 'off'} by somebody else": has_armed,
             "sent elsewhere by somebody else": self._aims_elsewhere(),
         }
         return next((what for what, is_so in acts.items() if is_so), "")

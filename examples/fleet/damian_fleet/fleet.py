@@ -612,7 +612,7 @@ class Fleet:
         way, points = self._path(decision), self.ground.points
         for other in self._others(uav):
             places = self.booked(other, found)
-            near = [way.distance(shapely.Point(points[place])) for place in places]
+            near = [way.distance(shapely.Point(self._start(other, place))) for place in places]
             mine = way if other.level == uav.level else shapely.Point(points[decision.goal])
             near += [self._path(each).distance(mine) for each in self._flights(other, found)]
             if decision.goal in places or min(near) < self.config.clearance:

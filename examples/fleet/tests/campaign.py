@@ -382,7 +382,8 @@ class Campaign:
             if copter.failsafe:
                 copter.reboot(self.now)
             copter.crashed, copter.battery = False, [100.0]
-            if self.in_zone(copter.place - 1, copter.place + 1):
+            stands = shapely.Point(self.ground.local(copter.degrees(copter.place)))
+            if not self.ground.region.polygon.contains(stands):  # in the zone, or outside: he carries it
                 copter.place = STARTS[ord(uav.name) - ord("A")]
             copter.change_mode(STABILIZE)
         elif self.now >= uav.idle_since + 35:

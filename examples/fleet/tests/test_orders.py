@@ -365,3 +365,14 @@ def test_an_offer_is_not_accepted_from_where_its_way_crosses_a_zone():
     field.now += 1
     field.report("A", 0, lat=lat, lon=lon)
     assert field.say("A", told.answer, "accepted") == "lapsed"
+
+
+def test_two_that_stand_by_one_landing_point_do_not_hold_each_other_for_ever():
+    field = begun(200, 300)
+    x, y = field.fleet.ground.points[200].tolist()
+    for uav, off in (("A", 0.0), ("B", 14.0)):
+        lat, lon = (float(each) for each in to_latlon(x, y + off, field.fleet.ground.region.origin))
+        field.now += 1
+        field.report(uav, 0, lat=lat, lon=lon)
+    assert {field.booked(uav) for uav in "AB"} == {200}
+    assert told(field, "A", 1) == ("fly", None), "away from the other one"
