@@ -52,7 +52,16 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it
 __version__ = "0.18.0.dev0"
 
 _MODULES = {
-    "damian.delays.laws": ["Burst", "Constant", "Distance", "Geometric", "Lag", "Law", "Trace", "Uniform"],
+    "damian.delays.laws": [
+        "Burst",
+        "Constant",
+        "Distance",
+        "Geometric",
+        "Lag",
+        "Law",
+        "Trace",
+        "Uniform",
+    ],
     "damian.delays.samplers": ["ContextSampler", "MessageContext", "Sampler", "TableSampler"],
     "damian.delays.config": ["DelayConfig"],
     "damian.envs.config": ["ClockConfig", "ScenarioConfig"],

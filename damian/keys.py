@@ -1,7 +1,7 @@
 """The TensorDict keys of the UAV environments, the learners and the replay storage.
 
-The root TensorDict has the batch size [B] (worlds), the one under ``"agents"`` [B, N] (UAVs). After a step,
-TorchRL stores the environment's outputs with the same keys under ``"next"``.
+The root TensorDict has the batch size [B] (worlds), the one under ``"agents"`` [B, N] (UAVs). After
+a step, TorchRL stores the environment's outputs with the same keys under ``"next"``.
 """
 
 from typing import TYPE_CHECKING
@@ -17,8 +17,8 @@ ACTION = (AGENTS, "action")
 ACTION_MASK = (AGENTS, "action_mask")
 """Legal discrete actions, [B, N, A] bool."""
 ACTION_VALID = (AGENTS, "action_valid")
-"""Written by ``ActionDelay`` for the environment: does this action arrive now, or is it the default action,
-[B, N] bool. The environment ignores all others, which are repetitions."""
+"""Written by ``ActionDelay`` for the environment: does this action arrive now, or is it the default
+action, [B, N] bool. The environment ignores all others, which are repetitions."""
 READY = (AGENTS, "ready")
 """May the UAV choose an action now, [B, N] bool."""
 OBSERVATION = (AGENTS, "observation")
@@ -38,47 +38,53 @@ MESSAGE_SENT = (AGENTS, "message_sent")
 RECEIVED = (AGENTS, "received")
 """The message of each UAV that the server holds, packed (``Messages.pack``), [B, N, M]."""
 LINKED = (AGENTS, "linked")
-"""Messages that each UAV holds of each other with ``links=matrix``, [B, N, N, M] (receiver, sender)."""
+"""Messages that each UAV holds of each other with ``links=matrix``, [B, N, N, M]
+(receiver, sender)."""
 TIMELINE = (AGENTS, "timeline")
 """Messages of the latest steps that each UAV knows (``ObservationTimeline``), [B, N, N, K, C]."""
 AGE = (AGENTS, "age")
 """Age of information: steps since the message that the server holds was generated, [B, N, 1]."""
 DELAY = (AGENTS, "delay")
-"""Delay of the message sent in this step [steps], -1 if it never arrives, [B, N, 1]; never for an actor."""
+"""Delay of the message sent in this step [steps], -1 if it never arrives, [B, N, 1]; never for an
+actor."""
 REWARD_DELAY = (AGENTS, "reward_delay")
 """Delay of the reward earned in this step [steps], [B, N, 1]; never for an actor."""
 EARNED_REWARD = (AGENTS, "earned_reward")
 """The reward earned in this step, whenever it is paid, [B, N, 1]; never for an actor."""
 POSITION = (AGENTS, "position")
-"""True position of each UAV at this instant, east and north [m], [B, N, 2]; for delay laws, never for an
-actor."""
+"""True position of each UAV at this instant, east and north [m], [B, N, 2]; for delay laws, never
+for an actor."""
 LOSS = (AGENTS, "loss")
-"""Probability with which messages to the server are lost, if it is drawn, [B, N, 1]; never for an actor."""
+"""Probability with which messages to the server are lost, if it is drawn, [B, N, 1]; never for an
+actor."""
 BELIEF = "belief"
-"""Probability that each source is in each cell of the server's grid, as far as the messages tell that have
-arrived, [B, K, C]."""
+"""Probability that each source is in each cell of the server's grid, as far as the messages tell
+that have arrived, [B, K, C]."""
 OWN_BELIEF = (AGENTS, "belief")
 """The same as each UAV knows it, whose own messages are not delayed for it, [B, N, K, C]."""
 STOPS, OWN_STOPS = (AGENTS, "stops"), (AGENTS, "own_stops")
-"""By age in steps, where each UAV is known to have stopped, east and north [m], and 1, else zeros: by the
-messages that the server holds, and by all that it has sent itself, [B, N, slots, 3]."""
+"""By age in steps, where each UAV is known to have stopped, east and north [m], and 1, else zeros:
+by the messages that the server holds, and by all that it has sent itself, [B, N, slots, 3]."""
 HEARD_STOPS = (AGENTS, "heard_stops")
 """The same by what has reached a UAV directly, [B, N, N, slots, 3] (receiver, sender)."""
 LINK_DELAY = (AGENTS, "link_delay")
-"""Delays of the messages sent directly in this step, [B, N, N] (receiver, sender); -1 for lost ones."""
+"""Delays of the messages sent directly in this step, [B, N, N] (receiver, sender); -1 for lost
+ones."""
 STATE = "state"
-"""The simulator's true state, [B, S]: of each UAV the position (east, north, up [m]), of each the battery
-level [%], whether the source emits, and its position [m]. For drawing and references, never an actor."""
+"""The simulator's true state, [B, S]: of each UAV the position (east, north, up [m]), of each the
+battery level [%], whether the source emits, and its position [m]. For drawing and references, never
+an actor."""
 SOURCE_OVER = "source_over"
 """Has the source finished its walk for good, [B, 1] bool."""
 SUCCESS = "success"
 """Is the task accomplished, as far as the server knows, [B, 1] bool."""
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
-"""TorchRL's flags of the end of an episode, [B, 1] bool each; only at the root, as TorchRL's transforms
-expect one reset key."""
+"""TorchRL's flags of the end of an episode, [B, 1] bool each; only at the root, as TorchRL's
+transforms expect one reset key."""
 ENDS = (DONE, TERMINATED, TRUNCATED)
 STEPPED = "_step"
-"""TorchRL's flag of the worlds that take this step, [B] bool; all of them if there is no such entry."""
+"""TorchRL's flag of the worlds that take this step, [B] bool; all of them if there is no such
+entry."""
 
 # Data collection and learning.
 STEP_COUNT = "step_count"
@@ -99,13 +105,14 @@ STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")
 ADVANTAGE = (AGENTS, "advantage")
 """Advantage of the action, [B, N, 1]."""
 BACKUPDATED = (AGENTS, "backupdated")
-"""Has a late message changed the stored reward of this step, [T, B, N, 1] bool; if only rewards are late: has
-it been credited with a late reward."""
+"""Has a late message changed the stored reward of this step, [T, B, N, 1] bool; if only rewards are
+late: has it been credited with a late reward."""
 HINDSIGHT = (AGENTS, "hindsight")
-"""Under ``"next"``, if a back-updating storage gets this key: the newest message sent by that step that has
-arrived by now, packed, [T, B, N, M]."""
+"""Under ``"next"``, if a back-updating storage gets this key: the newest message sent by that step
+that has arrived by now, packed, [T, B, N, M]."""
 VALID = "valid"
-"""False where, by the messages that have arrived since, the episode had already ended, [T, B, 1] bool."""
+"""False where, by the messages that have arrived since, the episode had already ended, [T, B, 1]
+bool."""
 RESET_AFTER = "reset_after"
 """Was the environment reset after this step, [T, B, 1] bool."""
 

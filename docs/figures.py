@@ -1,4 +1,5 @@
-"""Draws the figures of docs/concepts.md (delays and their laws), of docs/world.md, and one of delaybench.
+"""Draws the figures of docs/concepts.md (delays and their laws), of docs/world.md, and one of
+delaybench.
 
 python docs/figures.py    (make pictures)
 """
@@ -54,7 +55,8 @@ POLICIES = {
     (ALONE, "lag"): "without timeline (trained at 1 to 7)",
     (ALONE, "4"): "without timeline (trained at 4)",
 }
-"""Labels of the trainings in the figure: method, and delay of the training (lag: one to seven steps)."""
+"""Labels of the trainings in the figure: method, and delay of the training
+(lag: one to seven steps)."""
 LAWS_FLOWN = {
     "1-7": "1 to 7",
     "lost": "1 to 7, a\nfifth lost",
@@ -109,7 +111,8 @@ def draw_messages(law: Any, n_steps: int, seed: int, loss: float = 0.0) -> Drawn
 
 
 def age_in_hindsight(delay: np.ndarray) -> np.ndarray:
-    """Age of the newest message of each step or of an earlier one that ever arrives, [T]; step 0 is known."""
+    """Age of the newest message of each step or of an earlier one that ever arrives, [T]; step 0 is
+    known."""
     steps = np.arange(1, len(delay) + 1)
     return steps - np.maximum.accumulate(np.where(delay >= 0, steps, 0))
 
@@ -125,11 +128,15 @@ def plot_model(axes: tuple[Axes, Axes], drawn: Drawn) -> None:
         ways.plot([step], [1], "o", color=BLUE, ms=3)
         ways.plot([step + delay], [0], "v", color=BLUE, ms=4)
     ways.set_yticks([0, 1], ["arrives", "sent"])
-    ways.set_title("Messages: each line is one on its way, crosses are lost", loc="left", fontsize=9)
+    ways.set_title(
+        "Messages: each line is one on its way, crosses are lost", loc="left", fontsize=9
+    )
     steps = np.arange(1, len(drawn.age) + 1)
     ages.step(steps, drawn.age, where="mid", color=BLUE, label="the server, when it acts")
     hindsight = age_in_hindsight(drawn.delay)
-    ages.step(steps, hindsight, where="mid", color=ORANGE, label="back-updating, once all have arrived")
+    ages.step(
+        steps, hindsight, where="mid", color=ORANGE, label="back-updating, once all have arrived"
+    )
     ages.set(xlabel="step", ylabel="age [steps]", xlim=(0.5, len(steps) + 0.5), ylim=(-0.4, 9))
     ages.set_title("Age of the newest message that is known of a step", loc="left", fontsize=9)
     ages.legend(fontsize=8, frameon=False, loc="upper left")
@@ -139,7 +146,9 @@ def main() -> None:
     """Draw and write the figures."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots(2, 1, sharex=True)
-    plot_model((axes[0], axes[1]), draw_messages(Uniform(1, 7, probability=0.6), STEPS, seed=3, loss=0.12))
+    plot_model(
+        (axes[0], axes[1]), draw_messages(Uniform(1, 7, probability=0.6), STEPS, seed=3, loss=0.12)
+    )
     figure.savefig(IMAGES / "delay_model.png", dpi=110)
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
@@ -170,7 +179,9 @@ def plot_world(path: Path, words: list[str], step: int, worlds: int) -> None:
             MapView(axis, episode).draw(frame_of(episode, min(step, episode.n_steps)))
             wind = episode.about.get("wind")
             if worlds > 1 and wind:
-                axis.set_title(f"{episode.radius:.0f} m around a UAV, wind {wind[0]:.1f} m/s", loc="left")
+                axis.set_title(
+                    f"{episode.radius:.0f} m around a UAV, wind {wind[0]:.1f} m/s", loc="left"
+                )
         figure.legend(handles=legend_marks(episode), loc="outside right upper", frameon=False)
         figure.savefig(path, dpi=110)
     Image.open(path).convert("RGB").quantize(dither=Image.Dither.NONE).save(path, optimize=True)
@@ -182,7 +193,8 @@ def write_leaderboard() -> None:
 
 
 def leaderboard_page() -> str:
-    """The submissions as tables, with our runs of the same methods that are too few for a submission."""
+    """The submissions as tables, with our runs of the same methods that are too few for a
+    submission."""
     files = sorted((DELAYBENCH.parent / "leaderboard").glob("*.csv"))
     submitted = pd.concat([read_csv(file, text=WORDS) for file in files], ignore_index=True)
     stored = stored_results(DELAYBENCH).rows
@@ -208,7 +220,10 @@ def plot_matrix(path: Path) -> None:
         for number, (trained, label) in enumerate(POLICIES.items()):
             look = {"color": COLOURS[number], "linewidth": 1.2 + (number == 0), "markersize": 4}
             for axis, flown in ((left, constant), (right, [*LAWS_FLOWN])):
-                tasks = {name: "crowded" if name == trained[1] else f"crowded@delay_{name}" for name in flown}
+                tasks = {
+                    name: "crowded" if name == trained[1] else f"crowded@delay_{name}"
+                    for name in flown
+                }
                 known = {
                     place: rows.loc[key]
                     for place, name in enumerate(flown)
@@ -220,11 +235,18 @@ def plot_matrix(path: Path) -> None:
                 place = np.array([*known]) + (axis is right) * 0.12 * (number - 1)
                 axis.errorbar(place, value, error, marker="o", linestyle=line, label=label, **look)
         there = {
-            x: rows.loc[key] for x in range(9) if (key := (ALONE, str(x), "crowded", TRAINED)) in rows.index
+            x: rows.loc[key]
+            for x in range(9)
+            if (key := (ALONE, str(x), "crowded", TRAINED)) in rows.index
         }
         label = "without timeline (trained at the delay of the flight)"
         left.plot(
-            [*there], [row["return"] for row in there.values()], "D", color="0.3", markersize=3, label=label
+            [*there],
+            [row["return"] for row in there.values()],
+            "D",
+            color="0.3",
+            markersize=3,
+            label=label,
         )
         for axis, labels in ((left, constant), (right, [*LAWS_FLOWN.values()])):
             axis.set_xticks(range(len(labels)), labels)

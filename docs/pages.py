@@ -1,4 +1,5 @@
-"""Pages of the documentation site made from the project: settings, API, examples, texts beside docs/.
+"""Pages of the documentation site made from the project: settings, API, examples, texts beside
+docs/.
 
 MkDocs calls the functions that begin with ``on_``.
 """
@@ -15,16 +16,29 @@ from typing import Any
 
 import damian
 from damian.recipes.command import PROGRAMS
-from damian.recipes.known import SCHEMAS, Setting, default_options, groups, help_text, known_settings
+from damian.recipes.known import (
+    SCHEMAS,
+    Setting,
+    default_options,
+    groups,
+    help_text,
+    known_settings,
+)
 from damian.server import surroundings  # noqa: F401 (it registers features)
 from damian.server.features import FEATURES
 
 ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
-TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff", "SECURITY.md": "SECURITY.md"}
+TEXTS |= {
+    "CHANGELOG.md": "CHANGELOG.md",
+    "CITATION.cff": "CITATION.cff",
+    "SECURITY.md": "SECURITY.md",
+}
 TEXTS |= {"examples/fleet/README.md": "fleet.md", "examples/fleet/docs/mavlink.md": "mavlink.md"}
 CARDS = ROOT.glob("damian/data/*/README.md")
-TEXTS |= {f"damian/data/{card.parent.name}/README.md": f"policies/{card.parent.name}.md" for card in CARDS}
+TEXTS |= {
+    f"damian/data/{card.parent.name}/README.md": f"policies/{card.parent.name}.md" for card in CARDS
+}
 """Files beside docs/, and what they are called in the site."""
 SHOWN = (*SCHEMAS,)
 """Programs whose settings have a page."""
@@ -76,7 +90,9 @@ def listed(folder: str) -> list[Any]:
     if folder == "api/":
         return ["api/index.md", *({f"damian.{name}": f"api/{name}.md"} for name in PACKAGES)]
     inside = folder.removeprefix("examples/")
-    names = [path for path in examples() if (path.startswith(inside) if inside else "/" not in path)]
+    names = [
+        path for path in examples() if (path.startswith(inside) if inside else "/" not in path)
+    ]
     return [{path.removeprefix(inside): f"examples/{path}.md"} for path in names]
 
 
@@ -93,9 +109,17 @@ def made() -> dict[str, str | bytes]:
     """The pages that are not files of docs/, and pictures, by their names in the site."""
     pages: dict[str, str | bytes]
     pages = {name: (ROOT / source).read_text(encoding="utf-8") for source, name in TEXTS.items()}
-    pages |= {"commands/index.md": commands(), **{f"commands/{name}.md": settings(name) for name in SHOWN}}
-    pages |= {"api/index.md": public_names(), **{f"api/{name}.md": package(name) for name in PACKAGES}}
-    pages |= {f"examples/{path}.md": example(path) for path in examples()} | {"features.md": features()}
+    pages |= {
+        "commands/index.md": commands(),
+        **{f"commands/{name}.md": settings(name) for name in SHOWN},
+    }
+    pages |= {
+        "api/index.md": public_names(),
+        **{f"api/{name}.md": package(name) for name in PACKAGES},
+    }
+    pages |= {f"examples/{path}.md": example(path) for path in examples()} | {
+        "features.md": features()
+    }
     for path in NOTEBOOKS:
         pages |= notebook(path)
     return pages
@@ -107,7 +131,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def led(markdown: str, page_name: str) -> str:
-    """Lead the links of the project's texts, which lead to its files, to pages of the site; mend pictures."""
+    """Lead the links of the project's texts, which lead to its files, to pages of the site; mend
+    pictures."""
     if page_name.startswith(("api/", "commands/", "examples/")):
         return markdown
     markdown = re.sub(r"<img\s[^>]*>", picture, markdown)
@@ -118,7 +143,9 @@ def led(markdown: str, page_name: str) -> str:
         path = posixpath.normpath(posixpath.join(folder, match[1]))
         if path.startswith("examples/") and path not in TEXTS:
             path += ".md"
-        if path.startswith("damian/") and path not in TEXTS:  # a module; its page has a heading for it
+        if (
+            path.startswith("damian/") and path not in TEXTS
+        ):  # a module; its page has a heading for it
             module = path.removesuffix(".py").replace("/", ".")
             path = f"api/{module.split('.')[1]}.md#{module}"
         site = TEXTS.get(path, path.removeprefix("docs/"))
@@ -136,7 +163,10 @@ def picture(tag: re.Match[str]) -> str:
 
 def commands() -> str:
     """The programs, with what each says of itself."""
-    hint = "Settings are overrides of [Hydra](https://hydra.cc); `damian PROGRAM --help KEY` explains one."
+    hint = (
+        "Settings are overrides of [Hydra](https://hydra.cc); `damian PROGRAM --help KEY` explains "
+        "one."
+    )
     parts = ["# Commands", hint]
     for name, what in PROGRAMS.items():
         text = help_text(name)
@@ -152,21 +182,28 @@ def settings(program: str) -> str:
         parts += ["## Groups", table(("group", "options"), group_rows(program))]
     elif "learner" in everything:
         parts.append("Those of [damian train](train.md) may be given too.")
-        everything = {key: each for key, each in everything.items() if key not in known_settings("train")}
+        everything = {
+            key: each for key, each in everything.items() if key not in known_settings("train")
+        }
     sections: dict[str, list[tuple[str, ...]]] = {}
     for key, setting in everything.items():
         section = key.split(".")[0] if "." in key else "general"
         if not setting.is_section:
             sections.setdefault(section, []).append(row(key, setting))
     head = ("setting", "type", "default", "meaning")
-    return "\n\n".join([*parts, *(f"## {name}\n\n{table(head, rows)}" for name, rows in sections.items())])
+    return "\n\n".join(
+        [*parts, *(f"## {name}\n\n{table(head, rows)}" for name, rows in sections.items())]
+    )
 
 
 def group_rows(program: str) -> list[tuple[str, ...]]:
     """Each group of settings with its options, the default one in bold."""
     options = groups()
     return [
-        (code(name), ", ".join(f"**{each}**" if each == default else each for each in options[name]))
+        (
+            code(name),
+            ", ".join(f"**{each}**" if each == default else each for each in options[name]),
+        )
         for name, default in default_options(program).items()
         if name in options
     ]
@@ -203,7 +240,11 @@ def features() -> str:
 
 def public_names() -> str:
     """The names that ``import damian`` offers."""
-    parts = ["# damian", "`import damian` offers these names, and loads each when it is first used.", ""]
+    parts = [
+        "# damian",
+        "`import damian` offers these names, and loads each when it is first used.",
+        "",
+    ]
     for name in sorted(damian._MODULE_OF):
         path = PROGRAM_FUNCTIONS.get(name) or f"{getattr(damian, name).__module__}.{name}"
         parts.append(f"- [`{name}`][{path}]")
@@ -216,7 +257,8 @@ def package(name: str) -> str:
     folder = ROOT / "damian" / name
     paths = sorted(folder.rglob("[!_]*.py"))
     modules = [
-        f"::: damian.{'.'.join(path.relative_to(ROOT / 'damian').with_suffix('').parts)}" for path in paths
+        f"::: damian.{'.'.join(path.relative_to(ROOT / 'damian').with_suffix('').parts)}"
+        for path in paths
     ]
     return "\n\n".join([f"# damian.{name}", docstring(folder / "__init__.py"), *modules])
 

@@ -1,9 +1,10 @@
-"""Prints whether delaybench_mini orders the methods as delaybench does: Spearman's rank correlation.
+"""Prints whether delaybench_mini orders the methods as delaybench does: Spearman's rank
+correlation.
 
 python docs/rank_correlation.py [FOLDER]     (of the mini's rows; otherwise those that are stored)
 
-The interval (95 %) is of a bootstrap over the seeds of each method, in both. Last come correlations of
-training returns after fewer steps of delaybench itself, of the methods whose curves are stored.
+The interval (95 %) is of a bootstrap over the seeds of each method, in both. Last come correlations
+of training returns after fewer steps of delaybench itself, of the methods whose curves are stored.
 """
 
 import sys
@@ -28,7 +29,9 @@ def correlation(small: dict[str, np.ndarray], large: dict[str, np.ndarray]) -> s
     methods, rng = [name for name in small if name in large], np.random.default_rng(0)
 
     def means(seeds: dict[str, np.ndarray], again: bool) -> list[float]:
-        return [np.mean(rng.choice(seeds[m], len(seeds[m])) if again else seeds[m]) for m in methods]
+        return [
+            np.mean(rng.choice(seeds[m], len(seeds[m])) if again else seeds[m]) for m in methods
+        ]
 
     value = spearmanr(means(small, False), means(large, False))[0]
     drawn = [spearmanr(means(small, True), means(large, True))[0] for _ in range(DRAWS)]
@@ -51,8 +54,13 @@ def main(folder: Path) -> None:
     curves = pd.read_csv(RESULTS / "delaybench" / "curves.csv")
     for steps in (200_000, 300_000, 400_000, 500_000, 700_000):
         part = curves[curves["frames"].between(0.9 * steps, steps)]
-        part = part.groupby(["task", "delay", "method", "seed"], as_index=False)["hindsight_return"].mean()
-        print(f"after {steps:,} steps: {correlation(returns(part, 'crowded', 'hindsight_return'), large)}")
+        part = part.groupby(["task", "delay", "method", "seed"], as_index=False)[
+            "hindsight_return"
+        ].mean()
+        print(
+            f"after {steps:,} steps: "
+            f"{correlation(returns(part, 'crowded', 'hindsight_return'), large)}"
+        )
 
 
 if __name__ == "__main__":

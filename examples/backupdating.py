@@ -1,11 +1,14 @@
-"""Late messages make stored rewards wrong, and a replay buffer corrects them when the messages arrive.
+"""Late messages make stored rewards wrong, and a replay buffer corrects them when the messages
+arrive.
 
     python examples/backupdating.py        (a few seconds)
 
-Tanks far away send their water levels to a control room, where a message arrives three to seven steps later.
-The room computes rewards from the newest message that it holds, and ends an episode when it hears that a tank
-has overflowed: both tell of an earlier level. The replay buffer computes them again for each stored step that
-a message concerns, once that message has arrived. docs/backupdating.md explains each part.
+Tanks far away send their water levels to a control room, where a message arrives three to seven
+steps later. The room computes rewards from the newest message that it holds, and ends an episode
+when it hears that a tank
+has overflowed: both tell of an earlier level. The replay buffer computes them again for each stored
+step that a message concerns, once that message has arrived. docs/backupdating.md explains each
+part.
 """
 
 import torch
@@ -31,7 +34,11 @@ class Tanks(EnvBase):
         self.message = torch.zeros(n_worlds, 2)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        mask = torch.tensor(True) if tensordict is None else tensordict.get("_reset", torch.tensor(True))
+        mask = (
+            torch.tensor(True)
+            if tensordict is None
+            else tensordict.get("_reset", torch.tensor(True))
+        )
         self.message = torch.where(mask, torch.tensor([0.5, 0.0]), self.message)
         return TensorDict({"message": self.message}, self.batch_size)
 
@@ -46,7 +53,8 @@ class Tanks(EnvBase):
 
 
 def judge(message: Tensor) -> dict[str, Tensor]:
-    """Reward and end [*, 1], which follow from a message [*, 2]: the level and the latest inflow."""
+    """Reward and end [*, 1], which follow from a message [*, 2]: the level and the latest
+    inflow."""
     level, inflow = message.split(1, -1)
     overflowed = level > 1
     return {
@@ -72,9 +80,12 @@ def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor
 
 
 def main() -> tuple[TensorDictBase, Tensor]:
-    """Collect, store and report; returns all stored steps, and the rewards as collected, both [T, B]."""
+    """Collect, store and report; returns all stored steps, and the rewards as collected, both
+    [T, B]."""
     torch.manual_seed(0)
-    delay = ObservationDelay(Uniform(3, 7), ["message"], ["received"], age_key="age", delay_key="delay")
+    delay = ObservationDelay(
+        Uniform(3, 7), ["message"], ["received"], age_key="age", delay_key="delay"
+    )
     env = TransformedEnv(Tanks(WORLDS), Compose(delay, ControlRoom(), StepCounter(MAX_STEPS)))
     storage = BackupdateStorage(
         max_size=BATCHES * BATCH_STEPS * WORLDS,
@@ -109,8 +120,13 @@ def report(steps: TensorDictBase, collected: Tensor) -> None:
         ("message in hindsight", after["hindsight"], after["message"]),
     ):
         print(f"mean error of the {name}: {(estimate - true).abs().mean():.4f}")
-    print(f"steps whose reward a late message has changed: {steps['backupdated'].float().mean():.1%}")
-    print(f"steps after the end of an episode, not to learn from: {(~steps['valid']).float().mean():.1%}")
+    print(
+        f"steps whose reward a late message has changed: {steps['backupdated'].float().mean():.1%}"
+    )
+    print(
+        "steps after the end of an episode, not to learn from: "
+        f"{(~steps['valid']).float().mean():.1%}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""How old is what agents know of each other? Three robots of VMAS tell their positions over a slow radio.
+"""How old is what agents know of each other? Three robots of VMAS tell their positions over a slow
+radio.
 
 python examples/channel.py
 """
@@ -10,10 +11,13 @@ from damian import Channel, Uniform
 
 
 def main(n_worlds: int = 64, n_steps: int = 100) -> dict[str, tuple[float, float]]:
-    """Print, and return, the share of others heard of and the mean age of their messages, by channel."""
+    """Print, and return, the share of others heard of and the mean age of their messages, by
+    channel."""
     channels = {
         "direct": Channel(Uniform(1, 5), loss=0.2, seed=0),
-        "within 0.8 m": Channel(Uniform(1, 5), loss=0.2, comm_range=0.8, position_key="observation", seed=0),
+        "within 0.8 m": Channel(
+            Uniform(1, 5), loss=0.2, comm_range=0.8, position_key="observation", seed=0
+        ),
     }
     results = {}
     for name, channel in channels.items():
@@ -22,7 +26,10 @@ def main(n_worlds: int = 64, n_steps: int = 100) -> dict[str, tuple[float, float
         heard = agents["received_mask"].float().mean((0, 1))
         ages = agents["received_age"].mean((0, 1))
         results[name] = (heard[0, 1:].mean().item(), ages[0, 1:].mean().item())
-        print(f"{name:18s} heard of {results[name][0]:4.0%} of the others, {results[name][1]:4.1f} steps old")
+        print(
+            f"{name:18s} heard of {results[name][0]:4.0%} of the others, {results[name][1]:4.1f} "
+            "steps old"
+        )
     return results
 
 

@@ -1,8 +1,10 @@
-"""PPO of TorchRL on a Gymnasium environment whose observations and actions are late: one file, to be copied.
+"""PPO of TorchRL on a Gymnasium environment whose observations and actions are late: one file, to
+be copied.
 
-python examples/ppo_gymnasium.py                 two minutes: CartPole, 1 to 3 steps late; returns 325 to 396
-python examples/ppo_gymnasium.py --no-history    without past actions in the observation: 224 to 261
-python examples/ppo_gymnasium.py --delay 0       without delay: 352 to 444 (last ten batches, seeds 0 to 2)
+python examples/ppo_gymnasium.py                 two minutes: CartPole, 1 to 3 steps late; returns
+325 to 396 python examples/ppo_gymnasium.py --no-history    without past actions in the observation:
+224 to 261 python examples/ppo_gymnasium.py --delay 0       without delay: 352 to 444
+(last ten batches, seeds 0 to 2)
 """
 
 import argparse
@@ -26,7 +28,9 @@ def make_env(delay: int, history: bool) -> TransformedEnv:
     """CartPole with late observations and actions; the policy also sees what it has done since."""
     delays = [
         ActionDelay(1 if delay else 0),
-        ObservationDelay(Uniform(min(1, delay), delay)),  # each draws its delay; slow ones are overtaken
+        ObservationDelay(
+            Uniform(min(1, delay), delay)
+        ),  # each draws its delay; slow ones are overtaken
         *([ActionHistory(delay + 1, append_to="observation")] if history else []),
     ]
     return TransformedEnv(GymEnv("CartPole-v1"), Compose(*delays, StepCounter(), RewardSum()))
@@ -37,7 +41,9 @@ def train(delay: int = 3, history: bool = True, frames: int = 60_000, seed: int 
     torch.manual_seed(seed)
     env = make_env(delay, history)
     set_seed(env, seed)
-    network = MLP(out_features=env.action_spec.shape[-1], num_cells=[64, 64], activation_class=nn.Tanh)
+    network = MLP(
+        out_features=env.action_spec.shape[-1], num_cells=[64, 64], activation_class=nn.Tanh
+    )
     actor = ProbabilisticActor(
         TensorDictModule(network, ["observation"], ["logits"]),
         in_keys=["logits"],
@@ -56,7 +62,11 @@ def train(delay: int = 3, history: bool = True, frames: int = 60_000, seed: int 
         storage=LazyTensorStorage(BATCH), sampler=SamplerWithoutReplacement(), batch_size=MINIBATCH
     )
     collector = Collector(
-        env, actor, frames_per_batch=BATCH, total_frames=frames, auto_register_policy_transforms=False
+        env,
+        actor,
+        frames_per_batch=BATCH,
+        total_frames=frames,
+        auto_register_policy_transforms=False,
     )
     means = []
     for number, batch in enumerate(collector):
@@ -74,7 +84,9 @@ def train(delay: int = 3, history: bool = True, frames: int = 60_000, seed: int 
             means.append(batch["next", "episode_reward"][done].mean().item())
         if number % 10 == 9:
             age = batch["age"].mean().item()
-            print(f"{(number + 1) * BATCH:7} steps: return {means[-1]:6.1f}, mean age {age:.2f} steps")
+            print(
+                f"{(number + 1) * BATCH:7} steps: return {means[-1]:6.1f}, mean age {age:.2f} steps"
+            )
     return means
 
 

@@ -43,7 +43,12 @@ def make_networks(env: TransformedEnv) -> tuple[ProbabilisticActor, TensorDictMo
 
     def network(outputs: int, centralized: bool) -> MultiAgentMLP:
         return MultiAgentMLP(
-            n_inputs, outputs, AGENTS, centralized=centralized, share_params=True, num_cells=[128, 128]
+            n_inputs,
+            outputs,
+            AGENTS,
+            centralized=centralized,
+            share_params=True,
+            num_cells=[128, 128],
         )
 
     policy = nn.Sequential(network(2 * spec.shape[-1], False), NormalParamExtractor())
@@ -65,14 +70,18 @@ def train(delay: int = 3, history: bool = True, batches: int = 40, seed: int = 0
     env = make_env(delay, history)
     set_seed(env, seed)
     actor, critic = make_networks(env)
-    loss = ClipPPOLoss(actor, critic, clip_epsilon=0.2, entropy_coeff=1e-3, normalize_advantage=False)
+    loss = ClipPPOLoss(
+        actor, critic, clip_epsilon=0.2, entropy_coeff=1e-3, normalize_advantage=False
+    )
     loss.set_keys(reward=REWARD, action=ACTION, value=("agents", "state_value"))
     loss.set_keys(done=("agents", "done"), terminated=("agents", "terminated"))
     loss.make_value_estimator(gamma=0.95, lmbda=0.9)
     advantage: GAE = loss.value_estimator
     optimizer, frames = torch.optim.Adam(loss.parameters(), 5e-4), WORLDS * STEPS
     sampler = SamplerWithoutReplacement()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(frames), sampler=sampler, batch_size=frames // 8)
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(frames), sampler=sampler, batch_size=frames // 8
+    )
     means = []
     collector = Collector(
         env,
@@ -87,7 +96,9 @@ def train(delay: int = 3, history: bool = True, batches: int = 40, seed: int = 0
             batch.set(("next", "agents", end), flag)
         with torch.no_grad():
             advantage(
-                batch, params=loss.critic_network_params, target_params=loss.target_critic_network_params
+                batch,
+                params=loss.critic_network_params,
+                target_params=loss.target_critic_network_params,
             )
         for _ in range(EPOCHS):
             buffer.extend(batch.reshape(-1))

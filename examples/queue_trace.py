@@ -1,14 +1,16 @@
-"""Record how late small messages are that share a slow uplink with uploads: a trace to train and fly with.
+"""Record how late small messages are that share a slow uplink with uploads: a trace to train and
+fly with.
 
     sudo python examples/queue_trace.py --seconds 1200       (in real time; Linux with iproute2)
     damian train "delay.obs={law: trace, path: queue_trace.csv}" aware=timeline
 
-Three network namespaces stand for a UAV, its modem and a server, with virtual cables between them. The modem
-sends at 512 kbit/s (``tc tbf``) from one queue, first in, first out, of 480,000 bytes: when it is full, it is
-7.5 s long, and what comes is lost. The UAV sends a message every second by UDP, and uploads pictures by the
-kernel's TCP (Reno), the next one after 20 s in the mean, also while others are on their way. No delay is
-drawn or computed: packets wait in the kernel's queue, and both ends read one clock. Delays are rounded to
-tenths of a second, as a busy machine measures no better.
+Three network namespaces stand for a UAV, its modem and a server, with virtual cables between them.
+The modem sends at 512 kbit/s (``tc tbf``) from one queue, first in, first out, of 480,000 bytes:
+when it is full, it is 7.5 s long, and what comes is lost. The UAV sends a message every second by
+UDP, and uploads pictures by the kernel's TCP (Reno), the next one after 20 s in the mean, also
+while others are on their way. No delay is
+drawn or computed: packets wait in the kernel's queue, and both ends read one clock. Delays are
+rounded to tenths of a second, as a busy machine measures no better.
 """
 
 import argparse
@@ -25,7 +27,8 @@ from pathlib import Path
 RATE, QUEUE = "512kbit", 480_000
 """Rate of the uplink, and length of its queue [bytes]."""
 MESSAGE, PICTURE, PAUSE = 100, (200_000, 1_500_000), 20.0
-"""Sizes of a message and of the smallest and largest picture [bytes]; mean time between two uploads [s]."""
+"""Sizes of a message and of the smallest and largest picture [bytes]; mean time between two uploads
+[s]."""
 SERVER, PORT = "10.62.2.2", 6262
 ROOMS = uav, modem, server = [f"{name}{os.getpid()}" for name in ("uav", "modem", "server")]
 ENDS = {
@@ -100,25 +103,32 @@ def take(picture: socket.socket) -> None:
 
 
 def record(seconds: int, file: Path) -> None:
-    """Build the network, let both ends run, and write the delay of each message in the order of sending."""
+    """Build the network, let both ends run, and write the delay of each message in the order of
+    sending."""
     role = [sys.executable, __file__, "--seconds", str(seconds), "--role"]
     try:
         for words in NETWORK:
             subprocess.run(words.split(), check=True)
         exec_ = ["ip", "netns", "exec"]
-        with subprocess.Popen([*exec_, server, *role, "server"], stdout=subprocess.PIPE, text=True) as ears:
+        with subprocess.Popen(
+            [*exec_, server, *role, "server"], stdout=subprocess.PIPE, text=True
+        ) as ears:
             time.sleep(1)
             subprocess.run([*exec_, uav, *role, "uav"], check=True)
             arrived = dict(line.split() for line in ears.communicate()[0].splitlines())
     finally:
         for room in ROOMS:
             subprocess.run(["ip", "netns", "delete", room], check=False)
-    rows = [f"{float(arrived[str(n)]):.1f}s" if str(n) in arrived else "lost" for n in range(seconds)]
+    rows = [
+        f"{float(arrived[str(n)]):.1f}s" if str(n) in arrived else "lost" for n in range(seconds)
+    ]
     file.write_text("\n".join(["delay", *rows, ""]), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--seconds", type=int, default=1200, help="length of the trace")
     parser.add_argument("--out", type=Path, default=Path("queue_trace.csv"))
     parser.add_argument("--role", choices=["uav", "server"], help=argparse.SUPPRESS)

@@ -1,4 +1,5 @@
-"""An episode of ``damian fly`` for the viewer rerun (https://rerun.io): paths, beliefs, detections, ages.
+"""An episode of ``damian fly`` for the viewer rerun (https://rerun.io): paths, beliefs, detections,
+ages.
 
 pip install "damian[rerun]"
 damian fly scenario=tracking delay=paper "formats=[]" hydra.run.dir=runs/flight
@@ -21,10 +22,13 @@ from damian.show.episode import Episode
 def save_recording(episode: Episode, path: Path) -> None:
     """Write an episode as a recording with the timeline ``time``.
 
-    Entities are ``region``, ``landing_points``, ``source`` (large while it emits) and, for each UAV, in its
-    colour: ``uavs/NAME`` with ``paths/NAME``, ``believed/NAME`` (where the server believes it to be, on the
-    ground), ``detections/NAME`` (while it spots the source), and the scalars ``age/NAME`` [s] (of the message
-    that the server holds), ``delay/NAME`` [steps] (of the message sent) and ``reward/NAME``.
+    Entities are ``region``, ``landing_points``, ``source`` (large while it emits) and, for each
+    UAV, in its
+    colour: ``uavs/NAME`` with ``paths/NAME``, ``believed/NAME``
+    (where the server believes it to be, on the ground), ``detections/NAME``
+    (while it spots the source), and the scalars ``age/NAME`` [s]
+    (of the message that the server holds), ``delay/NAME`` [steps] (of the message sent) and
+    ``reward/NAME``.
     """
     rr: Any = import_module("rerun")
     recording, time = rr.RecordingStream("damian"), rr.TimeColumn("time", duration=episode.time)
@@ -43,14 +47,29 @@ def save_recording(episode: Episode, path: Path) -> None:
         colour, position = [int(colour[i : i + 2], 16) for i in (1, 3, 5)], episode.position[:, uav]
         path_of = rr.LineStrips3D([position], colors=[colour], radii=size / 10)
         recording.log(["paths", name], path_of, static=True)
-        places = {"uavs": position, "believed": on_ground(episode.believed[:, uav]), "detections": position}
+        places = {
+            "uavs": position,
+            "believed": on_ground(episode.believed[:, uav]),
+            "detections": position,
+        }
         for kind, radius in {"uavs": size, "believed": size / 2, "detections": 2 * size}.items():
-            style = {"colors": [colour], "labels": [name], "radii": [radius], "show_labels": kind == "uavs"}
+            style = {
+                "colors": [colour],
+                "labels": [name],
+                "radii": [radius],
+                "show_labels": kind == "uavs",
+            }
             recording.log([kind, name], rr.Points3D.from_fields(**style), static=True)
             shown = spotted if kind == "detections" else np.ones_like(spotted)
-            columns = rr.Points3D.columns(positions=places[kind][shown]).partition(shown.astype(int))
+            columns = rr.Points3D.columns(positions=places[kind][shown]).partition(
+                shown.astype(int)
+            )
             recording.send_columns(rr.new_entity_path([kind, name]), [time], columns)
-        for kind, values in {"age": episode.age, "delay": episode.delay, "reward": episode.reward}.items():
+        for kind, values in {
+            "age": episode.age,
+            "delay": episode.delay,
+            "reward": episode.reward,
+        }.items():
             columns = rr.Scalars.columns(scalars=values[:, uav])
             recording.send_columns(rr.new_entity_path([kind, name]), [time], columns)
     recording.flush()

@@ -1,12 +1,15 @@
-"""SAC of TorchRL with a ``BackupdateStorage``: a late actor, and critics that learn from the true states.
+"""SAC of TorchRL with a ``BackupdateStorage``: a late actor, and critics that learn from the true
+states.
 
-    python examples/sac_backupdating.py                  five minutes: Pendulum, observations 6 steps late
-    python examples/sac_backupdating.py --late-critics   critics read what the actor knows, as in plain SAC
+    python examples/sac_backupdating.py                  five minutes: Pendulum, observations 6
+    steps late python examples/sac_backupdating.py --late-critics   critics read what the actor
+    knows, as in plain SAC
 
 It returns -190 to -136, and with late critics -580 to -196 (last ten episodes, seeds 0 to 2).
 
-Kim et al. (2023), BPQL: critics are needed in training only, and by then the state in which an action was
-chosen has arrived. They value it as without delay, Q(state, action), with the actor's action at what it knew.
+Kim et al. (2023), BPQL: critics are needed in training only, and by then the state in which an
+action was chosen has arrived. They value it as without delay, Q(state, action), with the actor's
+action at what it knew.
 """
 
 import argparse
@@ -23,7 +26,10 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from damian import ActionHistory, BackupdateStorage, ObservationDelay, set_seed
 
-WARM_UP, BATCH = 1000, 256  # steps with random actions before the first update; transitions of an update
+WARM_UP, BATCH = (
+    1000,
+    256,
+)  # steps with random actions before the first update; transitions of an update
 
 
 def make_env(delay: int) -> TransformedEnv:
@@ -32,7 +38,9 @@ def make_env(delay: int) -> TransformedEnv:
         RewardSum(),
         StepCounter(),  # the storage reads it
         ObservationDelay(delay, ["observation"], ["received"], delay_key="delay"),
-        CatTensors(["received"], "state", del_keys=False),  # of critics: late, until the storage corrects it
+        CatTensors(
+            ["received"], "state", del_keys=False
+        ),  # of critics: late, until the storage corrects it
         CatTensors(["received"], "known", del_keys=False),  # of the actor:
         ActionHistory(delay, append_to="known"),  # what has arrived, and its own actions since
     )
@@ -40,7 +48,8 @@ def make_env(delay: int) -> TransformedEnv:
 
 
 def recompute(steps: TensorDictBase, arrived: Tensor) -> dict[tuple[str, str], Tensor]:
-    """States after steps [T, B]: the observations sent there, as far as they have arrived, [T, B, F]."""
+    """States after steps [T, B]: the observations sent there, as far as they have arrived,
+    [T, B, F]."""
     return {("next", "state"): arrived}
 
 
@@ -57,10 +66,14 @@ def draw(storage: BackupdateStorage, delay: int, n: int) -> TensorDictBase:
     return storage.steps[arrived[step], world]
 
 
-def make_actor_and_loss(env: TransformedEnv, critics_read: str) -> tuple[ProbabilisticActor, SACLoss]:
+def make_actor_and_loss(
+    env: TransformedEnv, critics_read: str
+) -> tuple[ProbabilisticActor, SACLoss]:
     """TorchRL's soft actor-critic: the actor reads ``known``."""
     bounds, n_actions = env.action_spec.space, env.action_spec.shape[-1]
-    network = nn.Sequential(MLP(out_features=2 * n_actions, num_cells=[128, 128]), NormalParamExtractor())
+    network = nn.Sequential(
+        MLP(out_features=2 * n_actions, num_cells=[128, 128]), NormalParamExtractor()
+    )
     actor = ProbabilisticActor(
         TensorDictModule(network, ["known"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -73,7 +86,11 @@ def make_actor_and_loss(env: TransformedEnv, critics_read: str) -> tuple[Probabi
 
 
 def train(
-    delay: int = 6, late_critics: bool = False, frames: int = 20_000, warm_up: int = WARM_UP, seed: int = 0
+    delay: int = 6,
+    late_critics: bool = False,
+    frames: int = 20_000,
+    warm_up: int = WARM_UP,
+    seed: int = 0,
 ) -> tuple[BackupdateStorage, list[float]]:
     """Train with one update in each step; returns the storage and the returns of the episodes."""
     torch.manual_seed(seed)
@@ -85,7 +102,9 @@ def train(
     now, returns = env.reset(), []
     for n_steps in range(frames):
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            step, now = env.step_and_maybe_reset(actor(now) if n_steps >= warm_up else env.rand_action(now))
+            step, now = env.step_and_maybe_reset(
+                actor(now) if n_steps >= warm_up else env.rand_action(now)
+            )
         buffer.extend(step.reshape(-1, 1))  # [B, 1], with or without a batch size
         if n_steps >= warm_up:
             losses = loss(draw(storage, delay, BATCH))
@@ -96,7 +115,10 @@ def train(
         if step["next", "done"].item():
             returns.append(step["next", "episode_reward"].item())
             if len(returns) % 10 == 0:
-                print(f"{n_steps + 1:6} steps: mean return of ten episodes {sum(returns[-10:]) / 10:.0f}")
+                print(
+                    f"{n_steps + 1:6} steps: mean return of ten episodes "
+                    f"{sum(returns[-10:]) / 10:.0f}"
+                )
     return storage, returns
 
 

@@ -1,1 +1,2 @@
-"""The programs of DAMIAN, which the command ``damian`` runs; installed, they are ``damian.recipes``."""
+"""The programs of DAMIAN, which the command ``damian`` runs; installed, they are
+``damian.recipes``."""

@@ -1,7 +1,8 @@
-"""What the programs share: schemas, options of the user's own, checked settings, and errors in one line.
+"""What the programs share: schemas, options of the user's own, checked settings, and errors in one
+line.
 
-Nothing here imports torch. A program is a function that takes what Hydra has composed (``program``);
-``shared/runs.py`` starts its work in the run folder.
+Nothing here imports torch. A program is a function that takes what Hydra has composed
+(``program``); ``shared/runs.py`` starts its work in the run folder.
 """
 
 import functools
@@ -16,7 +17,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``one_line_errors`` prints them
+os.environ.setdefault(
+    "HYDRA_FULL_ERROR", "1"
+)  # Hydra raises its errors, and ``one_line_errors`` prints them
 
 import hydra
 import yaml
@@ -47,7 +50,8 @@ EXPECTED = (InputError, RunError, OSError, *ERRORS)
 
 
 def _schema(kind: type) -> DictConfig:
-    """The settings of a dataclass at their defaults; mappings take any key, which ``filled`` checks."""
+    """The settings of a dataclass at their defaults; mappings take any key, which ``filled``
+    checks."""
     found = OmegaConf.create()
     for key, each in described(kind).items():
         if not key.startswith("learner."):  # the group fills it in
@@ -87,7 +91,8 @@ def settings(*words: str, program: str = "train") -> Any:
 
 
 def composed(*words: str, program: str = "train") -> DictConfig:
-    """What Hydra composes from words; in a program of damian with the options of its --config-dir."""
+    """What Hydra composes from words; in a program of damian with the options of its
+    --config-dir."""
     running = GlobalHydra.instance().hydra
     try:
         _register_own(words)
@@ -111,8 +116,9 @@ def checked(given: DictConfig, words: Sequence[str], program: str = "train") -> 
 def plain(given: DictConfig, words: Sequence[str], program: str = "train") -> dict[str, Any]:
     """A composed configuration as plain data.
 
-    A law, or another setting that is one value, replaces what stood there also where it is a mapping, which
-    Hydra merges. What a scenario says of a learner (``tuning``) gives way to the words.
+    A law, or another setting that is one value, replaces what stood there also where it is a
+    mapping, which Hydra merges. What a scenario says of a learner (``tuning``) gives way to the
+    words.
     """
     own = OmegaConf.masked_copy(given, [str(key) for key in given if key != "hydra"])
     values: Any = OmegaConf.to_container(own, resolve=True)
@@ -121,7 +127,9 @@ def plain(given: DictConfig, words: Sequence[str], program: str = "train") -> di
     for word in OverridesParser.create().parse_overrides([*words]):
         key, value = word.key_or_group, word.value()
         setting = known.get(key)
-        replaced |= {key} if setting and not setting.is_section and isinstance(value, Mapping) else set()
+        replaced |= (
+            {key} if setting and not setting.is_section and isinstance(value, Mapping) else set()
+        )
         if any(f"{key}.".startswith(f"{each}.") for each in replaced):
             set_at(values, key, value)
     tuned = values.pop("tuning", None) or {}
@@ -132,7 +140,8 @@ def plain(given: DictConfig, words: Sequence[str], program: str = "train") -> di
 
 
 def options_in(group: str, option: str = "*") -> Iterator[tuple[dict[str, Any], list[str]]]:
-    """What the files of a group's options set, as nested settings, and what their defaults lists name.
+    """What the files of a group's options set, as nested settings, and what their defaults lists
+    name.
 
     They lie in ``conf`` and in the folder of ``--config-dir``.
     """
@@ -141,20 +150,36 @@ def options_in(group: str, option: str = "*") -> Iterator[tuple[dict[str, Any], 
         for file in sorted((folder / group).rglob(f"{option}.yaml")):
             text = file.read_text(encoding="utf-8")
             written = yaml.safe_load(text) or {}
-            chosen = [name for each in written.pop("defaults", ()) if isinstance(each, dict) for name in each]
+            chosen = [
+                name
+                for each in written.pop("defaults", ())
+                if isinstance(each, dict)
+                for name in each
+            ]
             yield written if "@package _global_" in text else {group: written}, chosen
 
 
-def _check_whole(values: Mapping[str, Any], words: Sequence[str], choices: Mapping[str, Any]) -> None:
-    """Refuse a law that Hydra has merged from two files, such as that of a scenario over ``delay=burst``."""
-    for key in (key for key in LAWS if not any(f"{key_of(word)}.".startswith(f"{key}.") for word in words)):
+def _check_whole(
+    values: Mapping[str, Any], words: Sequence[str], choices: Mapping[str, Any]
+) -> None:
+    """Refuse a law that Hydra has merged from two files, such as that of a scenario over
+    ``delay=burst``."""
+    for key in (
+        key for key in LAWS if not any(f"{key_of(word)}.".startswith(f"{key}.") for word in words)
+    ):
         law = value_at(values, key)
         options = choices.items() if isinstance(law, Mapping) else ()
         files = [
-            value_at(found, key) for each in options for found, _ in options_in(*each) if "/" not in each[0]
+            value_at(found, key)
+            for each in options
+            for found, _ in options_in(*each)
+            if "/" not in each[0]
         ]
         written = [found for found in files if isinstance(found, Mapping) and "law" in found]
-        problem = f"mixes laws of several files; write the one that you mean as a whole: {key}={{law: ...}}"
+        problem = (
+            "mixes laws of several files; write the one that you mean as a whole: "
+            f"{key}={{law: ...}}"
+        )
         checks.require(not written or law in written, key, law, problem)
 
 
@@ -178,7 +203,8 @@ def reason(error: BaseException, program: str = "train") -> str:
 
 @contextmanager
 def one_line_errors(program: str = "train") -> Iterator[None]:
-    """End a program with one line on stderr if input is wrong (code 2) or a run cannot go on (3)."""
+    """End a program with one line on stderr if input is wrong (code 2) or a run cannot go on
+    (3)."""
     _register_own(sys.argv[1:])
     try:
         yield
@@ -193,20 +219,27 @@ def one_line_errors(program: str = "train") -> Iterator[None]:
     except KeyboardInterrupt:
         end_interrupted()
     finally:
-        if HydraConfig.initialized() and not OmegaConf.is_missing(HydraConfig.get().runtime, "output_dir"):
+        if HydraConfig.initialized() and not OmegaConf.is_missing(
+            HydraConfig.get().runtime, "output_dir"
+        ):
             folder = Path(HydraConfig.get().runtime.output_dir)
-            with suppress(OSError):  # a refused run has nothing in the folder that Hydra has made for it
+            with suppress(
+                OSError
+            ):  # a refused run has nothing in the folder that Hydra has made for it
                 if folder.resolve() != Path.cwd():
                     folder.rmdir()
 
 
 def program(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Decorator of a program's ``main``: Hydra composes its argument from ``conf/NAME.yaml`` and words."""
+    """Decorator of a program's ``main``: Hydra composes its argument from ``conf/NAME.yaml`` and
+    words."""
 
     def decorated(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         @functools.wraps(main)
         def work(given: DictConfig) -> None:
-            with one_line_errors(name):  # here too: Hydra prints a line about an error that reaches it
+            with one_line_errors(
+                name
+            ):  # here too: Hydra prints a line about an error that reaches it
                 main(given)
 
         return one_line_errors(name)(hydra.main("../conf", name, version_base=None)(work))
@@ -215,12 +248,14 @@ def program(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], 
 
 
 def _sweep_name(sweep: Sequence[str]) -> str:
-    """The name of a sweep's folder, the same for the same command: what is swept, and a hash of all words."""
+    """The name of a sweep's folder, the same for the same command: what is swept, and a hash of all
+    words."""
     return f"{_run_name(sweep, sweep)}-{_hash(' '.join(sweep))}"
 
 
 def _run_name(sweep: Sequence[str], words: Sequence[str]) -> str:
-    """The name of a run's folder: the settings in which the runs of a sweep differ, or their hash."""
+    """The name of a run's folder: the settings in which the runs of a sweep differ, or their
+    hash."""
     parsed = OverridesParser.create().parse_overrides([*sweep])
     swept = {each.key_or_group for each in parsed if each.is_sweep_override()}
     text = "_".join(word.replace("=", "-") for word in words if key_of(word) in swept) or "run"
@@ -234,7 +269,9 @@ def _hash(text: str) -> str:
 
 LONGEST_NAME = 80
 """Letters of the name of a folder in a sweep before its hash."""
-OmegaConf.register_new_resolver("damian.typed", list, use_cache=True)  # a run of a sweep finds those of all
+OmegaConf.register_new_resolver(
+    "damian.typed", list, use_cache=True
+)  # a run of a sweep finds those of all
 OmegaConf.register_new_resolver("damian.sweep_name", _sweep_name)
 OmegaConf.register_new_resolver("damian.run_name", _run_name)
 

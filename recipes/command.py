@@ -23,12 +23,15 @@ MORE = "damian PROGRAM --help explains a program's settings, damian --version pr
 def main(words: Sequence[str] | None = None) -> None:
     """Run the program that the first word names with the other words."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a pipe of Windows may be unable to carry every letter
+        if isinstance(
+            stream, io.TextIOWrapper
+        ):  # a pipe of Windows may be unable to carry every letter
             stream.reconfigure(errors="backslashreplace")
-    # Threads that wait for each other soon sleep: where other programs run, a training whose threads keep
-    # spinning takes several times as long. OpenMP reads this when torch is loaded.
+    # Threads that wait for each other soon sleep: where other programs run, a training whose
+    # threads keep spinning takes several times as long. OpenMP reads this when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    # Compiled kernels: torch's own choice is a temporary folder, which the next boot, or job, lacks.
+    # Compiled kernels: torch's own choice is a temporary folder, which the next boot, or job,
+    # lacks.
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(Path(caches, "torchinductor")))
     name, *words = (sys.argv[1:] if words is None else words) or ["--help"]
@@ -42,7 +45,9 @@ def main(words: Sequence[str] | None = None) -> None:
             if checked is None:
                 return
             program = import_module(f".{name}", __package__)
-        except InputError as error:  # also a package that the program needs and that is not installed
+        except (
+            InputError
+        ) as error:  # also a package that the program needs and that is not installed
             print(f"error: {one_line(str(error))}", file=sys.stderr)
             sys.exit(2)
         sys.argv = [f"damian {name}", *checked]  # the program's own command line, which Hydra reads
@@ -53,7 +58,9 @@ def _checked(name: str, words: list[str]) -> list[str] | None:
     """The words for a program; None if it was asked for help, which is printed."""
     if name not in PROGRAMS:
         raise InputError(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}")
-    options = [word for word in words if word.startswith("-") or ("=" not in word and word[:1] != "~")]
+    options = [
+        word for word in words if word.startswith("-") or ("=" not in word and word[:1] != "~")
+    ]
     rest = [word for word in words if word not in options]
     before = dict(zip(options, ["", *options], strict=False))
     plain = [word for word in options if word[:1] != "-" and before[word][:1] != "-"]

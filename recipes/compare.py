@@ -1,4 +1,5 @@
-"""Train and evaluate several methods with several seeds over tasks and delays, and compare their results.
+"""Train and evaluate several methods with several seeds over tasks and delays, and compare their
+results.
 
 damian compare experiment=usecases "tasks=[usecase2]" seeds=2 "overrides=['frames=1000','eval_episodes=8']"
 damian compare experiment=delaybench seeds=10 processes=2 "delays=[paper]" "methods=[undelayed,naive]"
@@ -59,12 +60,21 @@ TABLE, CURVES, PROFILES = "table.csv", "curves.png", "profiles.png"
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
-    """Every run with its checked settings: seed after seed, and last what flies others' policies."""
-    tasks, delays, runs = config.chosen("tasks"), {NOT_LATE: [], **config.chosen("delays")}, list[Run]()
-    composed = cache(cli.settings)  # several methods differ only in whose policy they fly: 0.2 s each
+    """Every run with its checked settings: seed after seed, and last what flies others'
+    policies."""
+    tasks, delays, runs = (
+        config.chosen("tasks"),
+        {NOT_LATE: [], **config.chosen("delays")},
+        list[Run](),
+    )
+    composed = cache(
+        cli.settings
+    )  # several methods differ only in whose policy they fly: 0.2 s each
     places = [(task, task, HeldOut()) for task in tasks]
     for name, held_out in config.experiment.held_out.items():
-        places += [(f"{t}{HELD_OUT_MARK}{name}", t, held_out) for t in tasks if _in(held_out.tasks, t)]
+        places += [
+            (f"{t}{HELD_OUT_MARK}{name}", t, held_out) for t in tasks if _in(held_out.tasks, t)
+        ]
     for (place, task, held_out), (delay, words) in product(places, delays.items()):
         for name, method in config.chosen("methods").items():
             fits = method.delayed == (delay != NOT_LATE) and _in(method.tasks, task)
@@ -77,7 +87,9 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
             with named(_place(run.folder.parent)):
                 check_policy_fits(run.config, by_folder[Path(run.config.checkpoint)])
     succeeds = any(run.config.episode.can_succeed for run in runs)
-    should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
+    should = (
+        "is in none of the tasks anything that can be reached: choose return or perceived_return"
+    )
     checks.require(succeeds or "success" not in config.score, "score", config.score, should)
     measured = all(config.score in (*BUILT_IN, *run.config.metrics) for run in runs)
     should = f"is not measured by every run: add overrides=['metrics=[{config.score}]']"
@@ -95,7 +107,8 @@ def _place(folder: Path) -> str:
 
 
 def _replaced(words: Sequence[str], by: Sequence[str]) -> list[str]:
-    """Words without those that others replace, and the others: ``delay=paper`` replaces ``delay.obs=4``."""
+    """Words without those that others replace, and the others: ``delay=paper`` replaces
+    ``delay.obs=4``."""
     keys = tuple(f"{key_of(word)}." for word in by)
     return [*(word for word in words if not f"{key_of(word)}.".startswith(keys)), *by]
 
@@ -119,7 +132,9 @@ def _seeds(
         late_by = [] if method.delayed else late(unseeded.make_delays())
         if late_by and away:
             return  # a held-out delay, under which the undelayed method is not flown
-        should = "delays this method, with which others are compared: put delays under experiment.delays"
+        should = (
+            "delays this method, with which others are compared: put delays under experiment.delays"
+        )
         checks.require(not late_by, ", ".join(late_by), "its value", should)
         if trains:
             able = not method.teacher or hasattr(unseeded.learner, "teacher")
@@ -142,7 +157,9 @@ def _seeds(
 def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
     """Which rows of results are of a task, a delay, a method and a seed that are asked for."""
     tasks, first = [*config.chosen("tasks")], config.experiment.first_seed
-    tasks += [f"{task}{HELD_OUT_MARK}{name}" for task in tasks for name in config.experiment.held_out]
+    tasks += [
+        f"{task}{HELD_OUT_MARK}{name}" for task in tasks for name in config.experiment.held_out
+    ]
     delays, methods = [NOT_LATE, *config.chosen("delays")], [*config.chosen("methods")]
     asked = {"task": tasks, "delay": delays, "method": methods}
     last = math.inf if config.seeds is None else config.every_seed[-1]
@@ -160,7 +177,8 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
 
 
 def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) -> list[str]:
-    """Lines above the tables: the command, the number of seeds and episodes, what the columns mean."""
+    """Lines above the tables: the command, the number of seeds and episodes, what the columns
+    mean."""
     seeds, episodes = rows["seed"], sorted(rows["episodes"].astype(int).unique())
     few = rows.groupby(RUN[:-1])["seed"].nunique().min() < SEEDS or episodes[0] < EPISODES
     return [
@@ -169,12 +187,17 @@ def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) ->
         f"{seeds.nunique()} seeds ({seeds.min()} to {seeds.max()}), "
         f"{' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: bootstrap over seeds, widened for few seeds; none below "
-        f"{FEWEST}]; J: {config.score} of the sampled policy; perceived: as far as the server knew, "
-        "else as it truly was; age in steps; backupdated: share of the rewards in training; n: seeds",
-        "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (late "
+        f"{FEWEST}]; J: {config.score} of the sampled policy; perceived: as far as the server "
+        "knew, "
+        "else as it truly was; age in steps; backupdated: share of the rewards in training; n: "
+        "seeds",
+        "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track "
+        "(late "
         "data, or simulator), 1 undelayed, not shown where "
-        "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
-        "one of the strongest naive method, with its score interval; n compared: seeds that all have",
+        "the delay costs less than a tenth of undelayed - random; P > naive: probability that a "
+        "run beats "
+        "one of the strongest naive method, with its score interval; n compared: seeds that all "
+        "have",
         *[f"missing: {', '.join(missing)}"] * bool(missing),
     ]
 
@@ -237,5 +260,7 @@ def main(given: DictConfig) -> None:
     running = HydraConfig.get()
     folder = cli.short(Path(running.runtime.output_dir))
     config = cli.checked(given, running.overrides.task, "compare")
-    with nullcontext() if config.report_only else locked(folder):  # it may be reported on while it runs
+    with (
+        nullcontext() if config.report_only else locked(folder)
+    ):  # it may be reported on while it runs
         compare(config, folder)

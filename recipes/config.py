@@ -1,4 +1,5 @@
-"""All settings of the programs but ``damian compare``: those of ``damian train``, which the others extend."""
+"""All settings of the programs but ``damian compare``: those of ``damian train``, which the others
+extend."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -13,7 +14,6 @@ from damian.models.config import MODELS, MlpConfig, ModelConfig
 from damian.runs.config import LoggerConfig
 from damian.runs.measures import check_score
 
-FORMATS = ("gif", "mp4", "png", "html", "geojson")
 COMPILE_FROM = 1_000_000
 """Environment steps from which on compiling saves more time than it takes, half a minute."""
 
@@ -32,70 +32,100 @@ class TrainConfig(ScenarioConfig):
     logger: LoggerConfig = setting(LoggerConfig)
     seed: int = setting(0, "Seed of all random draws.", low=0, high=2**31)
     worlds: int = setting(64, "Number of parallel environments.", low=1, high=checks.WORLDS)
-    frames: int = setting(300000, "Environment steps to learn from, over all worlds.", low=1, high=1e12)
+    frames: int = setting(
+        300000, "Environment steps to learn from, over all worlds.", low=1, high=1e12
+    )
     episodes: int | None = setting(
-        None, "Stop after this number of episodes, if that comes before ``frames``.", low=1, high=1e12
+        None,
+        "Stop after this number of episodes, if that comes before ``frames``.",
+        low=1,
+        high=1e12,
     )
     eval_episodes: int = setting(200, "Episodes of each evaluation.", low=1, high=checks.WORLDS)
     metrics: list[str] = setting([], "Further metrics of evaluations, such as package.module:name.")
-    eval_every: int | None = setting(None, "Updates between two evaluations on the way.", low=1, high=1e12)
+    eval_every: int | None = setting(
+        None, "Updates between two evaluations on the way.", low=1, high=1e12
+    )
     checkpoint_every: int = setting(
         20, "Updates between two checkpoints: what a killed run loses at most.", low=1, high=1e12
     )
     backupdate: bool = setting(
-        False, "Late messages and rewards correct stored steps before the learner uses them (section 3.4)."
+        False,
+        "Late messages and rewards correct stored steps before the learner uses them (section 3.4).",
     )
     settle: bool = setting(
-        False, "With ``backupdate``: learn from a step only when nothing of it can be in transit any more."
+        False,
+        "With ``backupdate``: learn from a step only when nothing of it can be in transit any more.",
     )
     corrected: list[str] = setting(
         ["reward", "critic"],
-        "With ``backupdate``: what late messages correct: reward, critic (its observation), actor (its own).",
+        "With ``backupdate``: what late messages correct: reward, critic (its observation), actor "
+        "(its own).",
     )
     checkpoint: str | None = setting(
-        None, "Run folder, its best.pt, or damian:NAME: the policy to begin with or to fly, and its settings."
+        None,
+        "Run folder, its best.pt, or damian:NAME: the policy to begin with or to fly, and its "
+        "settings.",
     )
-    overrides: list[str] = constant([], "Words of the command line, to be shown; the program fills them in.")
+    overrides: list[str] = constant(
+        [], "Words of the command line, to be shown; the program fills them in."
+    )
     resume: str | None = setting(None, "Run folder of the run to continue.")
     device: str = setting("cpu", "Device of all tensors: cpu, cuda, cuda:1, ...")
     threads: int = setting(
-        1, "Threads of the learning; more help only networks much larger than the default.", low=1, high=1024
+        1,
+        "Threads of the learning; more help only networks much larger than the default.",
+        low=1,
+        high=1024,
     )
     compile: Any = setting(
         "auto",
         "Compile the steps, the actor and MAPPO's loss; auto does from a million ``frames`` on.",
         choices=("auto", True, False),
     )
-    trust: bool = setting(False, "Import the components package.module:Name that a run folder names.")
+    trust: bool = setting(
+        False, "Import the components package.module:Name that a run folder names."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for key, registry in (("learner", LEARNERS), ("model", MODELS)):
             section = getattr(self, key)
-            problem = f"is not the {key} of these settings: choose one with {key}={'|'.join(registry)}"
+            problem = (
+                f"is not the {key} of these settings: choose one with {key}={'|'.join(registry)}"
+            )
             matches = type(section) is registry.get(section.name, key)
             checks.require(matches, f"{key}.name", section.name, problem)
         checks.names("corrected", self.corrected, ("reward", "critic", "actor"))
         self.refuse(not self.corrected, "corrected", "is empty: choose reward, critic or actor")
         if self.observation.belief and not self.seeks_source:  # aware=belief suits any task
             keys = "observation.belief" + " and model.skip" * self.model.skip
-            warnings.warn(f"{keys}: left out, because nothing is won by finding the source", stacklevel=2)
+            warnings.warn(
+                f"{keys}: left out, because nothing is won by finding the source", stacklevel=2
+            )
             self.observation = replace(self.observation, belief=[])
             self.model = replace(self.model, skip=False)
 
     @property
     def compiles(self) -> bool:
-        """Whether to compile; ``auto`` leaves out sensors of the user's own, which Inductor may crash on."""
-        return self.frames >= COMPILE_FROM and not self.sensors if self.compile == "auto" else self.compile
+        """Whether to compile; ``auto`` leaves out sensors of the user's own, which Inductor may
+        crash on."""
+        return (
+            self.frames >= COMPILE_FROM and not self.sensors
+            if self.compile == "auto"
+            else self.compile
+        )
 
     @property
     def update_steps(self) -> int:
-        """Steps of every world before the first update: the system clock's period, or ``learner.steps``."""
+        """Steps of every world before the first update: the system clock's period, or
+        ``learner.steps``."""
         return self.clock.steps("system") if self.clock.system else self.learner.steps
 
     @property
     def eval_seed(self) -> int:
-        """Seed of the initial conditions of an evaluation; they differ from those of the training."""
+        """Seed of the initial conditions of an evaluation; they differ from those of the
+        training."""
         return self.seed + 10_000
 
     @property
@@ -116,19 +146,26 @@ class FlyConfig(TrainConfig):
         choices=(*STORED, "script", "random"),
     )
     keep: str = setting(
-        "all", "Keep all, or the best, median and worst episode (extremes).", choices=("all", "extremes")
+        "all",
+        "Keep all, or the best, median and worst episode (extremes).",
+        choices=("all", "extremes"),
     )
     formats: list[str] = setting(
         ["gif", "png"],
-        "What to make of each: films (gif, mp4), a figure (png), a page (html), or geojson for map tools.",
-        choices=FORMATS,
+        "What to make of each: films (gif, mp4), a figure (png), a page (html), or geojson for map "
+        "tools.",
+        choices=("gif", "mp4", "png", "html", "geojson"),
     )
-    views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
+    views: list[str] = setting(
+        ["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d")
+    )
     shown: list[str] = setting(
         [],
         "UAVs that films tell apart, by number; if none, all of up to 6, 3 of more.",
     )
-    replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
+    replay: list[str] = setting(
+        [], "Stored episodes to play side by side in one page, instead of flying."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,21 +205,29 @@ class FitConfig(Settings):
 class ExportConfig(Settings):
     """All settings of ``damian export``."""
 
-    checkpoint: str | None = setting(None, "Run folder, its best.pt, or damian:NAME: the policy to export.")
-    trust: bool = setting(False, "Import the components package.module:Name that the run folder names.")
+    checkpoint: str | None = setting(
+        None, "Run folder, its best.pt, or damian:NAME: the policy to export."
+    )
+    trust: bool = setting(
+        False, "Import the components package.module:Name that the run folder names."
+    )
 
 
 @dataclass
 class ResultsConfig(Settings):
     """All settings of ``damian results``."""
 
-    folders: list[str] = setting([], "Folder of a run, a sweep or a comparison; or two folders to compare.")
+    folders: list[str] = setting(
+        [], "Folder of a run, a sweep or a comparison; or two folders to compare."
+    )
     score: str = setting("return", "Metric whose differences the table of two folders has.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_score(self.score)
-        self.refuse(len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare")
+        self.refuse(
+            len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare"
+        )
 
 
 @dataclass
@@ -196,4 +241,6 @@ class SubmitConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("folder", "method", "authors"):
-            self.refuse(not getattr(self, name), name, "is missing: damian submit --help shows an example")
+            self.refuse(
+                not getattr(self, name), name, "is missing: damian submit --help shows an example"
+            )

@@ -36,7 +36,8 @@ likely one is taken. A policy without memory often needs chance to search."""
 
 
 def fly(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the policy of ``config.checkpoint``, or the untrained networks, and fill the run folder."""
+    """Evaluate the policy of ``config.checkpoint``, or the untrained networks, and fill the run
+    folder."""
     env = make_eval_env(config)
     actor = stored_actor(config, env) if config.checkpoint else None
     save_config(config, folder)
@@ -65,15 +66,19 @@ def load(
     deterministic: bool = False,
     trust: bool = False,
 ) -> Loaded:
-    """Load the trained policy of a run folder, with an environment of its scenario or of a changed one.
+    """Load the trained policy of a run folder, with an environment of its scenario or of a changed
+    one.
 
     Args:
-        run: run folder, the ``best.pt`` in it, or ``damian:NAME``, one of the package (docs/policies.md).
+        run: run folder, the ``best.pt`` in it, or ``damian:NAME``, one of the package
+            (docs/policies.md).
         *overrides: changes to the settings of the run, such as ``delay.obs=6`` or ``agents=5``.
         worlds: number of parallel worlds of the environment, B.
         seed: of the environment; that of ``damian evaluate`` if not given.
-        deterministic: take the most likely actions; if not, they are drawn from the policy's distribution.
-        trust: import the components ``package.module:Name`` that the run names, which runs their code.
+        deterministic: take the most likely actions; if not, they are drawn from the policy's
+            distribution.
+        trust: import the components ``package.module:Name`` that the run names, which runs their
+            code.
 
     Returns:
         The policy, without gradients, and the environment, [B].
@@ -97,7 +102,8 @@ def load(
 
 
 def make_eval_env(config: TrainConfig) -> DelayedEnv:
-    """The environment of an evaluation, a world for each episode; its initial conditions are new."""
+    """The environment of an evaluation, a world for each episode; its initial conditions are
+    new."""
     return make_env(config, config.eval_episodes, config.eval_seed, config.device, ["message"])
 
 

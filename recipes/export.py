@@ -1,9 +1,10 @@
-"""Export a trained policy, so that it can fly without damian: on a companion computer, or in another program.
+"""Export a trained policy, so that it can fly without damian: on a companion computer, or in
+another program.
 
 damian export runs/FOLDER    # fills runs/FOLDER/export
 
-``policy.pt2`` is a program of ``torch.export``, ``policy.onnx`` the same for ONNX runtimes; ``policy.json``
-says what goes in and what comes out (docs/runs.md).
+``policy.pt2`` is a program of ``torch.export``, ``policy.onnx`` the same for ONNX runtimes;
+``policy.json`` says what goes in and what comes out (docs/runs.md).
 """
 
 import json
@@ -55,12 +56,16 @@ def export(run: Path, trust: bool = False) -> Path:
         make_folder(target, below=named)
         torch.export.save(program, not_linked(target / "policy.pt2"))
         onnx.save(not_linked(target / "policy.onnx"), external_data=False)
-    text = json.dumps(described, indent=2, default=lambda x: x.tolist() if isinstance(x, Tensor) else str(x))
+    text = json.dumps(
+        described, indent=2, default=lambda x: x.tolist() if isinstance(x, Tensor) else str(x)
+    )
     write_atomically(target / "policy.json", text + "\n")
     return target
 
 
-def describe(run: Path, policy: ExportedPolicy, env: DelayedEnv, any_number: bool) -> dict[str, Any]:
+def describe(
+    run: Path, policy: ExportedPolicy, env: DelayedEnv, any_number: bool
+) -> dict[str, Any]:
     """What goes in and what comes out, for people and programs without damian."""
     scenario, inputs = env.uav_env.scenario, {}
     for name, key in zip(policy.inputs, policy.in_keys, strict=True):
@@ -115,12 +120,27 @@ def actions(config: ActionConfig, spec: TensorSpec) -> dict[str, Any]:
     units = {"distance": "m", "heading": "degrees, clockwise from north"}
     if isinstance(spec, Bounded):
         low, high = (bound[0].tolist() for bound in (spec.low, spec.high))
-        meaning = "the bounds low and high of an action stand for these; a value beyond counts as the bound"
+        meaning = (
+            "the bounds low and high of an action stand for these; a value beyond counts as the "
+            "bound"
+        )
         ends = {"distance": [0.0, max(config.distances)], "heading": [0.0, 360.0]}
-        return {"units": units, "columns": [*ends], "low": low, "high": high, **ends, "meaning": meaning}
+        return {
+            "units": units,
+            "columns": [*ends],
+            "low": low,
+            "high": high,
+            **ends,
+            "meaning": meaning,
+        }
     rows = action_table(config, torch.float64).tolist()
     table = [[distance, math.degrees(heading)] for distance, heading in rows]
-    return {"meaning": "index of a row", "units": units, "columns": ["distance", "heading"], "table": table}
+    return {
+        "meaning": "index of a row",
+        "units": units,
+        "columns": ["distance", "heading"],
+        "table": table,
+    }
 
 
 @cli.program("export")

@@ -1,4 +1,5 @@
-"""Fit a law to recorded delays: how late the messages of a log were, as a trace to train with, and as a law.
+"""Fit a law to recorded delays: how late the messages of a log were, as a trace to train with, and
+as a law.
 
 damian fit log=reports.csv                                          (a table with times and receive times)
 damian fit log=journals/north.jsonl clock.simulation=0.5s           (the journal of a service for fleets)
@@ -25,7 +26,8 @@ from .config import FitConfig
 
 
 def fit(config: FitConfig, folder: Path) -> None:
-    """Write the delays of a log of reports as a trace, and tell and draw which law fits them best."""
+    """Write the delays of a log of reports as a trace, and tell and draw which law fits them
+    best."""
     log, dt = Path(config.log), config.clock.dt
     messages = in_order(read_log(log))
     right = are_right(messages)
@@ -45,23 +47,32 @@ def fit(config: FitConfig, folder: Path) -> None:
 
 
 def summary(messages: pd.DataFrame) -> str:
-    """The fitted delays and losses as text, with a line about those that came in before their time."""
+    """The fitted delays and losses as text, with a line about those that came in before their
+    time."""
     delays, n, time = messages.delay.dropna(), len(messages), messages.time
     n_lost, early = n - len(delays), (time - messages.received)[messages.received < time]
     median, most, nearly_all = np.quantile(delays, [0.5, 0.9, 0.99])
-    problem = "came in before their time, because clocks differ, and count as 0 s late; the earliest by"
+    problem = (
+        "came in before their time, because clocks differ, and count as 0 s late; the earliest by"
+    )
     clocks = f"\n{len(early)} {problem} {early.max():.3g} s" if len(early) else ""
     return (
-        f"{n} messages of {messages.uav.nunique()} UAVs over {time.max() - time.min():.0f} s; lost: {n_lost} "
+        f"{n} messages of {messages.uav.nunique()} UAVs over {time.max() - time.min():.0f} s; "
+        f"lost: {n_lost} "
         f"({n_lost / n:.1%})\n"
-        f"delay [s]: mean {delays.mean():.3f}, median {median:.3f}, 90 % {most:.3f}, 99 % {nearly_all:.3f}, "
+        f"delay [s]: mean {delays.mean():.3f}, median {median:.3f}, 90 % {most:.3f}, 99 % "
+        f"{nearly_all:.3f}, "
         f"longest {delays.max():.3f}{clocks}"
     )
 
 
 def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
-    """The law that ``fit_laws`` finds as settings, and what of the delays it does not repeat, as text."""
-    other, gain = np.abs(best.chances - own.chances).sum() / 2, (own.likelihood - best.likelihood) / best.n
+    """The law that ``fit_laws`` finds as settings, and what of the delays it does not repeat, as
+    text."""
+    other, gain = (
+        np.abs(best.chances - own.chances).sum() / 2,
+        (own.likelihood - best.likelihood) / best.n,
+    )
     law, loss = str(best.written).replace("'", ""), f" delay.loss={best.loss}" * (best.loss > 0)
     text = f'best law: "delay.obs={law}"{loss} clock.simulation={dt:g}s\n'
     text += f"it gives {other:.1%} of the messages another delay; "

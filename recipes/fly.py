@@ -1,4 +1,5 @@
-"""Fly episodes and keep each as file, film, figure or page: what is true, and what the server believes.
+"""Fly episodes and keep each as file, film, figure or page: what is true, and what the server
+believes.
 
 damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
 damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"   (in one page, side by side)

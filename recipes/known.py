@@ -1,4 +1,5 @@
-"""What can be said on a command line: the settings and options that are known, help, and hints for typos.
+"""What can be said on a command line: the settings and options that are known, help, and hints for
+typos.
 
 Nothing here imports torch or Hydra, so that help and a misspelt word are answered at once.
 """
@@ -24,7 +25,8 @@ from damian.learners.config import LEARNERS
 from .config import ExportConfig, FitConfig, FlyConfig, ResultsConfig, SubmitConfig, TrainConfig
 
 CONF = Path(__file__).parents[1] / "conf"
-"""Folder of the configuration files: one for each program, and in folders one for each option of a group."""
+"""Folder of the configuration files: one for each program, and in folders one for each option of a
+group."""
 SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
     "evaluate": TrainConfig,
@@ -87,7 +89,11 @@ def described(kind: type, path: str = "") -> dict[str, Setting]:
         rule, default, declared = rules(kind)[each.name], default_of(each), each.type
         section: Any = next((x for x in (type(default), declared) if is_dataclass(x)), None)
         if not rule.fixed:
-            named = str(declared) if "[" in str(declared) else getattr(declared, "__name__", str(declared))
+            named = (
+                str(declared)
+                if "[" in str(declared)
+                else getattr(declared, "__name__", str(declared))
+            )
             value = None if section else default
             found[f"{path}{each.name}"] = Setting(named, value, rule.meaning, section is not None)
             found |= described(section, f"{path}{each.name}.") if section else {}
@@ -97,7 +103,9 @@ def described(kind: type, path: str = "") -> dict[str, Setting]:
 def default_options(program: str) -> dict[str, str]:
     """The groups of a program, each with its default option; ``???`` if one must be chosen."""
     found: dict[str, str] = {}
-    for each in yaml.safe_load((CONF / f"{program}.yaml").read_text(encoding="utf-8")).get("defaults", []):
+    for each in yaml.safe_load((CONF / f"{program}.yaml").read_text(encoding="utf-8")).get(
+        "defaults", []
+    ):
         if isinstance(each, dict):
             found |= {group: option for group, option in each.items() if " " not in group}
         elif (CONF / f"{each}.yaml").is_file():
@@ -121,14 +129,17 @@ def key_of(word: str) -> str:
 
 
 def check_words(program: str, words: Iterable[str]) -> None:
-    """Refuse unknown keys and options, as far as the words alone can tell, without any slow import."""
+    """Refuse unknown keys and options, as far as the words alone can tell, without any slow
+    import."""
     options = groups()
     for word in words:
         key, _, value = word.partition("=")
         if key in options:
             names = [name for name in value.split(",") if re.fullmatch(r"[\w/.-]+", name)]
             if key == "delay" and re.match(r"-?\d", value):
-                raise InputError(f"delay: {value} is not an option of this group; write delay.obs={value}")
+                raise InputError(
+                    f"delay: {value} is not an option of this group; write delay.obs={value}"
+                )
             if wrong := [name for name in names if name not in (*options[key], "null")]:
                 raise InputError(f"{key}: {wrong[0]} is not one of {', '.join(options[key])}")
         elif not (is_known(key, program) or key.startswith(("hydra", "+", "~", "-"))):
@@ -136,7 +147,8 @@ def check_words(program: str, words: Iterable[str]) -> None:
 
 
 def is_known(key: str, program: str) -> bool:
-    """Is a key that of a setting, or below one that holds anything, or of a learner or model of the user's own?"""
+    """Is a key that of a setting, or below one that holds anything, or of a learner or model of the
+    user's own?"""
     known, parts = known_settings(program), key.partition("@")[0].split(".")
     above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
     is_open = any(each and each.kind.startswith(("Any", "list", "dict")) for each in above)
@@ -148,7 +160,9 @@ def no_such_key(key: str, program: str) -> str:
     if key in SYNONYMS:
         return f"{key}: unknown setting; did you mean {SYNONYMS[key]}?"
     if program == "compare" and (key in known_settings("train") or key in default_options("train")):
-        return f"{key}: it is a setting of the runs; all of them get it by \"overrides=['{key}=...']\""
+        return (
+            f"{key}: it is a setting of the runs; all of them get it by \"overrides=['{key}=...']\""
+        )
     names = [*known_settings(program), *default_options(program)]
     near = difflib.get_close_matches(key, names, n=1, cutoff=0.7)
     near = near or [name for name in names if name.rpartition(".")[2] == key][:1]
@@ -164,12 +178,23 @@ def help_text(name: str, keys: Sequence[str] = ()) -> str:
     """What ``--help`` prints: a page on a program, or the meaning of settings and groups."""
     if keys:
         found = [[*_options(name, key), *_meaning(name, key)] for key in keys]
-        return "\n".join("\n".join(f or [no_such_key(k, name)]) for k, f in zip(keys, found, strict=True))
+        return "\n".join(
+            "\n".join(f or [no_such_key(k, name)]) for k, f in zip(keys, found, strict=True)
+        )
     lines = [f"damian {name} [GROUP=OPTION] [KEY=VALUE] ...", "", about(name)]
-    known, common = known_settings(name), {} if name in ("train", "compare") else known_settings("train")
-    own = [key for key in known if key not in common and not known[key].is_section and "." not in key]
+    known, common = (
+        known_settings(name),
+        {} if name in ("train", "compare") else known_settings("train"),
+    )
+    own = [
+        key for key in known if key not in common and not known[key].is_section and "." not in key
+    ]
     if name != "train":
-        lines += ["", "Its own settings:", *_meaning(name, *(own or ("checkpoint", "eval_episodes")))]
+        lines += [
+            "",
+            "Its own settings:",
+            *_meaning(name, *(own or ("checkpoint", "eval_episodes"))),
+        ]
     lines += ["", "Groups (the default in brackets):"] if default_options(name) else []
     for group, default in default_options(name).items():
         options = [f"[{o}]" if o == default else o for o in groups().get(group, [])]
@@ -178,7 +203,8 @@ def help_text(name: str, keys: Sequence[str] = ()) -> str:
 
 
 def _options(program: str, group: str) -> list[str]:
-    """How to choose an option of a group, with what the comment at the top of its file says; or nothing."""
+    """How to choose an option of a group, with what the comment at the top of its file says; or
+    nothing."""
     if group not in default_options(program):
         return []
     default, lines = default_options(program)[group], [f"choose one with {group}=OPTION:"]

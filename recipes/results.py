@@ -20,9 +20,9 @@ from .shared.sweeps import MARKDOWN, POINTS, compared, report, stored_results, s
 def results(folder: str | Path) -> pd.DataFrame:
     """The results in a folder, a row for each policy of each run.
 
-    A comparison has the columns task, delay, method, regime and seed, a sweep one for each setting in which
-    its runs differ. ``return`` and other measures are true values, those that begin with ``perceived_`` what
-    the server knew.
+    A comparison has the columns task, delay, method, regime and seed, a sweep one for each setting
+    in which its runs differ. ``return`` and other measures are true values, those that begin with
+    ``perceived_`` what the server knew.
 
     Raises:
         InputError: there is no result in the folder.

@@ -2,8 +2,9 @@
 
 damian submit folder=runs/MYCOMPARISON method=mine "authors=A. Author, B. Author"
 
-The runs come from `damian compare` with the experiment delaybench, or one of your own that begins with it
-(docs/delaybench.md). What is submitted is the true return that damian's own evaluation has found.
+The runs come from `damian compare` with the experiment delaybench, or one of your own that begins
+with it (docs/delaybench.md). What is submitted is the true return that damian's own evaluation has
+found.
 """
 
 import shlex
@@ -29,8 +30,12 @@ from .known import key_of
 from .shared.runs import changed_settings
 from .shared.sweeps import stored_results
 
-_NAMES = "agents region motion wind source requests battery reward episode clock links randomise frames"
-OF_TASKS = tuple(f"{name}." for name in f"{_NAMES} delay.obs delay.act delay.rew delay.loss".split())
+_NAMES = (
+    "agents region motion wind source requests battery reward episode clock links randomise frames"
+)
+OF_TASKS = tuple(
+    f"{name}." for name in f"{_NAMES} delay.obs delay.act delay.rew delay.loss".split()
+)
 """How the keys of settings begin that a task and its delay state, and no method changes."""
 
 
@@ -49,10 +54,17 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
     facts, trained = list[dict[str, object]](), dict[tuple[str, str], Path]()
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
         run = folder / task / delay / method / f"seed_{seed}"
-        record, should = read_record(run), "is not the folder of a finished run: keep those of all runs"
+        record, should = (
+            read_record(run),
+            "is not the folder of a finished run: keep those of all runs",
+        )
         checks.require((run / RESULTS).exists() and bool(record), "folder", run, should)
-        found = read_results(run / RESULTS).set_index("policy")["return"]  # of damian's own evaluation
-        settings = [word for word in record.get("overrides", []) if key_of(word) not in ("logger", "seed")]
+        found = read_results(run / RESULTS).set_index("policy")[
+            "return"
+        ]  # of damian's own evaluation
+        settings = [
+            word for word in record.get("overrides", []) if key_of(word) not in ("logger", "seed")
+        ]
         told = {name: record.get(name) for name in ("damian", "commit")}
         facts.append({"return": found[TRAINED], "settings": shlex.join(settings), **told})
         if (task, delay) in words:
@@ -71,7 +83,8 @@ def words_of_tasks(experiment: Experiment) -> dict[tuple[str, str], list[str]]:
 
 
 def check_task(run: Path, asked_for: TrainConfig) -> None:
-    """Require that a run was in the task, under the delay, and for the steps that these settings state."""
+    """Require that a run was in the task, under the delay, and for the steps that these settings
+    state."""
     for key, found, asked in changed_settings(asked_for, run, "folder"):
         of_task = f"{key}.".startswith(OF_TASKS)
         checks.require(not of_task, f"{run}: {key}", found, f"is not {asked}, as the task has it")
@@ -97,7 +110,8 @@ def submit(config: SubmitConfig) -> None:
     path = Path(f"{config.method}.csv")
     write_csv(path, rows)
     print(
-        f"{path}: {len(rows)} runs; add it to docs/results/leaderboard, and your files to examples/extending"
+        f"{path}: {len(rows)} runs; add it to docs/results/leaderboard, and your files to "
+        "examples/extending"
     )
 
 

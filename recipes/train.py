@@ -1,4 +1,5 @@
-"""Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one (docs/runs.md).
+"""Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one
+(docs/runs.md).
 
 damian train scenario=paper/usecase2 delay=paper aware=backupdate+history hydra.run.dir=runs/first
 damian train agents=3 seed=0 frames=300000 worlds=64 device=cuda compile=true learner.lr=3e-4
@@ -84,11 +85,17 @@ def train(config: TrainConfig, folder: Path) -> None:
             for batch in ticks(collector, clock, env.server) if not enough(config, state) else ():
                 update(config, env, learner, state, log, batch)
                 frames = state.progress.frames
-                log.show(frames, {"steps_per_second": batch.numel() / (time.perf_counter() - began)})
+                log.show(
+                    frames, {"steps_per_second": batch.numel() / (time.perf_counter() - began)}
+                )
                 if eval_env and state.progress.updates % cast(int, config.eval_every) == 0:
-                    log.show(frames, grouped("eval/", evaluate_meanwhile(config, eval_env, learner)))
+                    log.show(
+                        frames, grouped("eval/", evaluate_meanwhile(config, eval_env, learner))
+                    )
                 began = time.perf_counter()
-                bar.set_postfix({name: f"{mean:.2f}" for name, mean in state.episodes.means().items()})
+                bar.set_postfix(
+                    {name: f"{mean:.2f}" for name, mean in state.episodes.means().items()}
+                )
                 bar.update(counted(config, state) - bar.n)
                 if save_or_stop(config, state, log, interrupt):
                     break
@@ -120,14 +127,17 @@ def evaluate_meanwhile(config: TrainConfig, env: DelayedEnv, learner: Learner) -
 
 
 def begin(config: TrainConfig, state: TrainingState) -> None:
-    """Load what the run continues or starts from, and write the first checkpoint and then the settings."""
+    """Load what the run continues or starts from, and write the first checkpoint and then the
+    settings."""
     if config.resume:
         state.load()
         made, updates = state.progress.frames, max(state.progress.updates, 1)
         problem = f"is fewer than the {made} that the run has made"
         checks.require(made - made / updates < config.frames, "frames", config.frames, problem)
     elif config.checkpoint:
-        trained = stored_values(run_folder(Path(config.checkpoint)), "checkpoint")["learner"]["name"]
+        trained = stored_values(run_folder(Path(config.checkpoint)), "checkpoint")["learner"][
+            "name"
+        ]
         shipped = config.checkpoint.startswith("damian:")  # without a critic
         names = ["actor", "critic"] if trained == config.learner.name and not shipped else ["actor"]
         networks = {name: state.components[name] for name in names if name in state.components}
@@ -188,20 +198,27 @@ def failure(state: TrainingState, problem: str) -> RunError:
 def progress_bar(config: TrainConfig, state: TrainingState) -> tqdm:
     """A progress bar that shows how far the training has come."""
     unit, total = (" episodes", config.episodes) if config.episodes else (" steps", config.frames)
-    return tqdm(total=total, initial=counted(config, state), unit=unit, unit_scale=not config.episodes)
+    return tqdm(
+        total=total, initial=counted(config, state), unit=unit, unit_scale=not config.episodes
+    )
 
 
 def counted(config: TrainConfig, state: TrainingState) -> int:
-    """How far the training has come: in episodes if they limit the run, else in environment steps."""
+    """How far the training has come: in episodes if they limit the run, else in environment
+    steps."""
     return state.episodes.finished if config.episodes else state.progress.frames
 
 
 def enough(config: TrainConfig, state: TrainingState) -> bool:
     """Whether the run has reached ``config.frames`` or ``config.episodes``."""
-    return state.progress.frames >= config.frames or state.episodes.finished >= (config.episodes or torch.inf)
+    return state.progress.frames >= config.frames or state.episodes.finished >= (
+        config.episodes or torch.inf
+    )
 
 
-def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> bool:
+def save_or_stop(
+    config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt
+) -> bool:
     """Write a checkpoint after an update if one is due; returns whether the training ends here."""
     finished, asked = enough(config, state), interrupt.asked is not None
     due = state.progress.updates % config.checkpoint_every == 0

@@ -1,4 +1,5 @@
-"""The Bayes filter of the source again, plainly: one world, one receiver, from the start at every step."""
+"""The Bayes filter of the source again, plainly: one world, one receiver, from the start at every
+step."""
 
 import math
 from collections.abc import Sequence
@@ -9,13 +10,20 @@ from torch import Tensor
 from damian.server.belief import SourceGrid
 
 Steps = Sequence[tuple[list[int], list[int]]]
-"""For each step the rows of ``SourceGrid.log_reports`` that UAVs send, and the delays of these messages."""
+"""For each step the rows of ``SourceGrid.log_reports`` that UAVs send, and the delays of these
+messages."""
 
 
 def belief(
-    grid: SourceGrid, place: int, first: list[int], steps: Steps, now: int, viewer: int | None = None
+    grid: SourceGrid,
+    place: int,
+    first: list[int],
+    steps: Steps,
+    now: int,
+    viewer: int | None = None,
 ) -> list[float]:
-    """Probability of each cell after the last of the steps, knowing what has arrived by step ``now``.
+    """Probability of each cell after the last of the steps, knowing what has arrived by step
+    ``now``.
 
     ``place`` is the index of the tables of the source for its region.
     ``viewer`` is the UAV that knows its own messages at once; None is the server.
@@ -76,5 +84,7 @@ def chance_at(grid: SourceGrid, place: int, probable: Tensor, point: int) -> flo
     for a, chance in enumerate(probable.tolist()):
         inside = {b: float(moves[a, b]) for b in range(len(prior)) if prior[b] > 0}
         if chance:
-            total += sum(chance * w / sum(inside.values()) * float(detects[b]) for b, w in inside.items())
+            total += sum(
+                chance * w / sum(inside.values()) * float(detects[b]) for b, w in inside.items()
+            )
     return emits * total + (1 - emits) * float(grid.false_alarm[place])

@@ -5,7 +5,8 @@
     python tests/bit_equal.py record after.json flights    # only cases whose name has this word
     python tests/bit_equal.py compare before.json after.json
 
-A record holds a digest of every entry of 54 rollouts with random actions, and the numbers that 12 trainings
+A record holds a digest of every entry of 54 rollouts with random actions, and the numbers that 12
+trainings
 wrote. It is good on one machine only: another processor rounds in another way.
 """
 
@@ -56,7 +57,12 @@ TRAININGS = [
     ["scenario=tracking", "learner=sac", "delay=paper", "aware=backupdate"],
     ["scenario=tracking", "learner=sac", "actions=continuous"],
     ["scenario=tracking", "learner=bpql", "delay.obs=2", "aware=backupdate+history"],
-    ["scenario=paper/usecase2", "delay=paper", "aware=backupdate+history", "corrected=[reward,critic,actor]"],
+    [
+        "scenario=paper/usecase2",
+        "delay=paper",
+        "aware=backupdate+history",
+        "corrected=[reward,critic,actor]",
+    ],
     ["scenario=delaybench/crowded", "delay=burst", "aware=timeline"],
     [
         "scenario=delaybench/flights",
@@ -73,7 +79,9 @@ def digest(tensor: torch.Tensor) -> str:
     """Hash of a tensor's type, shape and bits."""
     content = tensor.detach().cpu().contiguous()
     head = f"{content.dtype}{tuple(content.shape)}".encode()
-    return hashlib.sha256(head + content.flatten().view(torch.uint8).numpy().tobytes()).hexdigest()[:16]
+    return hashlib.sha256(head + content.flatten().view(torch.uint8).numpy().tobytes()).hexdigest()[
+        :16
+    ]
 
 
 def rollout(overrides: list[str]) -> dict[str, str]:
@@ -84,7 +92,9 @@ def rollout(overrides: list[str]) -> dict[str, str]:
     env = damian.make_env(damian.compose_scenario(*overrides), num_worlds=8, seed=3)
     steps = env.rollout(40, break_when_any_done=False)
     leaves = steps.items(include_nested=True, leaves_only=True)
-    return {"/".join((key,) if isinstance(key, str) else key): digest(value) for key, value in leaves}
+    return {
+        "/".join((key,) if isinstance(key, str) else key): digest(value) for key, value in leaves
+    }
 
 
 def training(overrides: list[str]) -> dict[str, list[str]]:
@@ -106,8 +116,13 @@ def training(overrides: list[str]) -> dict[str, list[str]]:
 def record(path: Path, word: str = "") -> None:
     """Write the record of the version that is installed, of all cases whose name has a word."""
     cases = [[*scenario, *delay] for scenario in SCENARIOS for delay in DELAYS] + OTHERS
-    content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}  # of a stopped call
-    for kind, overrides in [*(("rollout", case) for case in cases), *(("training", c) for c in TRAININGS)]:
+    content = (
+        json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    )  # of a stopped call
+    for kind, overrides in [
+        *(("rollout", case) for case in cases),
+        *(("training", c) for c in TRAININGS),
+    ]:
         name = f"{kind} {' '.join(overrides)}"
         if word not in name or name in content:
             continue
@@ -121,7 +136,10 @@ def record(path: Path, word: str = "") -> None:
 
 def compare(before: Path, after: Path) -> int:
     """Print what differs between two records; returns the number of differences."""
-    old, new = json.loads(before.read_text(encoding="utf-8")), json.loads(after.read_text(encoding="utf-8"))
+    old, new = (
+        json.loads(before.read_text(encoding="utf-8")),
+        json.loads(after.read_text(encoding="utf-8")),
+    )
     differences = 0
     for name, entries in ((name, old[name]) for name in old if name in new):
         for key in [key for key in entries if key in new.get(name, {})]:

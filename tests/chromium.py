@@ -1,4 +1,5 @@
-"""Chromium without a screen, driven by Selenium, which is imported only when a browser is opened."""
+"""Chromium without a screen, driven by Selenium, which is imported only when a browser is
+opened."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +19,9 @@ def chromium(*flags: str) -> Iterator[Any]:
     for flag in (*FLAGS, *flags):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(which("chromedriver")))
+    driver = webdriver.Chrome(
+        options=options, service=webdriver.ChromeService(which("chromedriver"))
+    )
     yield driver
     driver.quit()
 

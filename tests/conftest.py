@@ -1,7 +1,7 @@
 """Settings of every test: a seed, one thread, and how many examples a property test tries.
 
-One thread, because many small tensors are slower on more. ``make test`` tries the same examples every time;
-``make test-deep`` tries thousands of new ones (``--hypothesis-profile=deep``).
+One thread, because many small tensors are slower on more. ``make test`` tries the same examples
+every time; ``make test-deep`` tries thousands of new ones (``--hypothesis-profile=deep``).
 """
 
 import math
@@ -22,11 +22,14 @@ settings.load_profile("same")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark property tests, which ``make test-deep`` runs, and the cases that ``sample`` leaves to be slow."""
+    """Mark property tests, which ``make test-deep`` runs, and the cases that ``sample`` leaves to
+    be slow."""
     for item in items:
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker("property")
-    sampled = [(item, mark.args[0]) for item in items if (mark := item.get_closest_marker("sample"))]
+    sampled = [
+        (item, mark.args[0]) for item in items if (mark := item.get_closest_marker("sample"))
+    ]
     sampled.sort(key=lambda pair: (_function(pair[0]), crc32(pair[0].nodeid.encode())))
     for _, group in groupby(sampled, key=lambda pair: _function(pair[0])):
         cases = list(group)

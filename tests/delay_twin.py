@@ -1,6 +1,8 @@
-"""Delays in plain Python, for one agent at a time, and the laws and environments on which they are tested.
+"""Delays in plain Python, for one agent at a time, and the laws and environments on which they are
+tested.
 
-``Counting`` is a small environment in which every observation tells its world, agent, step and episode.
+``Counting`` is a small environment in which every observation tells its world, agent, step and
+episode.
 """
 
 import math
@@ -41,20 +43,33 @@ class Crowd(Law):
         """Every part is a whole number, apart from a quarter that is to be rounded up."""
         place = (context.entries[self.entry][:, self.column] / 32).floor().abs() % 3
         parity = (context.time / context.dt) % 2
-        steps = place + context.n_sending + context.sender + parity + (4 * context.uniform).floor() - 0.25
+        steps = (
+            place
+            + context.n_sending
+            + context.sender
+            + parity
+            + (4 * context.uniform).floor()
+            - 0.25
+        )
         return torch.where(context.uniform >= LOST, -1.0, steps)
 
 
-def twin_delay(value: float, n_sending: int, sender: int, elapsed: int, uniform: float) -> int | None:
+def twin_delay(
+    value: float, n_sending: int, sender: int, elapsed: int, uniform: float
+) -> int | None:
     """The delay of ``Crowd`` for one message; None if it is lost."""
     if uniform >= LOST:
         return None
     place = abs(math.floor(value / 32)) % 3
-    return min(math.ceil(place + n_sending + sender + elapsed % 2 + math.floor(4 * uniform) - 0.25), LONGEST)
+    return min(
+        math.ceil(place + n_sending + sender + elapsed % 2 + math.floor(4 * uniform) - 0.25),
+        LONGEST,
+    )
 
 
 def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
-    """Delays of the messages that senders with these random streams [M] send in steps 1 to T, [T, M]."""
+    """Delays of the messages that senders with these random streams [M] send in steps 1 to T,
+    [T, M]."""
     memory, delays = sampler.initial_state(streams), []
     for clock in range(1, n_steps + 1):
         delay, memory = sampler(streams, torch.tensor(clock), memory)
@@ -71,13 +86,15 @@ class Message(NamedTuple):
 
 
 class Receiver:
-    """Receives one sender's messages; holds that sent last (``generation``) or arrived last (``arrival``)."""
+    """Receives one sender's messages; holds that sent last (``generation``) or arrived last
+    (``arrival``)."""
 
     def __init__(self, order: str) -> None:
         self.order = order
 
     def begin(self, now: int, content: Any) -> None:
-        """Begin an episode: the first message is received without delay, and no other is in transit."""
+        """Begin an episode: the first message is received without delay, and no other is in
+        transit."""
         self.began, self.holds, self.in_transit = now, Message(now, now, content), []
 
     def step(self, now: int, content: Any, delay: int | None) -> bool:
@@ -106,7 +123,8 @@ class Purse:
     """Step of arrival and value of each reward."""
 
     def step(self, now: int, reward: float, delay: int, done: bool) -> float:
-        """Delay a reward; return the sum of those that arrive now, or of all of them if the episode ends."""
+        """Delay a reward; return the sum of those that arrive now, or of all of them if the episode
+        ends."""
         self.in_transit.append((now + delay, reward))
         arrived = [entry for entry in self.in_transit if done or entry[0] == now]
         self.in_transit = [entry for entry in self.in_transit if entry not in arrived]
@@ -116,14 +134,16 @@ class Purse:
 class Counting(EnvBase):
     """An environment in which every observation tells where it comes from; episodes end at random.
 
-    Each agent's state x becomes 3 x + a + 1 (mod 101) when it executes the action a. Its observation is
-    [world, agent, steps since construction, episode, x, executed action, ``action_valid``], its reward
-    x + 100 * world.
+    Each agent's state x becomes 3 x + a + 1 (mod 101) when it executes the action a. Its
+    observation is [world, agent, steps since construction, episode, x, executed action,
+    ``action_valid``], its reward x + 100 * world.
 
     Args:
-        worlds: integer names of the worlds; what a world does depends on its name, but on no other world.
+        worlds: integer names of the worlds; what a world does depends on its name, but on no other
+            world.
         n_agents: number of agents in each world, N.
-        continuous: actions are two numbers in [-1, 3], which are rounded to an integer, instead of integers.
+        continuous: actions are two numbers in [-1, 3], which are rounded to an integer, instead of
+            integers.
         ends: probability that an episode ends in a step.
     """
 
@@ -145,7 +165,9 @@ class Counting(EnvBase):
         flag = Binary(shape=agents, n=n_agents, dtype=torch.bool)
         observation = Unbounded((*agents, 7), dtype=torch.float64)
         self.action_spec = group(action=action)
-        self.observation_spec = group(observation=observation, message_sent=flag, ready=flag.clone())
+        self.observation_spec = group(
+            observation=observation, message_sent=flag, ready=flag.clone()
+        )
         self.reward_spec = group(reward=Unbounded((*agents, 1)))
         self._begin(torch.ones(worlds_shape, dtype=torch.bool))
         self.episode = torch.zeros(worlds_shape, dtype=torch.long)
@@ -159,12 +181,17 @@ class Counting(EnvBase):
     def _flag(self, salt: int) -> Tensor:
         """A flag that is true with probability 2/3, [B, N]."""
         agents = torch.arange(self.n_agents)
-        bits = counter_rng.bits(self.names.unsqueeze(-1), agents, torch.tensor([2 * self.total + salt]))
+        bits = counter_rng.bits(
+            self.names.unsqueeze(-1), agents, torch.tensor([2 * self.total + salt])
+        )
         return bits % 3 > 0
 
     def _outputs(self) -> TensorDict:
         shape = (*self.batch_size, self.n_agents)
-        names, agents = self.names.unsqueeze(-1).expand(shape), torch.arange(self.n_agents).expand(shape)
+        names, agents = (
+            self.names.unsqueeze(-1).expand(shape),
+            torch.arange(self.n_agents).expand(shape),
+        )
         total, episode = torch.full(shape, self.total), self.episode.unsqueeze(-1).expand(shape)
         observation = torch.stack(
             [names, agents, total, episode, self.x, self.executed, self.action_valid], -1
@@ -221,7 +248,9 @@ def trace(folder: Any, *delays: Any) -> Trace:
     return Trace(str(file))
 
 
-def delayed(*transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **options: Any) -> TransformedEnv:
+def delayed(
+    *transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **options: Any
+) -> TransformedEnv:
     """A ``Counting`` environment with transforms whose draws depend on the names of the worlds."""
     for transform in transforms:
         transform.seed_worlds(torch.tensor(worlds))
@@ -231,7 +260,10 @@ def delayed(*transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **op
 def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor]:
     """Actions for each step, [B, N]; those of a world do not depend on the other worlds."""
     names, agents = torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)
-    return [counter_rng.bits(names, agents, torch.tensor([t])) % Counting.N_ACTIONS for t in range(n_steps)]
+    return [
+        counter_rng.bits(names, agents, torch.tensor([t])) % Counting.N_ACTIONS
+        for t in range(n_steps)
+    ]
 
 
 def column(outputs: Sequence[TensorDictBase], *key: str) -> list:

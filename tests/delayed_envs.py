@@ -21,7 +21,9 @@ PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
 BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}
 DELAYS = {
     "paper": {"delay": DelayConfig(obs=PAPER)},
-    "burst": {"delay": DelayConfig(obs=BURST, act={"law": "geometric", "mean": 1}, order="arrival")},
+    "burst": {
+        "delay": DelayConfig(obs=BURST, act={"law": "geometric", "mean": 1}, order="arrival")
+    },
     "everything": {"delay": DelayConfig(obs=3, act=2, rew=1, history=4, loss=0.1, reward_window=3)},
     "slow clocks": {
         "delay": DelayConfig(obs=PAPER, act={"law": "uniform", "high": 2}, history=2),
@@ -31,7 +33,9 @@ DELAYS = {
         "delay": DelayConfig(obs=PAPER, loss=0.1),
         "observation": ObservationConfig(own=True, belief=["belief_moments", "belief_map"]),
     },
-    "context": {"delay": DelayConfig(obs=Crowd(), act=Crowd(column=1), rew=Crowd(loses=False), loss=0.1)},
+    "context": {
+        "delay": DelayConfig(obs=Crowd(), act=Crowd(column=1), rew=Crowd(loses=False), loss=0.1)
+    },
 }
 every_delay = pytest.mark.parametrize("delays", DELAYS)
 

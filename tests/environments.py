@@ -24,7 +24,8 @@ class Kind(NamedTuple):
 
 
 class Teams(EnvBase):
-    """Two worlds of two agents with flags only in the group, and a state and a team reward at the root.
+    """Two worlds of two agents with flags only in the group, and a state and a team reward at the
+    root.
 
     The state counts the steps of an episode, which lasts 3 or 5 steps; each reward is 1. PettingZoo
     environments with a root state look so.
@@ -55,7 +56,9 @@ class Teams(EnvBase):
         agents = {"observation": self.time.view(2, 1, 1).expand(2, 2, 3).clone()}
         flag = done.view(2, 1, 1).expand(2, 2, 1)
         agents |= {"done": flag.clone(), "terminated": flag.clone()}
-        return TensorDict({"agents": TensorDict(agents, [2, 2]), "state": self.time.view(2, 1).clone()}, [2])
+        return TensorDict(
+            {"agents": TensorDict(agents, [2, 2]), "state": self.time.view(2, 1).clone()}, [2]
+        )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get(("agents", "_reset"), None)
@@ -74,7 +77,8 @@ class Teams(EnvBase):
 
 
 def vmas(num_envs: int = 2, n_agents: int = 2, max_steps: int = 4, **options: Any) -> EnvBase:
-    """A multi-agent environment of VMAS: the first two numbers of an observation are the agent's position."""
+    """A multi-agent environment of VMAS: the first two numbers of an observation are the agent's
+    position."""
     pytest.importorskip("vmas")
     from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
 
@@ -83,7 +87,8 @@ def vmas(num_envs: int = 2, n_agents: int = 2, max_steps: int = 4, **options: An
 
 
 def petting_zoo(n_agents: int = 2) -> EnvBase:
-    """A PettingZoo environment without batch dimensions, with a state at the root and flags in the group."""
+    """A PettingZoo environment without batch dimensions, with a state at the root and flags in the
+    group."""
     spread = pytest.importorskip("mpe2.simple_spread_v3")
     from torchrl.envs.libs.pettingzoo import PettingZooWrapper  # noqa: PLC0415
 
@@ -111,10 +116,11 @@ ACTION, OBSERVATION, REWARD = ("agents", "action"), ("agents", "observation"), (
 
 
 class Drift(EnvBase):
-    """Three worlds with a moving point each, which the action pushes; their episodes last 3, 4 and 5 steps.
+    """Three worlds with a moving point each, which the action pushes; their episodes last 3, 4 and
+    5 steps.
 
-    Observation and reward have a gradient with respect to the action of the same step, but not of earlier
-    steps.
+    Observation and reward have a gradient with respect to the action of the same step, but not of
+    earlier steps.
     """
 
     def __init__(self) -> None:
@@ -140,7 +146,9 @@ class Drift(EnvBase):
         self.place, self.time = place.detach(), self.time + 1
         done = (self.time >= self._longest).unsqueeze(-1)
         flags = {"done": done, "terminated": done}
-        return TensorDict({"observation": place, "reward": place.sum(-1, keepdim=True), **flags}, [3])
+        return TensorDict(
+            {"observation": place, "reward": place.sum(-1, keepdim=True), **flags}, [3]
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         """The environment has no randomness."""

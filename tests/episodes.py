@@ -9,7 +9,8 @@ SQUARE = shapely.box(-200.0, -200.0, 200.0, 200.0)
 
 
 def flight(n_steps: int = 3, **changes) -> Episode:
-    """An episode of two UAVs that stand still, of which the server knows the places; the source is silent."""
+    """An episode of two UAVs that stand still, of which the server knows the places; the source is
+    silent."""
     t, position = n_steps + 1, np.array([[-100.0, 100.0, 0.0], [100.0, 100.0, 0.0]])
     uavs, flags = np.zeros((t, 2)), np.zeros((t, 2), bool)
     columns = {
@@ -22,7 +23,12 @@ def flight(n_steps: int = 3, **changes) -> Episode:
         **dict.fromkeys(("track", "age", "reward"), uavs),
         **{"spotted": flags, "sent": flags, "delay": uavs.astype(int), "emits": flags[:, :1]},
     }
-    fixed = {"about": {}, "region": SQUARE, "origin": None, "landing_points": np.array([[150.0, -190.0]])}
+    fixed = {
+        "about": {},
+        "region": SQUARE,
+        "origin": None,
+        "landing_points": np.array([[150.0, -190.0]]),
+    }
     fixed |= {"radius": 50.0, "instant": True, "success": False}
     return Episode(**{**fixed, **columns, **changes})
 
@@ -34,6 +40,9 @@ UNKNOWN_SOURCE = {"source": None, "emits": None}
 
 def crowd(n_steps: int = 3, **changes) -> Episode:
     """An episode of 20 UAVs, ten at each of two places."""
-    few, names = flight(n_steps), "position target battery believed track age reward spotted sent delay"
+    few, names = (
+        flight(n_steps),
+        "position target battery believed track age reward spotted sent delay",
+    )
     columns = {name: np.repeat(getattr(few, name), 10, axis=1) for name in names.split()}
     return flight(n_steps, **columns | changes)

@@ -1,4 +1,5 @@
-"""Settings of quick runs, a reward term that reads the belief, and an actor that reads other UAVs' rows."""
+"""Settings of quick runs, a reward term that reads the belief, and an actor that reads other UAVs'
+rows."""
 
 from dataclasses import dataclass
 
@@ -10,7 +11,14 @@ from damian import keys
 from damian.learners.config import MappoConfig
 from damian.models.distribution import with_distribution
 
-TINY = ["frames=128", "worlds=4", "learner.steps=16", "eval_episodes=3", "model.hidden=[8]", "logger=csv"]
+TINY = [
+    "frames=128",
+    "worlds=4",
+    "learner.steps=16",
+    "eval_episodes=3",
+    "model.hidden=[8]",
+    "logger=csv",
+]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]
 
 
@@ -22,7 +30,8 @@ def certainty(features, counters):
 
 @dataclass
 class RowsConfig(MappoConfig):
-    """An actor that attends over the rows of all UAVs, or (``hidden``) writes so what it remembers."""
+    """An actor that attends over the rows of all UAVs, or (``hidden``) writes so what it
+    remembers."""
 
     hidden: bool = False
 
@@ -31,7 +40,9 @@ class RowsConfig(MappoConfig):
 
         def make(n_out, *out_keys):
             written = [*out_keys, *[keys.HIDDEN] * self.hidden]
-            return TensorDictModule(Rows(n_columns, n_out, self.hidden), [keys.OBSERVATION], written)
+            return TensorDictModule(
+                Rows(n_columns, n_out, self.hidden), [keys.OBSERVATION], written
+            )
 
         return with_distribution(env, make)
 

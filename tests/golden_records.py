@@ -1,4 +1,5 @@
-"""The runs recorded from the original implementation, as transitions and as inputs of the server."""
+"""The runs recorded from the original implementation, as transitions and as inputs of the
+server."""
 
 import itertools
 from typing import Any, NamedTuple
@@ -75,7 +76,8 @@ def recorded(case: int, *kinds: str) -> list[Transition]:
 
 
 def detection_step(record: dict[str, Any]) -> float | None:
-    """Step number of the latest detection; the original stamps step k with k - 1, this project with k."""
+    """Step number of the latest detection; the original stamps step k with k - 1, this project with
+    k."""
     time = record["server"]["last_time"]
     return None if time is None else time + 1
 
@@ -91,7 +93,10 @@ def set_state(env: UavEnv, records: list[Transition], places: list) -> None:
     goal = torch.tensor([[nearest(points, place) for place in world] for world in places])
     place = env.simulation.airspace.points[0][goal]
     detected = torch.tensor([[-1.0 if m.detected is None else m.detected] for m in records])
-    estimate = torch.tensor([[m.estimate or [0.0, 0.0]] for m in records]) - env.simulation.airspace.offset[0]
+    estimate = (
+        torch.tensor([[m.estimate or [0.0, 0.0]] for m in records])
+        - env.simulation.airspace.offset[0]
+    )
     state = env.state
     env.state = state._replace(
         steps=torch.tensor([m.number - 1 for m in records]),
@@ -119,7 +124,8 @@ def ready_env(scenario: ScenarioConfig, n_worlds: int) -> UavEnv:
 
 
 def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, ServerContext, Counters]:
-    """The server's inputs after each transition; every UAV reports the recorded estimate as its detection."""
+    """The server's inputs after each transition; every UAV reports the recorded estimate as its
+    detection."""
     golden = GOLDEN[case]["scenario"]
     place = column(records, "positions")
     zeros = torch.zeros(place.shape[:-1])

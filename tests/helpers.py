@@ -1,4 +1,5 @@
-"""Shared test helpers: the paper's use cases without Hydra, small scenarios, and functions that step them."""
+"""Shared test helpers: the paper's use cases without Hydra, small scenarios, and functions that
+step them."""
 
 import io
 import json
@@ -76,13 +77,16 @@ def usecase(case: int, **changed: Any) -> ScenarioConfig:
         "actions": ActionConfig(distances=distances, headings=headings, mask=False),
         "observation": observation,
         "reward": task,
-        "episode": EpisodeConfig(max_steps=golden["max_episode_len"], success_share=golden["perc_needed"]),
+        "episode": EpisodeConfig(
+            max_steps=golden["max_episode_len"], success_share=golden["perc_needed"]
+        ),
     }
     return ScenarioConfig(**(sections | changed))
 
 
 def square(**changed: Any) -> ScenarioConfig:
-    """Three UAVs that start on different points of a small square, with the source in its middle."""
+    """Three UAVs that start on different points of a small square, with the source in its
+    middle."""
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=8)
     sections = {
         "region": region,
@@ -93,7 +97,8 @@ def square(**changed: Any) -> ScenarioConfig:
 
 
 def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) -> ScenarioConfig:
-    """A scenario with every feature, every reward term, a walking intermittent source and batteries."""
+    """A scenario with every feature, every reward term, a walking intermittent source and
+    batteries."""
     in_order = getattr(changed.get("delay"), "order", "generation") == "generation"
     sections = {
         "region": RegionConfig(min_area=20_000, max_area=60_000, pool=3, initial_conditions=12),
@@ -102,7 +107,9 @@ def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) 
         "battery": BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=20.0),
         "actions": ActionConfig(kind=kind),
         "observation": ObservationConfig(LOCAL, GLOBAL, timeline=3 * in_order),
-        "reward": RewardConfig(**dict.fromkeys(BUILT_IN, 0.5) | {"served": 0.0}, bonus=1.0, penalty=0.25),
+        "reward": RewardConfig(
+            **dict.fromkeys(BUILT_IN, 0.5) | {"served": 0.0}, bonus=1.0, penalty=0.25
+        ),
         "episode": EpisodeConfig(max_steps=8, success_share=1.0, discharged_share=1.0),
     }
     return ScenarioConfig(**(sections | changed))
@@ -145,13 +152,16 @@ KINDS: dict[str, dict[str, Any]] = {
 """Scenario sections of each kind of task."""
 
 REGIONS = {
-    "fixed": RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=4),
+    "fixed": RegionConfig(
+        kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=4
+    ),
     "pool": RegionConfig(min_area=20_000, max_area=60_000, pool=2, initial_conditions=8),
 }
 
 
 def random_actions(env: UavEnv, generator: torch.Generator) -> Tensor:
-    """Uniform random actions, [B, N] discrete or [B, N, 2] continuous, from the test's own generator."""
+    """Uniform random actions, [B, N] discrete or [B, N, 2] continuous, from the test's own
+    generator."""
     shape = (*env.batch_size, env.n_agents)
     if env.scenario.actions.kind == "continuous":
         return torch.rand(*shape, 2, generator=generator)
@@ -167,7 +177,8 @@ def act(env: UavEnv, action: Tensor) -> TensorDictBase:
 def play(
     env: UavEnv, choose: Sequence[Tensor] | Callable[[int], Tensor], n_steps: int | None = None
 ) -> list[TensorDictBase]:
-    """Step through episodes, resetting worlds that are done; return the output of every step and reset."""
+    """Step through episodes, resetting worlds that are done; return the output of every step and
+    reset."""
     td = env.reset()
     shown = [td.clone()]
     for t in range(len(choose) if n_steps is None else n_steps):
@@ -194,9 +205,13 @@ def same(one: TensorDictBase, other: TensorDictBase, atol: float = 0.0) -> bool:
     return keys == {*other.keys(True, True)} and all(equal(one[key], other[key]) for key in keys)
 
 
-def all_same(some: Sequence[TensorDictBase], others: Sequence[TensorDictBase], atol: float = 0.0) -> bool:
+def all_same(
+    some: Sequence[TensorDictBase], others: Sequence[TensorDictBase], atol: float = 0.0
+) -> bool:
     """Whether both sequences are equal at every step: bit for bit, or floats up to ``atol``."""
-    return len(some) == len(others) and all(same(*pair, atol) for pair in zip(some, others, strict=True))
+    return len(some) == len(others) and all(
+        same(*pair, atol) for pair in zip(some, others, strict=True)
+    )
 
 
 def saved_and_loaded(state: Any) -> Any:
@@ -220,7 +235,8 @@ def nearest(points: Sequence[Sequence[float]], place: Sequence[float]) -> int:
 def random_worlds(
     seed: int, n_agents: int, heard: float, spots: float, n_worlds: int = 4
 ) -> list[tuple[float, list[Uav]]]:
-    """Random times and UAVs of the twin; a UAV without any detection does not spot the source either."""
+    """Random times and UAVs of the twin; a UAV without any detection does not spot the source
+    either."""
     rng = np.random.default_rng(seed)
     worlds = []
     for _ in range(n_worlds):
@@ -282,7 +298,8 @@ both_kinds = pytest.mark.parametrize("kind", ["discrete", "continuous"])
 
 
 def one_uav(**changed) -> ScenarioConfig:
-    """One UAV that starts near (60, 100) in a rectangle, too far to hear the source at (390, 100)."""
+    """One UAV that starts near (60, 100) in a rectangle, too far to hear the source at
+    (390, 100)."""
     region = RegionConfig(
         kind="vertices",
         vertices=[[0.0, 0.0], [400.0, 0.0], [400.0, 200.0], [0.0, 200.0]],
@@ -312,8 +329,11 @@ def learning(model: ModelConfig, settle: int = 0, **changed: Any) -> LearningSet
     return setup._replace(**changed)
 
 
-def check_refused(recipe: Callable[[], Any], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Assert that a recipe ends with exit code 2 and one error line on stderr that contains ``message``."""
+def check_refused(
+    recipe: Callable[[], Any], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Assert that a recipe ends with exit code 2 and one error line on stderr that contains
+    ``message``."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
         recipe()

@@ -1,4 +1,5 @@
-"""Sensors of the tests, the features that read them, and plain loops that compute the same readings."""
+"""Sensors of the tests, the features that read them, and plain loops that compute the same
+readings."""
 
 import math
 
@@ -20,7 +21,9 @@ LOCAL, GLOBAL = ["sensor_cases:gust_felt"], ["sensor_cases:widest_gap", "sensor_
 @sensor(width=2)
 def gust(state: State, world: Simulation, *, strength: float = 1.0) -> Tensor:
     """Random numbers up to ``strength`` of the world, episode, step and UAV, plus the time [s]."""
-    seed, episode, step = (number.view(-1, 1, 1) for number in (state.seed, state.episode, state.steps))
+    seed, episode, step = (
+        number.view(-1, 1, 1) for number in (state.seed, state.episode, state.steps)
+    )
     uav, value = torch.arange(state.goal.shape[1]).unsqueeze(-1), torch.arange(2)
     return strength * counter_rng.uniform(seed, episode, step, uav, value) + step * world.dt
 
@@ -58,13 +61,17 @@ def calm(features: dict[str, Tensor], counters: Counters) -> Tensor:
 
 
 def readings_of(env: UavEnv, strength: float = 2.0) -> Tensor:
-    """What a UAV on the ground reads in the current state, by a loop over worlds and UAVs, [B, N, 3]."""
+    """What a UAV on the ground reads in the current state, by a loop over worlds and UAVs,
+    [B, N, 3]."""
     state, rows = env.state, []
     for b in range(len(state.seed)):
         rows.append([])
         counters = [state.seed[b], state.episode[b], state.steps[b]]
         for i in range(env.n_agents):
-            draws = [counter_rng.uniform(*counters, torch.tensor(i), torch.tensor(k)).item() for k in (0, 1)]
+            draws = [
+                counter_rng.uniform(*counters, torch.tensor(i), torch.tensor(k)).item()
+                for k in (0, 1)
+            ]
             gusts = [strength * draw + float(state.steps[b]) * env.simulation.dt for draw in draws]
             rows[b].append(
                 [*gusts, math.dist(state.position[b, i, :2].tolist(), state.source[b, 0].tolist())]

@@ -25,7 +25,8 @@ def generator() -> dict[str, Any]:
 
 @cache
 def pages() -> dict[str, str]:
-    """The text of each page of the site, made ones included, with its links as the site has them."""
+    """The text of each page of the site, made ones included, with its links as the site has
+    them."""
     texts = {path.name: path.read_text(encoding="utf-8") for path in DOCS.glob("*.md")}
     texts |= {name: text for name, text in generator()["made"]().items() if isinstance(text, str)}
     return {name: generator()["led"](text, name) for name, text in texts.items()}
@@ -60,6 +61,8 @@ def build(folder: Path) -> Path:
     """The site, built in this folder without a warning."""
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return folder

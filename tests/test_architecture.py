@@ -16,11 +16,17 @@ ROOT = Path(damian.__file__).parent
 RECIPES = ROOT.parent / "recipes"
 TREE = (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("\ndamian/\n")[2]
 ROOMS = re.findall(r"^  (\w+)(?:/|\.py) ", TREE.partition("\nconf/")[0], re.MULTILINE)
-"""Folders and modules of ``damian``, as CONTRIBUTING.md lists them: each imports only from those above it."""
+"""Folders and modules of ``damian``, as CONTRIBUTING.md lists them: each imports only from those
+above it."""
 MOST_ROOMS = 16
 DOORS = ("damian", "damian.interop")
 """Modules with the public names of programs, which are loaded when one is used."""
-FOR_ALL = ("damian.recipes.shared", "damian.recipes.cli", "damian.recipes.known", "damian.recipes.config")
+FOR_ALL = (
+    "damian.recipes.shared",
+    "damian.recipes.cli",
+    "damian.recipes.known",
+    "damian.recipes.config",
+)
 """What the programs share."""
 
 
@@ -31,18 +37,23 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-MODULES = {module_of(path): path for folder in (ROOT, RECIPES) for path in sorted(folder.rglob("*.py"))}
+MODULES = {
+    module_of(path): path for folder in (ROOT, RECIPES) for path in sorted(folder.rglob("*.py"))
+}
 FILES = [*MODULES.values()]
 
 
 def imported(module: str, strings: bool = False) -> Iterator[str]:
-    """Every module, or name within one, that a module imports anywhere; also those that ``strings`` name."""
+    """Every module, or name within one, that a module imports anywhere; also those that ``strings``
+    name."""
     package = module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
     for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            above = (
+                package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            )
             within = ".".join([*above, *[node.module] * bool(node.module)])
             yield from (f"{within}.{alias.name}" for alias in node.names)
         elif strings and isinstance(node, ast.Constant) and isinstance(node.value, str):
@@ -55,7 +66,11 @@ def is_in(name: str, modules: Iterable[str]) -> bool:
 
 
 def test_the_document_lists_every_room_and_there_are_few():
-    rooms = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    rooms = {
+        path.stem
+        for path in ROOT.iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
     assert rooms - {"__init__"} == set(ROOMS)
     assert len(rooms) <= MOST_ROOMS + 1
 
@@ -73,7 +88,9 @@ def test_what_the_recipes_share_imports_no_program():
     for module in MODULES:
         if is_in(module, FOR_ALL):
             for name in imported(module, strings=True):
-                assert not is_in(name, ["damian.recipes"]) or is_in(name, FOR_ALL), f"{module} imports {name}"
+                assert not is_in(name, ["damian.recipes"]) or is_in(name, FOR_ALL), (
+                    f"{module} imports {name}"
+                )
 
 
 def test_an_installation_has_every_folder_of_the_package_the_recipes_and_the_configuration():
@@ -88,11 +105,15 @@ def test_no_modules_import_each_other_in_a_circle():
     edges = {}
     for module in MODULES:
         parts = [name.split(".") for name in imported(module)]
-        names = {".".join(each[:n]) for each in parts for n in range(1, len(each) + 1)} & MODULES.keys()
+        names = {
+            ".".join(each[:n]) for each in parts for n in range(1, len(each) + 1)
+        } & MODULES.keys()
         edges[module] = {name for name in names if not is_in(module, [name])}
     assert "damian.recipes.known" in edges["damian.recipes.cli"]
     while leaves := {module for module, others in edges.items() if not others}:
-        edges = {module: others - leaves for module, others in edges.items() if module not in leaves}
+        edges = {
+            module: others - leaves for module, others in edges.items() if module not in leaves
+        }
     assert edges == {}
 
 
@@ -101,12 +122,18 @@ def test_every_file_says_in_a_sentence_what_it_is_for():
 
 
 def test_text_is_read_and_written_as_utf_8_everywhere():
-    """Where the type of a path is not known, ruff (PLW1514) does not see that the encoding is missing."""
+    """Where the type of a path is not known, ruff (PLW1514) does not see that the encoding is
+    missing."""
     for path in (
-        each for folder in ("damian", "recipes", "examples") for each in (ROOT.parent / folder).rglob("*.py")
+        each
+        for folder in ("damian", "recipes", "examples")
+        for each in (ROOT.parent / folder).rglob("*.py")
     ):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("read_text", "write_text"):
+            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in (
+                "read_text",
+                "write_text",
+            ):
                 assert "encoding" in {each.arg for each in node.keywords}, f"{path}:{node.lineno}"
 
 
@@ -119,7 +146,17 @@ def test_every_public_name_exists_and_is_loaded_on_demand():
 
 
 def test_the_transforms_load_without_the_world_of_the_uavs():
-    heavy = ["shapely", "hydra", "omegaconf", "matplotlib", "damian.world", "damian.server", "damian.envs"]
-    code = f"import sys, damian.transforms; print([name for name in {heavy} if name in sys.modules])"
+    heavy = [
+        "shapely",
+        "hydra",
+        "omegaconf",
+        "matplotlib",
+        "damian.world",
+        "damian.server",
+        "damian.envs",
+    ]
+    code = (
+        f"import sys, damian.transforms; print([name for name in {heavy} if name in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -1,4 +1,5 @@
-"""The documents keep their word: their Python runs, their commands exist, their links lead somewhere."""
+"""The documents keep their word: their Python runs, their commands exist, their links lead
+somewhere."""
 
 import re
 import runpy
@@ -18,7 +19,9 @@ DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
 DOCUMENTS = sorted(
     [*DOCUMENTS, *(ROOT / "examples").rglob("*.md"), *(ROOT / "damian" / "data").rglob("*.md")]
 )
-FILES = [file for file in DOCUMENTS if file.name != "CHANGELOG.md"]  # which names commands of older versions
+FILES = [
+    file for file in DOCUMENTS if file.name != "CHANGELOG.md"
+]  # which names commands of older versions
 FILES += [*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.py")]
 FILES += sorted((ROOT / "recipes").glob("*.py"))
 
@@ -45,8 +48,14 @@ def test_every_command_that_a_file_names_exists(file):
     for name, words in commands(file):
         line = shlex.join([name, *words])
         assert name in PROGRAMS, line
-        own = [word for word in words if re.match(r"[\w.]+=", word) and not re.search("FOLDER|NAME", word)]
-        if name not in FOLDERS and not any(word.startswith(("--help", "--config-dir")) for word in words):
+        own = [
+            word
+            for word in words
+            if re.match(r"[\w.]+=", word) and not re.search("FOLDER|NAME", word)
+        ]
+        if name not in FOLDERS and not any(
+            word.startswith(("--help", "--config-dir")) for word in words
+        ):
             check_words(name, own)
 
 
@@ -56,17 +65,23 @@ def test_every_link_and_anchor_of_a_document_leads_somewhere(file):
     for link in links(file.read_text(encoding="utf-8")):
         path, _, anchor = link.partition("#")
         target = file.parent / path if path else file
-        there = target.exists() and (not anchor or anchor in anchors(target.read_text(encoding="utf-8")))
+        there = target.exists() and (
+            not anchor or anchor in anchors(target.read_text(encoding="utf-8"))
+        )
         nowhere += [] if there else [link]
     assert nowhere == []
 
 
 def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
     guide = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
-    results = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("RESULTS.md", "docs/report.md"))
+    results = "".join(
+        (ROOT / name).read_text(encoding="utf-8") for name in ("RESULTS.md", "docs/report.md")
+    )
     numbers = {*re.findall(r"-?\d+\.\d|-\d{3,}", guide)}
     assert len(numbers) > 20
-    assert [number for number in numbers if not re.search(rf"(?<![\d.]){number}(?![\d.]\d)", results)] == []
+    assert [
+        number for number in numbers if not re.search(rf"(?<![\d.]){number}(?![\d.]\d)", results)
+    ] == []
 
 
 def test_the_leaderboard_is_that_of_the_stored_results():
@@ -76,7 +91,9 @@ def test_the_leaderboard_is_that_of_the_stored_results():
     for method in ("timeline", "timeline+gru", "naive+timeline", "backupdate+gru", "naive+gru"):
         row = next(line for line in page.splitlines() if line.startswith(f"| {method} |"))
         (published,) = re.findall(rf"^\| \*{re.escape(method)}\* \|.*", readme, re.MULTILINE)
-        assert {*re.findall(r"[\d.]+ \[[^]]+\]", published)} <= {*re.findall(r"[\d.]+ \[[^]]+\]", row)}
+        assert {*re.findall(r"[\d.]+ \[[^]]+\]", published)} <= {
+            *re.findall(r"[\d.]+ \[[^]]+\]", row)
+        }
 
 
 def test_the_citation_names_this_version():

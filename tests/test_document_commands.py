@@ -1,7 +1,8 @@
-"""Every command that README and docs show runs, in the order in which it is shown, with tiny numbers (slow).
+"""Every command that README and docs show runs, in the order in which it is shown, with tiny
+numbers (slow).
 
-The commands of a document run one after the other in a folder with a trained run and the files that they
-name.
+The commands of a document run one after the other in a folder with a trained run and the files that
+they name.
 """
 
 import json
@@ -20,9 +21,18 @@ import damian
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROGRAM = [sys.executable, "-W", "ignore", "-c", "from damian.recipes.command import main; main()"]
-TINY = ["frames=64", "worlds=8", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
+TINY = [
+    "frames=64",
+    "worlds=8",
+    "learner.steps=8",
+    "eval_episodes=2",
+    "model.hidden=[8]",
+    "logger=csv",
+]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]
-OF_RUNS = f"overrides={json.dumps([word for word in TINY if word != 'logger=csv'])}".replace('"', "'")
+OF_RUNS = f"overrides={json.dumps([word for word in TINY if word != 'logger=csv'])}".replace(
+    '"', "'"
+)
 FLIGHTS = ["eval_episodes=3"]
 SHORTER = {
     "train": TINY,
@@ -75,7 +85,8 @@ def call(words: list[str], folder: Path) -> str:
     done = subprocess.run(
         [*PROGRAM, *words],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},  # as in a clone, whose examples the documents name
+        env=os.environ
+        | {"PYTHONPATH": str(ROOT)},  # as in a clone, whose examples the documents name
         capture_output=True,
         text=True,
         timeout=600,
@@ -92,13 +103,21 @@ def trained(tmp_path_factory) -> Path:
     call(["train", *TINY, "hydra.run.dir=runs/FOLDER"], folder)
     for name in "AB":
         shutil.copytree(folder / "runs" / "FOLDER", folder / "runs" / name)
-    flight = ["fly", "policy=random", "formats=[]", "episode.max_steps=12", "region.lattice_step=60"]
+    flight = [
+        "fly",
+        "policy=random",
+        "formats=[]",
+        "episode.max_steps=12",
+        "region.lattice_step=60",
+    ]
     call([*flight, "hydra.run.dir=undelayed"], folder)
     call([*flight, "delay.obs=3", "hydra.run.dir=late"], folder)
     shutil.copy(folder / "late" / "episode_0.json", folder / "runs" / "FOLDER")
     shape = {"type": "Polygon", "coordinates": [PARK]}
     park = {"type": "Feature", "properties": {"name": "park"}, "geometry": shape}
-    (folder / "park.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [park]}))
+    (folder / "park.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": [park]})
+    )
     for file in (ROOT / "examples" / "extending").glob("*.py"):
         shutil.copy(file, folder)
     return folder
@@ -106,9 +125,17 @@ def trained(tmp_path_factory) -> Path:
 
 def write_journal(path: Path) -> None:
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines: list[dict] = [{"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A", "B"]}]
+    lines: list[dict] = [
+        {"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A", "B"]}
+    ]
     for n in range(60):
-        row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
+        row = {
+            "ID": "AB"[n % 2],
+            "time": 1000.0 + n,
+            "lat": 52.811,
+            "lon": -4.128,
+            "sequence": n // 2,
+        }
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
     path.parent.mkdir(exist_ok=True)
     path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
@@ -117,11 +144,15 @@ def write_journal(path: Path) -> None:
 @pytest.mark.slow
 def test_the_python_of_every_recipe_runs(trained):
     pytest.importorskip("vmas")
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "recipes.md").read_text(), re.DOTALL)
+    blocks = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "recipes.md").read_text(), re.DOTALL
+    )
     assert len(blocks) == 5
     for block in blocks:
         command = [sys.executable, "-W", "ignore", "-c", block]
-        done = subprocess.run(command, cwd=trained, capture_output=True, text=True, timeout=600, check=False)
+        done = subprocess.run(
+            command, cwd=trained, capture_output=True, text=True, timeout=600, check=False
+        )
         assert done.returncode == 0, (block, done.stderr[-2000:])
 
 

@@ -21,7 +21,9 @@ from damian.delays.laws import Uniform
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
-PROGRAMS = [path for folder in ("docs", "examples") for path in sorted((ROOT / folder).rglob("*.py"))]
+PROGRAMS = [
+    path for folder in ("docs", "examples") for path in sorted((ROOT / folder).rglob("*.py"))
+]
 ELSEWHERE = {
     "docs/upstream/test_": "is one of TorchRL's own tests",
     "examples/benchmarl/": "needs BenchMARL, which asks for another TorchRL",
@@ -29,7 +31,8 @@ ELSEWHERE = {
     "examples/fleet/": "is a distribution of its own, with tests of its own",
     "examples/tune": "needs Optuna, which is no extra of tests",
 }
-"""How the paths of programs begin that are not imported here, and why; what they import of damian is."""
+"""How the paths of programs begin that are not imported here, and why; what they import of damian
+is."""
 DOCUMENT = (ROOT / "docs" / "backupdating.md").read_text()
 
 
@@ -78,7 +81,9 @@ def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
     code, printed = re.findall(r"```(?:python)?\n(.*?\n)```", DOCUMENT, re.DOTALL)[:2]
     exec(code, {})
     lines = capsys.readouterr().out.splitlines()
-    assert [line for line in lines if "torchrl" not in line] == printed.splitlines()  # it logs there, too
+    assert [
+        line for line in lines if "torchrl" not in line
+    ] == printed.splitlines()  # it logs there, too
 
 
 def test_the_delays_for_torchrl_stand_alone_and_are_ours(tmp_path, monkeypatch):
@@ -90,14 +95,23 @@ def test_the_delays_for_torchrl_stand_alone_and_are_ours(tmp_path, monkeypatch):
     runpy.run_path(str(ROOT / "docs" / "upstream" / "to_torchrl.py"))["main"](tmp_path)
     monkeypatch.syspath_prepend(tmp_path / "torchrl" / "envs" / "transforms")
     rollouts = []
-    for package, uniform in ((importlib.import_module("delays"), (1, 4)), (damian.transforms, Uniform(1, 4))):
-        late = package.ObservationDelay(uniform, "observation", "received", loss=0.2, delay_key="delay")
+    for package, uniform in (
+        (importlib.import_module("delays"), (1, 4)),
+        (damian.transforms, Uniform(1, 4)),
+    ):
+        late = package.ObservationDelay(
+            uniform, "observation", "received", loss=0.2, delay_key="delay"
+        )
         timeline = package.ObservationTimeline(6, delay_key="delay")
         env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(package.ActionDelay(2), late, timeline))
         package.set_seed(env, 0)
         torch.manual_seed(0)
         rollouts.append(env.rollout(30))
-    assert [*reference.read_text().split()][::2] == ["ActionDelay", "ObservationDelay", "ObservationTimeline"]
+    assert [*reference.read_text().split()][::2] == [
+        "ActionDelay",
+        "ObservationDelay",
+        "ObservationTimeline",
+    ]
     assert (rollouts[0] == rollouts[1]).all()
     assert rollouts[0]["delay"].unique().tolist() == [-1, 0, 1, 2, 3, 4]
 

@@ -34,7 +34,8 @@ return {
   ids: [...document.querySelectorAll('[id]')].map((each) => each.id),
 }
 """
-"""What is wrong on a page, and what links may lead to. What lies in a box that scrolls is not wide."""
+"""What is wrong on a page, and what links may lead to. What lies in a box that scrolls is not
+wide."""
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -57,7 +58,9 @@ def site(tmp_path_factory):
 
 def pages(folder: Path) -> list[str]:
     """The addresses of the pages, relative to the site."""
-    found = [path.relative_to(folder).parent.as_posix() for path in sorted(folder.rglob("index.html"))]
+    found = [
+        path.relative_to(folder).parent.as_posix() for path in sorted(folder.rglob("index.html"))
+    ]
     return [f"{name}/".removeprefix("./") for name in found]
 
 
@@ -92,7 +95,11 @@ def test_every_link_inside_the_site_leads_somewhere(site, seen):
             parts = urlsplit(link)
             path, part = unquote(parts.path).removeprefix("/"), unquote(parts.fragment)
             target = seen.get((path, 1440))
-            there = part in {"", "__codelineno", *target["ids"]} if target else (folder / path).is_file()
+            there = (
+                part in {"", "__codelineno", *target["ids"]}
+                if target
+                else (folder / path).is_file()
+            )
             if not there:
                 nowhere.add((name, link.removeprefix(address)))
     assert nowhere == set()

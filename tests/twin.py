@@ -11,8 +11,20 @@ from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 
 LOCAL = ["battery", "spotted"]
-GLOBAL = ["source_distance", "source_bearing", "source_drift", "source_time", "agent_distances", "coverage"]
-GLOBAL += ["mean_distance", "mean_distance_not_spotting", "mean_distance_spotting", "spotting_agents"]
+GLOBAL = [
+    "source_distance",
+    "source_bearing",
+    "source_drift",
+    "source_time",
+    "agent_distances",
+    "coverage",
+]
+GLOBAL += [
+    "mean_distance",
+    "mean_distance_not_spotting",
+    "mean_distance_spotting",
+    "spotting_agents",
+]
 """The features of the paper's Table 2."""
 INDIVIDUAL = ("coverage", "spotted", "battery")
 """The terms of eq. 7; the others are those of eq. 6."""
@@ -20,7 +32,8 @@ INDIVIDUAL = ("coverage", "spotted", "battery")
 
 @dataclass
 class Uav:
-    """The message that the server holds of one UAV: metres, seconds, radians clockwise from north."""
+    """The message that the server holds of one UAV: metres, seconds, radians clockwise from
+    north."""
 
     place: tuple[float, float]
     point: int = 0
@@ -39,7 +52,8 @@ class Uav:
 def features(
     uavs: Sequence[Uav], now: float, scale: float, time_scale: float, resolution: float = 5.0
 ) -> dict[str, list]:
-    """The features of the paper's Table 2 except the coverage: a list with one value for each UAV."""
+    """The features of the paper's Table 2 except the coverage: a list with one value for each
+    UAV."""
     heard = [uav for uav in uavs if uav.heard_at is not None]
     source = None
     if heard:
@@ -68,8 +82,12 @@ def features(
             row["source_time"] = min((now - last) / time_scale, 1.0)
         row["mean_distance"] = mean([math.dist(uav.place, u.place) / scale for u in others])
         both_silent = [u for u in others if not u.spots and not uav.spots]
-        row["mean_distance_not_spotting"] = mean([math.dist(uav.place, u.place) / scale for u in both_silent])
-        row["mean_distance_spotting"] = mean([math.dist(u.place, source) / scale for u in uavs if u.spots])
+        row["mean_distance_not_spotting"] = mean(
+            [math.dist(uav.place, u.place) / scale for u in both_silent]
+        )
+        row["mean_distance_spotting"] = mean(
+            [math.dist(u.place, source) / scale for u in uavs if u.spots]
+        )
         for name, value in row.items():
             table.setdefault(name, []).append(value)
     return table
@@ -151,7 +169,8 @@ def final(ended: tuple[bool, bool, bool], steps: int, task: RewardConfig) -> flo
 def assign_landing_points(
     preferences: Sequence[Sequence[int]], standing: Sequence[int], ready: Sequence[bool]
 ) -> list[int]:
-    """Book points by preference, in index order; points that others hold or have booked are not free."""
+    """Book points by preference, in index order; points that others hold or have booked are not
+    free."""
     booked: list[int] = []
     for i, preferred in enumerate(preferences):
         busy = {*booked, *standing[:i], *standing[i + 1 :]}
@@ -190,7 +209,9 @@ class World:
         standing = [uav.point for uav in self.uavs]
         self.steps += 1
         for uav, point in zip(
-            self.uavs, assign_landing_points(preferences, standing, [True] * len(standing)), strict=True
+            self.uavs,
+            assign_landing_points(preferences, standing, [True] * len(standing)),
+            strict=True,
         ):
             self._move(uav, point)
             self._listen(uav)
@@ -200,7 +221,9 @@ class World:
         end_reward = final(self.ended, self.steps, self.task)
         rewards = []
         for i, uav in enumerate(self.uavs):
-            own = {name: values[i] for name, values in observation.items() if name != "agent_distances"}
+            own = {
+                name: values[i] for name, values in observation.items() if name != "agent_distances"
+            }
             rewards.append(sum(terms(own, uav.motions, self.task).values()) + end_reward)
         return rewards
 
@@ -209,9 +232,13 @@ class World:
         return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale)
 
     def _preferences(self, uav: Uav, move: tuple[float, float]) -> list[int]:
-        """Landing points, nearest the target first; only the UAV's own point if the target is outside."""
+        """Landing points, nearest the target first; only the UAV's own point if the target is
+        outside."""
         distance, heading = move
-        target = (uav.place[0] + distance * math.sin(heading), uav.place[1] + distance * math.cos(heading))
+        target = (
+            uav.place[0] + distance * math.sin(heading),
+            uav.place[1] + distance * math.cos(heading),
+        )
         if not shapely.contains_xy(self.polygon, *target):
             return [uav.point]
         return sorted(range(len(self.points)), key=lambda p: math.dist(self.points[p], target))
@@ -233,7 +260,8 @@ class World:
 
 
 def exact_share(polygon, positions, radius):
-    """Exact coverage of one world by shapely, UAV by UAV: positions ``[N, n, 2]`` [m] -> ``[N]``."""
+    """Exact coverage of one world by shapely, UAV by UAV: positions ``[N, n, 2]`` [m] ->
+    ``[N]``."""
     discs = [[shapely.Point(p).buffer(radius, quad_segs=128) for p in uav] for uav in positions]
     shares = []
     for i, own in enumerate(discs):

@@ -55,7 +55,9 @@ def main() -> None:
                     tokens[key] += found[0]
                     lines[key] += found[1]
         for key, count in tokens.most_common():
-            print(f"{count:8,} tokens {lines[key]:7,} lines {count / max(lines[key], 1):6.2f}  {key}")
+            print(
+                f"{count:8,} tokens {lines[key]:7,} lines {count / max(lines[key], 1):6.2f}  {key}"
+            )
 
 
 if __name__ == "__main__":

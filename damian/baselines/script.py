@@ -20,29 +20,38 @@ from damian.server.features.requests import known_requests
 from damian.world.messages import Messages
 
 BLUR_M = 5.0
-"""Standard deviation of a detection's place [m]: landing points stand for the ground around them."""
+"""Standard deviation of a detection's place [m]: landing points stand for the ground around
+them."""
 TRUST = 0.9
 """Confidence, in [0, 1], that there is no source in a footprint in which a UAV hears nothing."""
 RECENT = 3.0
 """A detection is recent until the source can have moved by this many footprint radii."""
 _FLIGHT_COST = 1e-6
-"""Cost of a flight [weight per metre]: it only decides between equally good places, for the nearest."""
+"""Cost of a flight [weight per metre]: it only decides between equally good places, for the
+nearest."""
 _LEAST_GAIN = 1e-3
 """If no choice gains more weight than this, all weight lies out of reach."""
 PROBABLE = 0.1
-"""If a UAV detects the source with this probability somewhere in the next step, it leaves its own ground."""
+"""If a UAV detects the source with this probability somewhere in the next step, it leaves its own
+ground."""
 WORTH = 0.3
-"""Least share of the highest probability of a detection for which a UAV flies to a landing point."""
+"""Least share of the highest probability of a detection for which a UAV flies to a landing
+point."""
 SEARCH_STEPS, GOLDEN = 4, (math.sqrt(5) - 1) / 2
-"""A UAV that searches several sources flies to another place after so many steps, by the golden ratio."""
+"""A UAV that searches several sources flies to another place after so many steps, by the golden
+ratio."""
 MAX_PAIRS = 400_000_000
-"""Most pairs of landing points: the script weighs each of them against every other one of its region."""
+"""Most pairs of landing points: the script weighs each of them against every other one of its
+region."""
 
 
 def script_policy(env: DelayedEnv) -> TensorDictModule:
     """Build the stateless scripted policy, for an environment with ``message`` among its extras."""
     n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
-    shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
+    shown, should = (
+        f"{n_points} landing points",
+        "are too many for the scripted policy: take a larger step",
+    )
     checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
     scenario = env.uav_env.scenario
@@ -66,12 +75,17 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
 
 
 class Seeker:
-    """Function from messages to actions, for the regions, the source and the UAVs of an environment."""
+    """Function from messages to actions, for the regions, the source and the UAVs of an
+    environment."""
 
     def __init__(self, worlds: UavEnv) -> None:
         scenario, simulation, server = worlds.scenario, worlds.simulation, worlds.server
         source = scenario.source
-        self.unpack, self.region_of, self.counted = server.messages, server.region_of, server.counted
+        self.unpack, self.region_of, self.counted = (
+            server.messages,
+            server.region_of,
+            server.counted,
+        )
         self.grid, self.level = server.grid, server.level
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
@@ -83,8 +97,11 @@ class Seeker:
         # A row is a landing point to cover, a column the one in whose footprint it lies.
         self.near = (near & self.real.unsqueeze(-1)).float()
 
-    def __call__(self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
-        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M], ages [steps] and legal actions."""
+    def __call__(
+        self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None
+    ) -> Tensor:
+        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M], ages [steps] and legal
+        actions."""
         held = self.unpack(message)
         region = self.region_of(held)
         ground = self.points[region]
@@ -107,13 +124,15 @@ class Seeker:
         goal = (gain - _FLIGHT_COST * flown).argmax(-1)
         left = distances(_places_at(ground, goal), ground)
         if self.actions.kind == "discrete":
-            # A UAV that the server has last heard of at its takeoff stands on its target when it chooses.
+            # A UAV that the server has last heard of at its takeoff stands on its target when it
+            # chooses.
             standing = flown.argmin(-1) + region.unsqueeze(-1) * self.points.shape[1]
             return self.best_action(standing, gain, left, mask)
         return self.best_move(held, gain, flown, left, ground)
 
     def fresh(self, held: Messages, ground: Tensor) -> Tensor:
-        """1 for landing points [B, L, 2] nearest to the UAV and outside its latest footprints, [B, N, L]."""
+        """1 for landing points [B, L, 2] nearest to the UAV and outside its latest footprints,
+        [B, N, L]."""
         distance = distances(held.target, ground)
         own = distance <= distance.amin(1, keepdim=True)
         landed = gather_rows(self.points.flatten(0, 1), self.counted(held))
@@ -121,18 +140,22 @@ class Seeker:
         return (own & (from_trail > self.radius).all(-2)).float()
 
     def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-        """How likely the source is at each landing point [B, L, 2], relative to the best one, [B, 1, L].
+        """How likely the source is at each landing point [B, L, 2], relative to the best one,
+        [B, 1, L].
 
-        The place of a detection grows uncertain with its age: the way of the source at full speed counts as
-        two standard deviations. A footprint in which a UAV on the ground hears nothing ``now`` [s] makes it
-        less likely there. Also returns whether the latest detection is recent, [B, 1, 1].
+        The place of a detection grows uncertain with its age: the way of the source at full speed
+        counts as two standard deviations. A footprint in which a UAV on the ground hears nothing
+        ``now`` [s] makes it less likely there. Also returns whether the latest detection is recent,
+        [B, 1, 1].
         """
         detected = held.detected_time.squeeze(-1)
         has_detection = detected >= 0
         since = torch.where(has_detection, now - detected, torch.inf).unsqueeze(-1)
         outside = (distances(held.detected_position.squeeze(-2), ground) - self.radius).clamp(min=0)
         log_detected = -(outside / (BLUR_M + self.speed * since / 2)).square() / 2
-        log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0).sum(1, keepdim=True)
+        log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0).sum(
+            1, keepdim=True
+        )
         silent = ~held.spotted & ~held.in_flight & (held.time > now - self.dt / 2)
         covered = (distances(held.position, ground) <= self.radius) & silent.unsqueeze(-1)
         latest = since.amin(1, keepdim=True)
@@ -144,7 +167,8 @@ class Seeker:
     def best_action(
         self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """The best legal discrete action from points of these flat ids, [B, N], and where it leads."""
+        """The best legal discrete action from points of these flat ids, [B, N], and where it
+        leads."""
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = standing.unsqueeze(-1) * len(action) + action
         point, flown = (gather_rows(table[:, 0], row) for table in self.candidates.ranking)
@@ -155,7 +179,8 @@ class Seeker:
     def best_move(
         self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Distance and heading in [0, 1] to the best landing point in reach, [B, N, 2], and this point."""
+        """Distance and heading in [0, 1] to the best landing point in reach, [B, N, 2], and this
+        point."""
         best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
         east, north = (_places_at(ground, best) - held.target).unbind(-1)
         heading = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
@@ -164,9 +189,12 @@ class Seeker:
 
 
 def _best(gain: Tensor, flown: Tensor, left: Tensor) -> Tensor:
-    """Index of the choice of most gain, the nearest of equals, or nearest the goal if none gains, [B, N]."""
+    """Index of the choice of most gain, the nearest of equals, or nearest the goal if none gains,
+    [B, N]."""
     gains = gain.amax(-1, keepdim=True) > _LEAST_GAIN
-    return torch.where(gains, gain - _FLIGHT_COST * flown, -left.where(gain.isfinite(), torch.inf)).argmax(-1)
+    return torch.where(
+        gains, gain - _FLIGHT_COST * flown, -left.where(gain.isfinite(), torch.inf)
+    ).argmax(-1)
 
 
 def _places_at(ground: Tensor, index: Tensor) -> Tensor:
@@ -197,7 +225,9 @@ class Searcher(Seeker):
         assert self.grid is not None
         place = places(self.grid, region, level).unsqueeze(1).expand(belief.shape[:3])
         ground = self.points[region]
-        chance = any_of(detection_chance(self.grid, belief, place)).expand(-1, known.time.shape[1], -1)
+        chance = any_of(detection_chance(self.grid, belief, place)).expand(
+            -1, known.time.shape[1], -1
+        )
         here = own.trail[..., :1] % self.points.shape[1]
         rows = report_rows(self.grid, own, level).movedim(-1, -2)
         each = belief.expand(*rows.shape, -1)
@@ -210,7 +240,8 @@ class Searcher(Seeker):
         return self.choose_landing(own, torch.where(worth, chance, 0.0), region, mask)[0]
 
     def from_others(self, known: Messages, ground: Tensor) -> Tensor:
-        """Distance from the nearest other UAV to each landing point [m], [B, N, L]; infinite for one UAV."""
+        """Distance from the nearest other UAV to each landing point [m], [B, N, L]; infinite for
+        one UAV."""
         distance = distances(known.target, ground).unsqueeze(1)
         n = distance.shape[2]
         itself = torch.eye(n, dtype=torch.bool, device=distance.device).unsqueeze(-1)
@@ -224,10 +255,12 @@ class Searcher(Seeker):
 
 
 class Coverer(Seeker):
-    """Each UAV flies where its footprint holds most new ground; the UAVs choose one after the other.
+    """Each UAV flies where its footprint holds most new ground; the UAVs choose one after the
+    other.
 
-    Ground is new if it lies outside the UAV's own latest footprints, as they are after the next landing, and
-    outside those that the UAVs before it choose, as far as it knows. It looks one step ahead.
+    Ground is new if it lies outside the UAV's own latest footprints, as they are after the next
+    landing, and outside those that the UAVs before it choose, as far as it knows. It looks one step
+    ahead.
     """
 
     def __call__(  # type: ignore[override]
@@ -256,16 +289,20 @@ class Coverer(Seeker):
     def choose_new(
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others."""
+        """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by
+        others."""
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
         # The next landing replaces the oldest one.
         latest = self.counted(alone)[:, 0, :-1] % self.points.shape[1]
-        covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
+        covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(
+            1, keepdim=True
+        )
         return self.choose_landing(alone, (1 - covered) @ near, self.region_of(known), mask)
 
 
 class Rescuer(Coverer):
-    """UAVs are assigned to known sources, the nearest pair first; the others search all over the region."""
+    """UAVs are assigned to known sources, the nearest pair first; the others search all over the
+    region."""
 
     def choose_new(
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
@@ -284,7 +321,9 @@ class Rescuer(Coverer):
         """Where a UAV that searches flies next, [B, 2]."""
         region = self.region_of(known)
         # A sequence of landing points that leaves no gap: each lies far from those before it.
-        turn = (known.time[:, uav : uav + 1] / self.dt / SEARCH_STEPS).floor() * known.time.shape[1] + uav
+        turn = (known.time[:, uav : uav + 1] / self.dt / SEARCH_STEPS).floor() * known.time.shape[
+            1
+        ] + uav
         point = (turn * GOLDEN % 1 * self.real[region].sum(-1, keepdim=True)).long()
         return _places_at(self.points[region], point).squeeze(1)
 
@@ -309,17 +348,24 @@ class Dispatcher(Rescuer):
 
 
 def _assigned(uavs: Tensor, places: Tensor, wanted: Tensor, uav: int) -> tuple[Tensor, Tensor]:
-    """The place [B, 2] of those wanted [B, K] to which a UAV is assigned, and whether it is to any, [B].
+    """The place [B, 2] of those wanted [B, K] to which a UAV is assigned, and whether it is to any,
+    [B].
 
-    UAVs are at ``uavs`` [B, N, 2], places at [B, K, 2] m; of those left, the nearest pair is assigned first.
+    UAVs are at ``uavs`` [B, N, 2], places at [B, K, 2] m; of those left, the nearest pair is
+    assigned first.
     """
     cost = distances(uavs, places).masked_fill(~wanted.unsqueeze(1), torch.inf)
-    goal, assigned = places[:, 0].clone(), torch.zeros(len(uavs), dtype=torch.bool, device=uavs.device)
+    goal, assigned = (
+        places[:, 0].clone(),
+        torch.zeros(len(uavs), dtype=torch.bool, device=uavs.device),
+    )
     for _ in range(min(cost.shape[1:])):
         least, pair = cost.flatten(1).min(-1)
         one, place = pair // cost.shape[2], pair % cost.shape[2]
         own = (one == uav) & least.isfinite()
-        goal = torch.where(own.unsqueeze(-1), _places_at(places, place.unsqueeze(1)).squeeze(1), goal)
+        goal = torch.where(
+            own.unsqueeze(-1), _places_at(places, place.unsqueeze(1)).squeeze(1), goal
+        )
         assigned = assigned | own
         rows = torch.arange(cost.shape[1], device=uavs.device) == one.unsqueeze(-1)
         columns = torch.arange(cost.shape[2], device=uavs.device) == place.unsqueeze(-1)

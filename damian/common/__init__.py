@@ -1,1 +1,2 @@
-"""Checks, errors, random numbers and other helpers that depend on neither the UAV world nor learning."""
+"""Checks, errors, random numbers and other helpers that depend on neither the UAV world nor
+learning."""

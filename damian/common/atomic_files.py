@@ -1,8 +1,9 @@
-"""Writes files below a folder that a person has named: each completely or not at all, none through a link.
+"""Writes files below a folder that a person has named: each completely or not at all, none through
+a link.
 
-The folder may be a link, or lie below one. What is in it may come from anybody, so that nothing below it is
-followed to another place. Every program writes by these functions, or, where a library writes by itself, to
-a path from ``not_linked``.
+The folder may be a link, or lie below one. What is in it may come from anybody, so that nothing
+below it is followed to another place. Every program writes by these functions, or, where a library
+writes by itself, to a path from ``not_linked``.
 """
 
 import os
@@ -70,4 +71,6 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         problem = error.strerror or str(error)
-        raise RunError(f"{path}: it cannot be written: {problem}; what was stored before is intact") from None
+        raise RunError(
+            f"{path}: it cannot be written: {problem}; what was stored before is intact"
+        ) from None

@@ -20,8 +20,8 @@ COMPILE_OPTIONS = {
 class CompiledMethods:
     """The methods of an object, each compiled at its first call, with the options of ``compiled``.
 
-    With ``cuda_graph`` each becomes a ``CudaGraph``. A copy, and what a pickle is read as, has no graphs:
-    these belong to the object of the methods.
+    With ``cuda_graph`` each becomes a ``CudaGraph``. A copy, and what a pickle is read as, has no
+    graphs: these belong to the object of the methods.
     """
 
     def __init__(self, options: dict[str, Any], cuda_graph: bool = False) -> None:
@@ -43,9 +43,9 @@ class CompiledMethods:
 class CudaGraph:
     """A function of a state, as one CUDA graph from its third call on.
 
-    Its first two arguments are the state, its first two results the next one: trees of tensors. What a call
-    returns as the state is changed in place by the next one; everything else that it returns stays. (With
-    ``torch.compile(mode="reduce-overhead")`` both would be lost.)
+    Its first two arguments are the state, its first two results the next one: trees of tensors.
+    What a call returns as the state is changed in place by the next one; everything else that it
+    returns stays. (With ``torch.compile(mode="reduce-overhead")`` both would be lost.)
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -63,7 +63,9 @@ class CudaGraph:
             self._own = tree_unflatten(self._inputs, self._form)
             with torch.cuda.graph(self._graph):
                 first, second, *self._others = self._function(*self._own)
-                computed = tree_map(Tensor.clone, (first, second))  # since one may be another's input
+                computed = tree_map(
+                    Tensor.clone, (first, second)
+                )  # since one may be another's input
                 tree_map(Tensor.copy_, self._own[:2], computed)
         for mine, given in zip(self._inputs, self._form.flatten_up_to(args), strict=True):
             if mine is not given:
@@ -73,17 +75,19 @@ class CudaGraph:
 
 
 def compiled(function: Function, **options: Any) -> Function:
-    """Compile a pure function of tensors as one graph; ``options`` replace the defaults, tuned for a CPU."""
+    """Compile a pure function of tensors as one graph; ``options`` replace the defaults, tuned for
+    a CPU."""
     options = options or {"options": _INDUCTOR}
-    # Recompiles are isolated, so that a function never runs a graph compiled for another's settings.
+    # Recompiles are isolated, so that a function never runs a graph compiled for another's
+    # settings.
     return torch.compile(  # type: ignore[call-overload]
         function, fullgraph=True, isolate_recompiles=True, **options
     )
 
 
 _INDUCTOR: dict[str, Any] = {
-    # Guards on tensors stay, since shapes may change. Settings never do, and checking them takes as long as
-    # running a kernel.
+    # Guards on tensors stay, since shapes may change. Settings never do, and checking them takes as
+    # long as running a kernel.
     "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
     # The innermost loops run over a few UAVs: vectors of 16 lanes would be mostly idle, and slower.
     "cpp.simdlen": 1,

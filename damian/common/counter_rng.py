@@ -1,8 +1,9 @@
 """Random numbers as a pure function of a key and counters: no generator, no hidden state.
 
-A stream, with a key of 64 bits, draws the same numbers in a batch as alone, on any device and compiled. The
-hash is the mixing function of SplitMix64 (Steele, Lea and Flood 2014; multipliers: D. Stafford's variant 13)
-of the counter, with the key added within it again, so that each key gives a sequence of its own.
+A stream, with a key of 64 bits, draws the same numbers in a batch as alone, on any device and
+compiled. The hash is the mixing function of SplitMix64
+(Steele, Lea and Flood 2014; multipliers: D. Stafford's variant 13) of the counter, with the key
+added within it again, so that each key gives a sequence of its own.
 """
 
 import hashlib
@@ -60,5 +61,6 @@ def world_seeds(seed: int, n_worlds: int, device: torch.device | None = None) ->
 
 
 def number_of(text: str) -> int:
-    """A 63-bit number that stands for a text: a counter that tells streams of different uses apart."""
+    """A 63-bit number that stands for a text: a counter that tells streams of different uses
+    apart."""
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big") >> 1

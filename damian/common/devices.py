@@ -9,7 +9,8 @@ import torch
 
 
 def data_dependent(device: torch.device) -> bool:
-    """Whether shapes and branches may depend on data, so that only the rows that need it are worked on.
+    """Whether shapes and branches may depend on data, so that only the rows that need it are worked
+    on.
 
     Any device but a CPU would first have to finish all work to tell how many: there a mask chooses.
     """
@@ -20,16 +21,20 @@ def free_memory(device: torch.device) -> float:
     """Free memory of a device [GiB]; infinite where the system does not tell."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0] / 2**30
-    table = Path("/proc/meminfo")  # of Linux: the memory that is free, or would be if it were asked for [KiB]
+    table = Path(
+        "/proc/meminfo"
+    )  # of Linux: the memory that is free, or would be if it were asked for [KiB]
     lines = table.read_text(encoding="ascii").splitlines() if table.exists() else []
     free = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     return free[0] / 2**20 if free else math.inf
 
 
 def keep_freed_memory() -> None:
-    """Let the C library of Linux keep freed memory for new tensors, of up to 32 MiB: it allows no more.
+    """Let the C library of Linux keep freed memory for new tensors, of up to 32 MiB: it allows no
+    more.
 
-    The system would clear every page that it hands out again, which takes a tenth of a training's time.
+    The system would clear every page that it hands out again, which takes a tenth of a training's
+    time.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:

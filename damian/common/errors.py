@@ -8,7 +8,8 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """Wrong input, in one line with key, value, unit and remedy; a recipe prints it and exits with code 2."""
+    """Wrong input, in one line with key, value, unit and remedy; a recipe prints it and exits with
+    code 2."""
 
 
 RUN_ERROR = 3
@@ -16,12 +17,14 @@ RUN_ERROR = 3
 
 
 class RunError(RuntimeError):
-    """A run that cannot go on, in one line; a recipe prints it and exits with code ``RUN_ERROR``."""
+    """A run that cannot go on, in one line; a recipe prints it and exits with code
+    ``RUN_ERROR``."""
 
 
 @contextmanager
 def naming_errors(name: str) -> Iterator[None]:
-    """Turn an exception of the user's component into an ``InputError`` with its name, file and line."""
+    """Turn an exception of the user's component into an ``InputError`` with its name, file and
+    line."""
     try:
         yield
     except (InputError, RunError):

@@ -1,7 +1,9 @@
-"""How a setting is declared: its default, meaning, bounds and choices stand in one place, its field.
+"""How a setting is declared: its default, meaning, bounds and choices stand in one place, its
+field.
 
-Every dataclass of settings derives from ``Settings``, which checks its fields when it is made; a class checks
-in ``__post_init__`` only what its settings exclude in each other. Nothing here imports torch.
+Every dataclass of settings derives from ``Settings``, which checks its fields when it is made; a
+class checks in ``__post_init__`` only what its settings exclude in each other. Nothing here imports
+torch.
 """
 
 import dataclasses
@@ -36,7 +38,8 @@ class Rule:
     """Allowed values; with ``paths`` also components of the user's own, ``package.module:Name``."""
     paths: bool = False
     kinds: tuple[str, ...] = ()
-    """Kinds of the section that read this setting; all of them if empty. Another kind does not have it."""
+    """Kinds of the section that read this setting; all of them if empty. Another kind does not have
+    it."""
     each: bool = False
     """A list gives one value for each UAV."""
     fixed: bool = False
@@ -46,7 +49,8 @@ class Rule:
 
 
 def setting(default: Any, meaning: str = "", unit: str = "", **rule: Any) -> Any:
-    """A field of settings: its default, copied for every instance, and the fields of its ``Rule``."""
+    """A field of settings: its default, copied for every instance, and the fields of its
+    ``Rule``."""
     shown = f"{meaning.removesuffix('.')} [{unit}]." if meaning and unit else meaning
     metadata = {"rule": Rule(shown, unit=unit, **rule)}
     if isinstance(default, type):
@@ -57,7 +61,8 @@ def setting(default: Any, meaning: str = "", unit: str = "", **rule: Any) -> Any
 
 
 def constant(default: Any, reason: str, **rule: Any) -> Any:
-    """A field that is no key: a Python program may set it, but nobody needs to, for the reason given."""
+    """A field that is no key: a Python program may set it, but nobody needs to, for the reason
+    given."""
     return setting(default, reason, fixed=True, **rule)
 
 
@@ -89,7 +94,8 @@ class Settings:
 
     @classmethod
     def class_for(cls, values: Mapping[str, Any]) -> "type[Settings]":
-        """The class that plain values of this section make; one with a class for each option finds it."""
+        """The class that plain values of this section make; one with a class for each option finds
+        it."""
         return cls
 
     def key(self, name: str) -> str:
@@ -97,18 +103,27 @@ class Settings:
         return f"{self.section}.{name}".lstrip(".")
 
     def refuse(self, wrong: Any, name: str, problem: str) -> None:
-        """Refuse a setting, or one of a section such as ``observation.own``, in a case that is wrong."""
+        """Refuse a setting, or one of a section such as ``observation.own``, in a case that is
+        wrong."""
         if wrong:
             value = functools.reduce(getattr, name.split("."), self)
-            checks.require(False, self.key(name), "it" if value in (None, "", [], {}) else value, problem)
+            checks.require(
+                False, self.key(name), "it" if value in (None, "", [], {}) else value, problem
+            )
 
     def refuse_unread(self) -> None:
-        """Refuse changed settings that only other kinds of the section read; your own kind reads any."""
+        """Refuse changed settings that only other kinds of the section read; your own kind reads
+        any."""
         for each in dataclasses.fields(self):
             kinds = rules(type(self))[each.name].kinds
             read = not kinds or self.variant in kinds or ":" in self.variant
-            problem = f"means nothing with {self.section}={self.variant}: only {' or '.join(kinds)} reads it"
-            self.refuse(not read and getattr(self, each.name) != default_of(each), each.name, problem)
+            problem = (
+                f"means nothing with {self.section}={self.variant}: only {' or '.join(kinds)} "
+                "reads it"
+            )
+            self.refuse(
+                not read and getattr(self, each.name) != default_of(each), each.name, problem
+            )
 
 
 def default_of(each: "dataclasses.Field[Any]") -> Any:
@@ -119,7 +134,8 @@ def default_of(each: "dataclasses.Field[Any]") -> Any:
 
 @functools.cache
 def rules(kind: type) -> dict[str, Rule]:
-    """The rules of the fields of a dataclass; a field that only changes the default keeps the rule."""
+    """The rules of the fields of a dataclass; a field that only changes the default keeps the
+    rule."""
     found: dict[str, Rule] = {}
     for base in reversed(kind.__mro__):
         for each in getattr(base, "__dataclass_fields__", {}).values():
@@ -129,7 +145,8 @@ def rules(kind: type) -> dict[str, Rule]:
 
 
 def leaves(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every setting of nested dataclasses by its key, without constants and what its kind does not read."""
+    """Every setting of nested dataclasses by its key, without constants and what its kind does not
+    read."""
     kind = config.variant if isinstance(config, Settings) else ""
     for name, rule in rules(type(config)).items():
         value = getattr(config, name)
@@ -163,7 +180,8 @@ def has(values: Mapping[str, Any], key: str) -> bool:
 
 
 def set_at(values: dict[str, Any], key: str, value: Any) -> None:
-    """Set a value of nested data by its dotted key, in sections that are made where there are none."""
+    """Set a value of nested data by its dotted key, in sections that are made where there are
+    none."""
     *sections, name = key.split(".")
     for each in sections:
         if not isinstance(values.get(each), dict):
@@ -173,11 +191,14 @@ def set_at(values: dict[str, Any], key: str, value: Any) -> None:
 
 
 def filled(kind: type[S], values: Mapping[str, Any], path: str = "") -> S:
-    """Settings of a class from plain values, whose sections are mappings; no text in them is resolved."""
+    """Settings of a class from plain values, whose sections are mappings; no text in them is
+    resolved."""
     known, hints, given = rules(kind), _hints(kind), {}
     for name, value in values.items():
         if name not in known or known[name].fixed:
-            close = difflib.get_close_matches(str(name), [each for each in known if not known[each].fixed], 1)
+            close = difflib.get_close_matches(
+                str(name), [each for each in known if not known[each].fixed], 1
+            )
             hint = "".join(f"; did you mean {path}{each}?" for each in close)
             raise InputError(f"{path}{name}: unknown setting{hint}")
         declared = _base(hints[name])
@@ -206,7 +227,13 @@ def _base(hint: Any) -> Any:
     return hint
 
 
-_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", list: "a list"}
+_KINDS = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    list: "a list",
+}
 
 
 def _converted(key: str, value: Any, hint: Any) -> Any:
@@ -219,7 +246,9 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
         return float(value)
     if origin is str and checks.is_number(value):
         return str(value)  # a time such as 2
-    if origin is int and (isinstance(value, str) or (isinstance(value, float) and value.is_integer())):
+    if origin is int and (
+        isinstance(value, str) or (isinstance(value, float) and value.is_integer())
+    ):
         with suppress(ValueError):
             return int(value)  # 1e6, or the text of an environment variable
     good = isinstance(value, origin) and not (isinstance(value, bool) and origin is not bool)

@@ -1,4 +1,5 @@
-"""Components by name, or by the path of a class or function of a user's own: ``package.module:Name``.
+"""Components by name, or by the path of a class or function of a user's own:
+``package.module:Name``.
 
 Nothing else in the package imports what a setting names, because importing a module runs it.
 """
@@ -33,10 +34,11 @@ _door: ContextVar[_Door | None] = ContextVar("door", default=None)
 
 @contextmanager
 def stored_settings(named: Collection[str] = (), trust: bool = False) -> Iterator[None]:
-    """While settings that come from a file are in use, import only the paths that are ``named`` elsewhere.
+    """While settings that come from a file are in use, import only the paths that are ``named``
+    elsewhere.
 
-    The file may come from anybody. What has been registered or imported before stays usable. With ``trust``
-    any path is imported. Of nested ones the outermost decides.
+    The file may come from anybody. What has been registered or imported before stays usable. With
+    ``trust`` any path is imported. Of nested ones the outermost decides.
     """
     before = _door.set(_door.get() or _Door(frozenset(named), trust))
     try:
@@ -48,10 +50,11 @@ def stored_settings(named: Collection[str] = (), trust: bool = False) -> Iterato
 class Registry(Generic[T]):
     """Components of one kind.
 
-    ``@LAWS.register("uniform")`` adds a class to the registry ``LAWS``, and ``LAWS.get("uniform", key)``
-    returns it. ``LAWS.get("my_lab.delays:Satellite", key)`` imports a class that is not registered, also from
-    the current folder, so that your own file needs no installation. An installed package that declares its
-    module as an entry point ``damian.plugins`` registers names in the same way.
+    ``@LAWS.register("uniform")`` adds a class to the registry ``LAWS``, and
+    ``LAWS.get("uniform", key)`` returns it. ``LAWS.get("my_lab.delays:Satellite", key)`` imports a
+    class that is not registered, also from the current folder, so that your own file needs no
+    installation. An installed package that declares its module as an entry point ``damian.plugins``
+    registers names in the same way.
 
     Args:
         kind: what a component is called in errors, such as ``law``.
@@ -61,7 +64,9 @@ class Registry(Generic[T]):
 
     def __init__(self, kind: str, fits: type | Callable[[Any], bool], problem: str) -> None:
         self.kind, self._fits, self._problem = kind, fits, problem
-        self._components: dict[str, T] = {}  # registered ones, and those that ``get`` has imported last
+        self._components: dict[
+            str, T
+        ] = {}  # registered ones, and those that ``get`` has imported last
 
     def register(self, name: str) -> Callable[[Component], Component]:
         """Decorator that adds a component under a name."""
@@ -87,7 +92,9 @@ class Registry(Generic[T]):
         if door and not door.trust and name not in door.named and name not in self:
             remedy = "repeat that override, or add trust=true if you know where the run comes from"
             raise InputError(f"{key}: this run uses code outside DAMIAN ({name}): {remedy}")
-        component = _import_path(name, key)  # each time, because a module may have been loaded again
+        component = _import_path(
+            name, key
+        )  # each time, because a module may have been loaded again
         fits = self._fits
         good = isinstance(component, fits) if isinstance(fits, type) else fits(component)
         checks.require(good, key, name, self._problem)
@@ -95,9 +102,12 @@ class Registry(Generic[T]):
         return component
 
     def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:
-        """Name or path, component and parameters of ``{entry: package.module:name, parameter: ..., ...}``."""
+        """Name or path, component and parameters of ``{entry: package.module:name, parameter: ...,
+        ...}``."""
         if not isinstance(written, Mapping) or entry not in written:
-            raise InputError(f"{key}: {written} is not {{{entry}: package.module:name, parameter: value}}")
+            raise InputError(
+                f"{key}: {written} is not {{{entry}: package.module:name, parameter: value}}"
+            )
         path = written[entry]
         parameters = {str(name): value for name, value in written.items() if name != entry}
         return path, self.get(path, f"{key}.{entry}"), parameters
@@ -122,30 +132,41 @@ def load_plugins() -> None:
 
 
 def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
-    """Take the entry ``name``, which tells components of one function apart, out of the parameters."""
+    """Take the entry ``name``, which tells components of one function apart, out of the
+    parameters."""
     name = parameters.pop("name", default)
-    checks.require(str(name).isidentifier(), f"{key}.name", name, "is not a name of letters, digits and _")
+    checks.require(
+        str(name).isidentifier(), f"{key}.name", name, "is not a name of letters, digits and _"
+    )
     return name
 
 
 def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """The keyword-only arguments of a function, by name."""
     accepted = inspect.signature(function).parameters
-    return {name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY}
+    return {
+        name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY
+    }
 
 
-def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str) -> None:
-    """Require that ``given`` are the keyword-only arguments of a function; ``path`` names it in errors."""
+def check_parameters(
+    function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str
+) -> None:
+    """Require that ``given`` are the keyword-only arguments of a function; ``path`` names it in
+    errors."""
     known = parameters_of(function)
     for name, value in given.items():
         problem = f"is not a parameter of {path}, which has {', '.join(known) or 'none'}"
         checks.require(name in known, f"{key}.{name}", value, problem)
-    missing = [name for name, each in known.items() if each.default is each.empty and name not in given]
+    missing = [
+        name for name, each in known.items() if each.default is each.empty and name not in given
+    ]
     checks.require(not missing, key, path, f"needs a value for {', '.join(missing)}")
 
 
 def resolved(path: str) -> Any:
-    """The class or function at a path that code names, not a setting; it is imported when it is needed."""
+    """The class or function at a path that code names, not a setting; it is imported when it is
+    needed."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
 
@@ -155,13 +176,17 @@ def _import_path(path: str, key: str) -> Any:
     module_name, _, name = path.partition(":")
     folder = os.getcwd()
     if folder not in sys.path:
-        sys.path.append(folder)  # it stays there: worker processes inherit it and import the module again
+        sys.path.append(
+            folder
+        )  # it stays there: worker processes inherit it and import the module again
     try:
         module = importlib.import_module(module_name)
     except InputError as error:
         raise InputError(f"{key}: {path}: {error}") from error
     except Exception as error:  # the module of a user can raise anything
-        if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
+        if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(
+            f"{error.name}."
+        ):
             problem = f"{error}; {module_name} must be installed, on PYTHONPATH, or in {folder}"
         else:
             problem = f"importing it raised {described(error)}"

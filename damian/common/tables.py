@@ -13,7 +13,8 @@ from damian.common.errors import InputError
 
 
 def read_csv(path: Path, text: Sequence[str] = ()) -> pd.DataFrame:
-    """Read a table of numbers, in which the columns ``text`` are words; those named ``seed`` are whole.
+    """Read a table of numbers, in which the columns ``text`` are words; those named ``seed`` are
+    whole.
 
     A last line without an end, which a killed process was writing, is left out.
 
@@ -30,7 +31,9 @@ def read_csv(path: Path, text: Sequence[str] = ()) -> pd.DataFrame:
     except OSError as error:
         raise InputError(f"{path}: it cannot be read: {error.strerror}") from None
     except ValueError as error:
-        raise InputError(f"{path}: it is not a table of numbers ({' '.join(str(error).split())})") from None
+        raise InputError(
+            f"{path}: it is not a table of numbers ({' '.join(str(error).split())})"
+        ) from None
 
 
 def write_csv(path: Path, table: pd.DataFrame, unknown: str = "nan") -> None:

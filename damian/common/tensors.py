@@ -10,24 +10,30 @@ Tree = TypeVar("Tree", bound=NamedTuple)
 
 
 def gather_rows(table: Tensor, index: Tensor) -> Tensor:
-    """Compute ``table[index]`` [*, ...], several times as fast on a CPU; table [M, ...], index [*]."""
+    """Compute ``table[index]`` [*, ...], several times as fast on a CPU; table [M, ...], index
+    [*]."""
     return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
 
 
 def expand_mask(mask: Tensor, like: Tensor) -> Tensor:
-    """Append dimensions of size 1 to a mask [*], so that it broadcasts against ``like`` [*, ...]."""
+    """Append dimensions of size 1 to a mask [*], so that it broadcasts against ``like``
+    [*, ...]."""
     return mask.view((*mask.shape, *[1] * (like.dim() - mask.dim())))
 
 
 def distances(places: Tensor, others: Tensor) -> Tensor:
-    """Distances [*, P, Q] between places [*, P, 2] and others [*, Q, 2], exact also for small distances."""
+    """Distances [*, P, Q] between places [*, P, 2] and others [*, Q, 2], exact also for small
+    distances."""
     if places.is_cuda:  # the same, where cdist takes a hundred times as long
         return torch.linalg.vector_norm(places.unsqueeze(-2) - others.unsqueeze(-3), dim=-1)
-    return torch.cdist(places, others, compute_mode="donot_use_mm_for_euclid_dist")  # no matrix product
+    return torch.cdist(
+        places, others, compute_mode="donot_use_mm_for_euclid_dist"
+    )  # no matrix product
 
 
 def next_true(flags: Tensor) -> Tensor:
-    """Index of the next true flag at or after each place, T if there is none; flags [T, ...] by time."""
+    """Index of the next true flag at or after each place, T if there is none; flags [T, ...] by
+    time."""
     n_flags = len(flags)
     index = expand_mask(torch.arange(n_flags, device=flags.device), flags)
     return torch.where(flags, index, n_flags).flip(0).cummin(0).values.flip(0)
@@ -43,14 +49,17 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
 
 
 def to_device(value: Any, device: torch.device) -> Any:
-    """Copy of a tensor, or of nested tuples and mappings of tensors and others, on another device."""
+    """Copy of a tensor, or of nested tuples and mappings of tensors and others, on another
+    device."""
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, dict):
         return {key: to_device(each, device) for key, each in value.items()}
     if type(value) is tuple:
         return tuple(to_device(each, device) for each in value)
-    return value._make(to_device(each, device) for each in value) if hasattr(value, "_make") else value
+    return (
+        value._make(to_device(each, device) for each in value) if hasattr(value, "_make") else value
+    )
 
 
 def move_attributes(owner: object, device: torch.device) -> None:
@@ -60,5 +69,6 @@ def move_attributes(owner: object, device: torch.device) -> None:
 
 
 def tree_where(mask: Tensor, new: Tree, old: Tree) -> Tree:
-    """Take the rows of ``new`` where the mask [*] is true and of ``old`` elsewhere; tensors are [*, ...]."""
+    """Take the rows of ``new`` where the mask [*] is true and of ``old`` elsewhere; tensors are
+    [*, ...]."""
     return tree_map(lambda a, b: torch.where(expand_mask(mask, a), a, b), new, old)

@@ -1,4 +1,5 @@
-"""Reads input files as text and tables, and puts the file, the place and a hint into one-line errors."""
+"""Reads input files as text and tables, and puts the file, the place and a hint into one-line
+errors."""
 
 import csv
 import difflib
@@ -22,7 +23,8 @@ def data_file(path: str, key: str) -> str:
     """The file of a path; one that begins with ``damian:`` is among the package's own.
 
     Raises:
-        InputError: the package has no policy, or no file, of this name; ``key`` is the setting of the path.
+        InputError: the package has no policy, or no file, of this name; ``key`` is the setting of
+            the path.
     """
     shipped = path.removeprefix("damian:")
     if shipped == path:
@@ -69,12 +71,15 @@ def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
         if len(cells) != len(header) or None in cells:
             raise InputError(f"line {number}: it has not {len(header)} values, one for each column")
     rows = [(number, [cell.strip() for cell in cells]) for number, cells in lines]
-    return [Row(number, dict(zip(header, cells, strict=True))) for number, cells in rows if any(cells)]
+    return [
+        Row(number, dict(zip(header, cells, strict=True))) for number, cells in rows if any(cells)
+    ]
 
 
 @contextmanager
 def named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the file's name before every ``InputError`` raised inside, and make it one printable line."""
+    """Put the file's name before every ``InputError`` raised inside, and make it one printable
+    line."""
     try:
         yield
     except InputError as error:
@@ -82,7 +87,8 @@ def named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def one_line(text: str) -> str:
-    """Remove line breaks, escape what a terminal would not print, and leave out the middle of a long text."""
+    """Remove line breaks, escape what a terminal would not print, and leave out the middle of a
+    long text."""
     line = " ".join(text.split())
     if len(line) > MAX_LINE:
         line = f"{line[: MAX_LINE // 2]} ... {line[-MAX_LINE // 3 :]}"

@@ -1,4 +1,5 @@
-"""Comparison of methods over tasks, delays and seeds: means, J_norm and recovery, with 95 % intervals."""
+"""Comparison of methods over tasks, delays and seeds: means, J_norm and recovery, with 95 %
+intervals."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ NOT_LATE = "none"
 CORRECTED = "backupdated"
 """Share of the steps of a training whose rewards late messages have changed."""
 COMPARED = ("J_norm", "recovery", "improvement")
-"""Statistics of a method under a delay (``normalised``, ``recovery``, ``probability_of_improvement``). The
+"""Statistics of a method under a delay (``normalised``, ``recovery``,
+``probability_of_improvement``). The
 naive method in them is the strongest of the same track: late data only, or simulator allowed."""
 LATE_DATA, SIMULATOR, NO_DELAY = "late data", "simulator", "no delay"
 """Regimes: the information that a method may use (docs/protocol.md)."""
@@ -65,20 +67,25 @@ def shown(line: Mapping[Any, Any], name: str) -> str:
 def _estimates(
     names: Sequence[str], statistic: Callable[[Floats], Floats], scores: Floats
 ) -> dict[str, float]:
-    """Columns (``ENDS``) of a statistic from ``scores`` [methods, seeds] to a number for each name."""
+    """Columns (``ENDS``) of a statistic from ``scores`` [methods, seeds] to a number for each
+    name."""
     triples = zip(names, *(np.ravel(x).tolist() for x in bootstrap(statistic, scores)), strict=True)
     return {name + end: x for name, *triple in triples for end, x in zip(ENDS, triple, strict=True)}
 
 
 def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
-    """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for each seed."""
+    """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for
+    each seed."""
     found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1), _scores(runs))
-    shares = [n + end for n in map(str, runs) for end in ENDS if declared(n).share or n == CORRECTED]
+    shares = [
+        n + end for n in map(str, runs) for end in ENDS if declared(n).share or n == CORRECTED
+    ]
     return found | {name: float(np.clip(found[name], 0, 1)) for name in shares}
 
 
 def improvement(scores: Floats, others: Floats) -> dict[str, float]:
-    """Columns (``ENDS``) of the probability that a run beats another, from scores by seed, [seeds] each."""
+    """Columns (``ENDS``) of the probability that a run beats another, from scores by seed, [seeds]
+    each."""
     probability = float(probability_of_improvement(scores, others))
     ends = (probability, *improvement_interval(probability, len(scores)))
     return {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
@@ -98,10 +105,11 @@ def _scores(runs: pd.DataFrame) -> Floats:
 class Comparison:
     """Results of all runs, and the statistics that follow from them.
 
-    ``rows`` has an evaluation of each run and policy: task, delay, method, regime, seed, policy, episodes,
-    its metrics, and of the run ``frames`` (environment steps in training) and ``seconds``. ``points`` are
-    those of learning curves: task, delay, method, seed, frames, episodes, and measures in training. Unknown
-    or meaningless numbers are nan.
+    ``rows`` has an evaluation of each run and policy: task, delay, method, regime, seed, policy,
+    episodes, its metrics, and of the run ``frames`` (environment steps in training) and
+    ``seconds``. ``points`` are
+    those of learning curves: task, delay, method, seed, frames, episodes, and measures in training.
+    Unknown or meaningless numbers are nan.
     """
 
     rows: pd.DataFrame
@@ -138,14 +146,16 @@ class Comparison:
         return found
 
     def policy_of(self, method: str) -> str:
-        """The policy with which a method is compared: an untrained one has only its untrained network."""
+        """The policy with which a method is compared: an untrained one has only its untrained
+        network."""
         return UNTRAINED if self.methods[method].untrained else TRAINED
 
     @cached_property
     def table(self) -> pd.DataFrame:
         """A line for each task, delay, method and policy, first the undelayed method.
 
-        Behind the columns ``LABELLED`` stand those of ``measured`` and ``COMPARED``, three each (``ENDS``).
+        Behind the columns ``LABELLED`` stand those of ``measured`` and ``COMPARED``, three each
+        (``ENDS``).
         """
         columns = [name + end for name in (*self.measured, *COMPARED) for end in ENDS]
         return pd.DataFrame(self._lines(), columns=[*LABELLED, *columns])
@@ -175,12 +185,18 @@ class Comparison:
         return {name: found.set_index("seed") for name, found in grouped}
 
     def scores(self, task: str, delay: str) -> pd.DataFrame:
-        """Scores by seed, higher ones better, in a column for each method; nan where a run is missing.
+        """Scores by seed, higher ones better, in a column for each method; nan where a run is
+        missing.
 
         The first columns are the undelayed method and the random policy, without delay.
         """
-        of = {self.undelayed: (NOT_LATE, self.undelayed, TRAINED), RANDOM: (NOT_LATE, self.undelayed, RANDOM)}
-        of |= {method: (delay, method, self.policy_of(method)) for method in self._present(task, delay)}
+        of = {
+            self.undelayed: (NOT_LATE, self.undelayed, TRAINED),
+            RANDOM: (NOT_LATE, self.undelayed, RANDOM),
+        }
+        of |= {
+            method: (delay, method, self.policy_of(method)) for method in self._present(task, delay)
+        }
         none = pd.DataFrame({self.score: []}, dtype=float)
         found = {name: self._runs.get((task, *key), none)[self.score] for name, key in of.items()}
         return pd.DataFrame(found).sort_index() * sign_of(self.score)
@@ -195,7 +211,9 @@ class Comparison:
         tracks = {name: regime(self.methods, name) == LATE_DATA for name in (*delayed, method)}
         others = [name for name in delayed if tracks[name] == tracks[method]]
         naive = [name for name in others if self.methods[name].naive]
-        paired = scores[[undelayed, random, *(name for name in naive if name != method), method]].dropna()
+        paired = scores[
+            [undelayed, random, *(name for name in naive if name != method), method]
+        ].dropna()
         if paired.empty:
             return {}
         array = _scores(paired)
@@ -209,6 +227,7 @@ class Comparison:
 
 
 def _norms(scores: Floats) -> Floats:
-    """J_norm of the last method's mean score, [*, methods, seeds] to [*]; first come undelayed and random."""
+    """J_norm of the last method's mean score, [*, methods, seeds] to [*]; first come undelayed and
+    random."""
     means = scores.mean(-1)
     return normalised(means[..., -1], means[..., 0], means[..., 1])

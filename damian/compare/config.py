@@ -13,9 +13,11 @@ MISSING: Any = "???"
 STORED = ("sampled", "deterministic")
 """Policies of a checkpoint: its actions are drawn, or the most likely ones."""
 SEEDS = 10
-"""Seeds of a comparison, if their number is not given; with fewer, a report is marked as developing."""
+"""Seeds of a comparison, if their number is not given; with fewer, a report is marked as
+developing."""
 EPISODES = 100
-"""With fewer episodes in an evaluation a report is marked as developing, and a submission is refused."""
+"""With fewer episodes in an evaluation a report is marked as developing, and a submission is
+refused."""
 SET_BY_COMPARISON = ("seed", "resume", "checkpoint", "logger", "hydra")
 """Keys that a comparison sets for each of its runs."""
 
@@ -25,15 +27,29 @@ class Method(Settings):
     """One way to train policies for a task, or to fly those of another method."""
 
     overrides: list[str] = setting([], "Overrides of the settings of ``damian train``.")
-    delayed: bool = setting(True, "Whether it has delays; exactly one method, the reference, has none.")
-    naive: bool = setting(False, "Whether it ignores the delay; the best such method has recovery 0.")
-    policy_of: str | None = setting(None, "Method whose policies it flies, without any training of its own.")
-    starts_from: str | None = setting(None, "Method from whose policies, of the same seed, training starts.")
-    teacher: str | None = setting(None, "Method whose policies its learner imitates: ``learner.teacher``.")
-    untrained: bool = setting(False, "Whether the networks fly as they are before the first update.")
+    delayed: bool = setting(
+        True, "Whether it has delays; exactly one method, the reference, has none."
+    )
+    naive: bool = setting(
+        False, "Whether it ignores the delay; the best such method has recovery 0."
+    )
+    policy_of: str | None = setting(
+        None, "Method whose policies it flies, without any training of its own."
+    )
+    starts_from: str | None = setting(
+        None, "Method from whose policies, of the same seed, training starts."
+    )
+    teacher: str | None = setting(
+        None, "Method whose policies its learner imitates: ``learner.teacher``."
+    )
+    untrained: bool = setting(
+        False, "Whether the networks fly as they are before the first update."
+    )
     tasks: list[str] | None = setting(None, "Tasks that the method does; all of them if not given.")
     simulator: bool | None = setting(
-        None, "Whether its training uses what only a simulator knows; if not given, whether ``source`` does."
+        None,
+        "Whether its training uses what only a simulator knows; if not given, whether ``source`` "
+        "does.",
     )
 
     @property
@@ -44,12 +60,15 @@ class Method(Settings):
 
 @dataclass
 class HeldOut(Settings):
-    """Changes of a task under which the policies that were trained without them are evaluated too."""
+    """Changes of a task under which the policies that were trained without them are evaluated
+    too."""
 
     overrides: list[str] = setting([], "Overrides of ``damian train``, such as another region.")
     tasks: list[str] | None = setting(None, "Tasks to change; all of them if not given.")
     delays: list[str] | None = setting(None, "Delays of the training; all of them if not given.")
-    methods: list[str] | None = setting(None, "Methods whose policies are flown; all of them if not given.")
+    methods: list[str] | None = setting(
+        None, "Methods whose policies are flown; all of them if not given."
+    )
 
 
 @dataclass
@@ -60,8 +79,12 @@ class Experiment(Settings):
 
     tasks: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each task.")
     delays: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each delay.")
-    methods: dict[str, Method] = setting({}, "Ways to train or fly; one of them has ``delayed: false``.")
-    held_out: dict[str, HeldOut] = setting({}, "Changed tasks, TASK@NAME, to evaluate all policies in.")
+    methods: dict[str, Method] = setting(
+        {}, "Ways to train or fly; one of them has ``delayed: false``."
+    )
+    held_out: dict[str, HeldOut] = setting(
+        {}, "Changed tasks, TASK@NAME, to evaluate all policies in."
+    )
     first_seed: int = setting(0, "The seeds of every method count from this one.", low=0)
 
     def __post_init__(self) -> None:
@@ -69,10 +92,15 @@ class Experiment(Settings):
         for kind in ("tasks", "delays", "methods", "held_out"):
             for name in getattr(self, kind):
                 good = re.fullmatch(r"[\w.+-]+", name) and name not in ("none", "random", "script")
-                should = "cannot name a folder: use letters, digits, _ . + - but not none, random or script"
+                should = (
+                    "cannot name a folder: use letters, digits, _ . + - but not none, random or "
+                    "script"
+                )
                 checks.require(bool(good), f"experiment.{kind}", name, should)
         for kind in ("tasks", "methods"):
-            self.refuse(not getattr(self, kind), kind, "is missing or empty; an experiment needs one")
+            self.refuse(
+                not getattr(self, kind), kind, "is missing or empty; an experiment needs one"
+            )
         self._check_methods()
         for name, held_out in self.held_out.items():
             for kind in ("tasks", "delays", "methods"):
@@ -101,18 +129,26 @@ class CompareConfig(Settings):
 
     experiment: Experiment = MISSING
     seeds: int | None = setting(
-        None, "Number of seeds; if not given 10, or with ``report_only`` all stored ones.", low=1, high=10_000
+        None,
+        "Number of seeds; if not given 10, or with ``report_only`` all stored ones.",
+        low=1,
+        high=10_000,
     )
     processes: int = setting(1, "Runs at the same time, of one thread each.", low=1, high=1024)
     tasks: list[str] | None = setting(None, "Tasks to run; all of the experiment's if not given.")
     delays: list[str] | None = setting(None, "Delays to run; all of the experiment's if not given.")
-    methods: list[str] | None = setting(None, "Methods to run; all of the experiment's if not given.")
+    methods: list[str] | None = setting(
+        None, "Methods to run; all of the experiment's if not given."
+    )
     overrides: list[str] = setting([], "Further overrides of ``damian train`` for every run.")
     score: str = setting(
-        "return", "Metric that counts: return, success_rate, steps, perceived_return, ..., or your own."
+        "return",
+        "Metric that counts: return, success_rate, steps, perceived_return, ..., or your own.",
     )
     report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
-    keep: bool = setting(False, "Keep the results of runs whose folders are gone, and run only the others.")
+    keep: bool = setting(
+        False, "Keep the results of runs whose folders are gone, and run only the others."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -129,7 +165,9 @@ class CompareConfig(Settings):
         for name, method in methods.items():
             for kind in ("policy_of", "starts_from", "teacher"):
                 if getattr(method, kind) is not None:
-                    checks.one_of(f"experiment.methods.{name}.{kind}", getattr(method, kind), trained)
+                    checks.one_of(
+                        f"experiment.methods.{name}.{kind}", getattr(method, kind), trained
+                    )
 
     def chosen(self, kind: str) -> dict[str, Any]:
         """The experiment's tasks, delays or methods (``kind``) that are asked for, by name."""

@@ -1,4 +1,5 @@
-"""Figures of trainings, sweeps and comparisons: learning curves, scores with intervals, profiles."""
+"""Figures of trainings, sweeps and comparisons: learning curves, scores with intervals,
+profiles."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +28,8 @@ LABELS = {
     "perceived_success_rate": "success rate, perceived",
     "perceived_steps": "steps per episode, perceived",
 }
-"""Axis labels of the measures in training: in hindsight, from late data, or as the server perceived them."""
+"""Axis labels of the measures in training: in hindsight, from late data, or as the server perceived
+them."""
 METHOD_COLOURS = ("#0F3C2D", "#E15A00", "#4B96FF", "#A5000F", "#5A9696", "#FFA500", "#873C96")
 METHOD_COLOURS += ("#1E2DFF", "#FF87FF", "#0000A5")
 """Colours of methods: each pair is far apart in OKLab, for readers without green receptors too."""
@@ -38,7 +40,10 @@ _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 
 
 def plot_training(
-    rows: Sequence[Mapping[str, float]], evaluations: Mapping[str, Evaluation], path: Path, title: str
+    rows: Sequence[Mapping[str, float]],
+    evaluations: Mapping[str, Evaluation],
+    path: Path,
+    title: str,
 ) -> None:
     """Draw return and success rate of a training, from the untrained policy on."""
     table = pd.DataFrame(rows).set_index("frames")
@@ -50,7 +55,8 @@ def plot_training(
         _over_steps(axis, measure, levels, SCRIPT)
         axis.set(title=title)
 
-    # In hindsight, which is close to what truly happened; what is perceived may rank policies wrongly.
+    # In hindsight, which is close to what truly happened; what is perceived may rank policies
+    # wrongly.
     succeeds = (table["perceived_success_rate"] > 0).any()
     save(path, [*LABELS][: 1 + succeeds], panel, (4.4, 3.2), width=2)
 
@@ -58,8 +64,9 @@ def plot_training(
 def plot_curves(comparison: Comparison, path: Path) -> None:
     """Draw learning curves over environment steps, in panels for each task and delay.
 
-    There is one of the return and, where a task can succeed, of success rate and steps. A curve is the mean
-    over seeds, with its 95 % band. Dashed lines: the random policy; dash-dotted: the undelayed script;
+    There is one of the return and, where a task can succeed, of success rate and steps. A curve is
+    the mean over seeds, with its 95 % band. Dashed lines: the random policy; dash-dotted: the
+    undelayed script;
     dotted: methods without a curve, such as those that train nothing.
     """
     succeeds = comparison.points["perceived_success_rate"].notna().any()
@@ -69,7 +76,9 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
         if HELD_OUT_MARK not in task
         for delay in comparison.delays(task) or [NOT_LATE]
         if {(task, delay), (task, NOT_LATE)} & {run[:2] for run in comparison.curves}
-        for measure in (LABELS if succeeds else ["hindsight_return"])  # else episodes end at their limit
+        for measure in (
+            LABELS if succeeds else ["hindsight_return"]
+        )  # else episodes end at their limit
     ]
     save(path, panels, partial(_curve_panel, comparison), (3.2, 2.6), width=3)
 
@@ -77,19 +86,23 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
 def plot_scores(comparison: Comparison, path: Path) -> None:
     """Draw the score of each method with its 95 % interval, in a panel for each task and delay.
 
-    Dashed: the undelayed method; dotted: random actions; shaded: what the delay costs the strongest naive
-    method. Held-out tasks are in the table only.
+    Dashed: the undelayed method; dotted: random actions; shaded: what the delay costs the strongest
+    naive method. Held-out tasks are in the table only.
     """
     table: Any = comparison.table.set_index(["task", "delay", "method", "policy"])
     score = comparison.score
 
     def panel(axis: Axes, place: tuple[str, str]) -> None:
         task, delay = place
-        shown = [(name, comparison.policy_of(name)) for name in comparison.methods] + [(SCRIPT, SCRIPT)]
+        shown = [(name, comparison.policy_of(name)) for name in comparison.methods] + [
+            (SCRIPT, SCRIPT)
+        ]
         shown = [key for key in shown if (*place, *key) in table.index]
         naive = []
         for row, (name, policy) in enumerate(shown):
-            value, low, high = table.loc[(*place, name, policy), [score + end for end in ENDS]].astype(float)
+            value, low, high = table.loc[
+                (*place, name, policy), [score + end for end in ENDS]
+            ].astype(float)
             error = np.nan_to_num([[value - low], [high - value]], posinf=0.0)
             style: dict[str, Any] = {"color": "0.5", "marker": "o"}
             style |= look(comparison.methods, name) if name != SCRIPT else {}
@@ -115,10 +128,11 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
 
 
 def plot_profiles(comparison: Comparison, path: Path) -> None:
-    """Draw performance profiles: the share of runs, of all tasks, delays and seeds, above each J_norm.
+    """Draw performance profiles: the share of runs, of all tasks, delays and seeds, above each
+    J_norm.
 
-    Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice". A method
-    without runs of some task or delay is left out.
+    Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice". A
+    method without runs of some task or delay is left out.
     """
     tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
     scores = [comparison.scores(task, delay) for task in tasks for delay in comparison.delays(task)]
@@ -140,23 +154,37 @@ def plot_profiles(comparison: Comparison, path: Path) -> None:
 
 
 def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
-    """Draw the returns of a sweep (lines of ``means``) over one setting, in a panel for each value of others.
+    """Draw the returns of a sweep (lines of ``means``) over one setting, in a panel for each value
+    of others.
 
-    The setting along the axis has most values, and numbers if any has. The trained policy stands with its
-    95 % intervals before those of the other panels, in grey. There are 40 panels at most.
+    The setting along the axis has most values, and numbers if any has. The trained policy stands
+    with its 95 % intervals before those of the other panels, in grey. There are 40 panels at most.
     """
-    along = max(groups, key=lambda k: (is_numeric_dtype(lines[k]), lines[k].nunique()), default="policy")
+    along = max(
+        groups, key=lambda k: (is_numeric_dtype(lines[k]), lines[k].nunique()), default="policy"
+    )
     names = [] if is_numeric_dtype(lines[along]) else [*lines[along].unique()]
     places = lines[along].map(names.index) if names else lines[along]
-    titles = ["\n".join(f"{k}={line[k]}" for k in groups if k != along) for line in lines.to_dict("records")]
-    found = lines.assign(x=places, title=titles).sort_values("x").groupby(["title", "policy"], sort=False)
-    curves = {key: each[["x", *("return" + end for end in ENDS)]].to_numpy().T for key, each in found}
+    titles = [
+        "\n".join(f"{k}={line[k]}" for k in groups if k != along)
+        for line in lines.to_dict("records")
+    ]
+    found = (
+        lines.assign(x=places, title=titles)
+        .sort_values("x")
+        .groupby(["title", "policy"], sort=False)
+    )
+    curves = {
+        key: each[["x", *("return" + end for end in ENDS)]].to_numpy().T for key, each in found
+    }
 
     def panel(axis: Axes, title: str) -> None:
         for (place, policy), (x, value, low, high) in curves.items():
             style: dict[str, Any] = {"color": METHOD_COLOURS[0], "marker": "o", "markersize": 4}
             if policy == TRAINED and place == title:
-                axis.errorbar(x, value, np.nan_to_num([value - low, high - value]), label=policy, **style)
+                axis.errorbar(
+                    x, value, np.nan_to_num([value - low, high - value]), label=policy, **style
+                )
             elif policy == TRAINED:
                 axis.plot(x, value, color="0.85", zorder=0, label="other panels")
             elif place == title and policy in (SCRIPT, RANDOM):
@@ -194,7 +222,8 @@ def save(
     width: int = 1,
     sharey: bool = False,
 ) -> None:
-    """Draw panels of this size [inches] in rows of ``width``, with one legend to the right of them."""
+    """Draw panels of this size [inches] in rows of ``width``, with one legend to the right of
+    them."""
     if not panels:
         path.unlink(missing_ok=True)  # an older one would show other runs
         return
@@ -235,7 +264,8 @@ def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, st
 
 
 def _flown(measure: str) -> str:
-    """The measure of an evaluation, which knows the truth, that a measure in training comes close to."""
+    """The measure of an evaluation, which knows the truth, that a measure in training comes close
+    to."""
     return "return" if measure == "hindsight_return" else measure
 
 

@@ -7,13 +7,21 @@ import pandas as pd
 
 from damian.common import checks
 from damian.common.tables import markdown_table
-from damian.compare.comparison import HELD_OUT_MARK, LATE_DATA, RUN, SIMULATOR, means_over_seeds, shown
+from damian.compare.comparison import (
+    HELD_OUT_MARK,
+    LATE_DATA,
+    RUN,
+    SIMULATOR,
+    means_over_seeds,
+    shown,
+)
 from damian.compare.config import EPISODES, Experiment
 
 NUMBERS = ["frames", "episodes", "return"]
 WORDS = ["task", "delay", "method", "authors", "regime", "damian", "commit", "settings"]
 COLUMNS = [*RUN, *NUMBERS, "parameters", *WORDS[3:]]
-"""Columns of a submission, which has a row for each run; ``settings`` are those of ``damian train``."""
+"""Columns of a submission, which has a row for each run; ``settings`` are those of ``damian
+train``."""
 FEWEST_SEEDS = 5
 
 
@@ -27,11 +35,11 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
     checks.require(not missing, path, missing, f"are missing; the columns are {', '.join(COLUMNS)}")
     checks.require(len(rows) > 0, path, "it", "has no rows")
     places = [*experiment.tasks]
-    places += [f"{task}{HELD_OUT_MARK}{name}" for task in experiment.tasks for name in experiment.held_out]
+    places += [
+        f"{task}{HELD_OUT_MARK}{name}" for task in experiment.tasks for name in experiment.held_out
+    ]
     for task in rows["task"].unique():
-        should = (
-            f'is not of the leaderboard: train in one that is, by experiment=delaybench "tasks=[{places[0]}]"'
-        )
+        should = f'is not of the leaderboard: train in one that is, by experiment=delaybench "tasks=[{places[0]}]"'
         checks.require(task in places, f"{path}: task", task, should)
     for name, known in (("delay", experiment.delays), ("regime", (LATE_DATA, SIMULATOR))):
         for value in rows[name].unique():
@@ -43,15 +51,21 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         empty = rows[name].astype(str).str.strip().isin(["", "nan", "None"])
         checks.require(not empty.any(), f"{path}: {name}", "it", "is empty")
     changed = rows["commit"].astype(str).str.contains("+", regex=False)
-    checks.require(not changed.any(), f"{path}: commit", rows["commit"].iloc[0], "has changes: commit them")
+    checks.require(
+        not changed.any(), f"{path}: commit", rows["commit"].iloc[0], "has changes: commit them"
+    )
     finite = np.isfinite(rows[[*NUMBERS, "parameters"]].to_numpy(float)).all()
     checks.require(bool(finite), path, "a number", "is not finite")
     for place, runs in rows.groupby(RUN[:-1], sort=False):
         where, seeds = f"{path}: {'/'.join(map(str, place))}", runs["seed"]
-        checks.require(not seeds.duplicated().any(), f"{where}: seed", [*seeds], "are not all different")
+        checks.require(
+            not seeds.duplicated().any(), f"{where}: seed", [*seeds], "are not all different"
+        )
         enough = len(seeds) >= FEWEST_SEEDS and seeds.min() >= experiment.first_seed
         few = f"are too few, or too small: run compare again with keep=true seeds={FEWEST_SEEDS}"
-        checks.require(bool(enough), f"{where}: seed", [*seeds], f"{few}, from {experiment.first_seed} on")
+        checks.require(
+            bool(enough), f"{where}: seed", [*seeds], f"{few}, from {experiment.first_seed} on"
+        )
         checks.in_range(f"{where}: episodes", int(runs["episodes"].min()), EPISODES)
 
 
@@ -71,7 +85,8 @@ def leaderboard(submissions: Sequence[pd.DataFrame], delays: Collection[str]) ->
 
 
 def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
-    """A line for each method, the best one under the first delay first, with a column for each delay."""
+    """A line for each method, the best one under the first delay first, with a column for each
+    delay."""
     present = [delay for delay in delays if (rows["delay"] == delay).any()]
     means = rows.pivot_table(values="return", index="method", columns="delay")
     lines = []
@@ -84,7 +99,9 @@ def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
             f"{one['damian']} ({str(one['commit'])[:7]})".removesuffix(" (several)"),
         )
         lines.append((method, *cells, one["authors"], steps, size, version))
-    return markdown_table(["method", *present, "authors", "million steps", "parameters", "damian"], lines)
+    return markdown_table(
+        ["method", *present, "authors", "million steps", "parameters", "damian"], lines
+    )
 
 
 def _flights(rows: pd.DataFrame) -> str:

@@ -1,4 +1,5 @@
-"""Means of groups of runs over their seeds, and paired differences to the first value of a setting."""
+"""Means of groups of runs over their seeds, and paired differences to the first value of a
+setting."""
 
 from collections.abc import Sequence
 
@@ -11,21 +12,26 @@ from damian.runs.measures import declared
 from damian.runs.run_folder import measured_in
 
 NOTE = (
-    f"n: runs, one for each seed; [95 % interval over runs, none below {FEWEST}]; perceived: as far as the "
+    f"n: runs, one for each seed; [95 % interval over runs, none below {FEWEST}]; perceived: as "
+    "far as the "
     "server knew"
 )
 DIFFERENCE = (
-    "; difference: of the {score} to that of {first}, paired by seed; P > first: probability that a run of "
+    "; difference: of the {score} to that of {first}, paired by seed; P > first: probability that "
+    "a run of "
     "the line beats one of the first"
 )
 
 
 def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> pd.DataFrame:
-    """A line for each policy of each group: means over seeds, and differences to the first value."""
+    """A line for each policy of each group: means over seeds, and differences to the first
+    value."""
     succeeds, lines = (rows["success_rate"] > 0).any(), []
     known = {name: declared(name) for name in measured_in(rows, score)}
     measures = [name for name, each in known.items() if name == score or "sweep" in each.tables]
-    measures = [name for name in measures if name == score or succeeds or known[name].where != "success"]
+    measures = [
+        name for name in measures if name == score or succeeds or known[name].where != "success"
+    ]
     by_names = dict(iter(rows.groupby([*groups, "policy"], sort=False)))
     first = rows[groups[0]].iloc[0] if groups else None
     for names, runs in by_names.items():
@@ -39,7 +45,8 @@ def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> p
 
 
 def difference(runs: pd.DataFrame, others: pd.DataFrame, score: str) -> dict[str, float]:
-    """The mean difference of a score by seed, and the probability of improvement, with their intervals."""
+    """The mean difference of a score by seed, and the probability of improvement, with their
+    intervals."""
     pairs = runs[["seed", score]].merge(others[["seed", score]], on="seed")
     if pairs.empty:
         return {}

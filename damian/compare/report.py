@@ -1,4 +1,5 @@
-"""Report of a comparison as Markdown: the tables of all methods, and the time that the runs took."""
+"""Report of a comparison as Markdown: the tables of all methods, and the time that the runs
+took."""
 
 from collections.abc import Sequence
 
@@ -40,9 +41,13 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
 def _table(lines: pd.DataFrame, measures: Sequence[str]) -> str:
     rows = []
     for line in lines.to_dict("records"):
-        undelayed = " (undelayed)" if line["delay"] == NOT_LATE and line["method"] in SCRIPTED else ""
+        undelayed = (
+            " (undelayed)" if line["delay"] == NOT_LATE and line["method"] in SCRIPTED else ""
+        )
         labels = (line["method"] + undelayed, line["regime"], line["policy"], line["seeds"])
-        measured, compared = ([shown(line, name) for name in names] for names in (measures, COMPARED))
+        measured, compared = (
+            [shown(line, name) for name in names] for names in (measures, COMPARED)
+        )
         rows.append([*labels, *measured, line["compared_seeds"] or "-", *compared])
     measured = [name.replace("_", " ") for name in measures]
     head = ["method", "regime", "policy", "n", *measured, "n compared", *COMPARED[:-1], "P > naive"]
@@ -58,7 +63,9 @@ def _steps(comparison: Comparison, task: str, delay: str) -> list[str]:
             steps, values = curve(runs, "hindsight_return")
             tenth = len(steps) // 10
             found[method] = steps[tenth - 1 :], sliding_window_view(values, tenth, axis=0).mean(-1)
-    ends = {method: found[method][1][-1].mean() for method in found if comparison.methods[method].naive}
+    ends = {
+        method: found[method][1][-1].mean() for method in found if comparison.methods[method].naive
+    }
     if not ends:
         return []
     best, level = max(ends.items(), key=lambda end: end[1])
@@ -67,5 +74,11 @@ def _steps(comparison: Comparison, task: str, delay: str) -> list[str]:
         reached = [min(steps[run >= level], default=np.inf) for run in (values.mean(-1), *values.T)]
         numbers = (f"{each:,.0f}" for each in (reached[0], min(reached[1:]), max(reached[1:])))
         rows.append((method, *(number.replace("inf", "never") for number in numbers)))
-    title = f"Steps to the final training return (in hindsight, mean over a tenth) of *{best}*, {level:.1f}:"
-    return [title, markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows)]
+    title = (
+        f"Steps to the final training return (in hindsight, mean over a tenth) of *{best}*, "
+        f"{level:.1f}:"
+    )
+    return [
+        title,
+        markdown_table(("method", "mean over seeds", "fastest seed", "slowest seed"), rows),
+    ]

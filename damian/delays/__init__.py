@@ -1,1 +1,2 @@
-"""Delays of messages: delay laws, samplers that draw from them, and a delay line of messages in transit."""
+"""Delays of messages: delay laws, samplers that draw from them, and a delay line of messages in
+transit."""

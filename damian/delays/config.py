@@ -24,9 +24,13 @@ class DelayConfig(Settings):
     section: ClassVar[str] = "delay"
 
     obs: Any = setting(0, f"Delay of messages to the server: 3 (steps), 3s, or {_EXAMPLE}.")
-    act: Any = setting(0, "Delay of actions, written as ``obs``; a UAV holds until the first one arrives.")
+    act: Any = setting(
+        0, "Delay of actions, written as ``obs``; a UAV holds until the first one arrives."
+    )
     rew: Any = setting(0, "Delay of rewards, written as ``obs``; none may be lost.")
-    loss: float = setting(0.0, "Probability that a message to the server node is lost.", low=0, high=1)
+    loss: float = setting(
+        0.0, "Probability that a message to the server node is lost.", low=0, high=1
+    )
     hold: str = setting(
         "none",
         "``max``: the server holds messages back until the longest delay of ``obs`` has passed.",
@@ -34,7 +38,8 @@ class DelayConfig(Settings):
     )
     order: str = setting(
         "generation",
-        "Which message the server holds: that generated last (generation), or arrived last (arrival).",
+        "Which message the server holds: that generated last (generation), or arrived last "
+        "(arrival).",
         choices=("generation", "arrival"),
     )
     history: int = setting(0, "Number of its latest actions that a UAV observes.", low=0, high=1000)
@@ -49,19 +54,25 @@ class DelayConfig(Settings):
 
 @dataclass
 class LinkConfig(Settings):
-    """How observations reach the UAVs. Rewards and the critic always follow from what the server holds."""
+    """How observations reach the UAVs. Rewards and the critic always follow from what the server
+    holds."""
 
     section: ClassVar[str] = "links"
 
     kind: str = setting(
         "server",
-        "Observations come from the server at once (server), with a delay (updown), or from UAVs (matrix).",
+        "Observations come from the server at once (server), with a delay (updown), or from UAVs "
+        "(matrix).",
         choices=("server", "updown", "matrix"),
     )
     delay: Any = setting(
-        0, "Delay of a link, as delay.obs; for matrix also a list per receiver.", kinds=("updown", "matrix")
+        0,
+        "Delay of a link, as delay.obs; for matrix also a list per receiver.",
+        kinds=("updown", "matrix"),
     )
-    loss: Any = setting(0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix"))
+    loss: Any = setting(
+        0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix")
+    )
     range: float | None = setting(
         None, "A UAV hears only UAVs within this distance.", unit="m", above=0, kinds=("matrix",)
     )
@@ -75,4 +86,6 @@ class LinkConfig(Settings):
 
 def is_matrix(written: Any) -> bool:
     """Is a setting of the links given for each pair of UAVs, as a list or a tensor?"""
-    return getattr(written, "ndim", 0) > 0 or (isinstance(written, Sequence) and not isinstance(written, str))
+    return getattr(written, "ndim", 0) > 0 or (
+        isinstance(written, Sequence) and not isinstance(written, str)
+    )

@@ -1,4 +1,5 @@
-"""Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"133ms"``)."""
+"""Delay laws: distributions of message delays, in steps (``3``) or as a time
+(``"3s"``, ``"133ms"``)."""
 
 import copy
 import itertools
@@ -43,27 +44,34 @@ LOST = "lost"
 
 @dataclass(frozen=True)
 class Law(ABC):
-    """Distribution of message delays; bounds of its parameters may stand in its fields (``setting``)."""
+    """Distribution of message delays; bounds of its parameters may stand in its fields
+    (``setting``)."""
 
     @abstractmethod
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        """Build the sampler of this law, for steps of ``dt`` seconds; ``key`` names the law in errors.
+        """Build the sampler of this law, for steps of ``dt`` seconds; ``key`` names the law in
+        errors.
 
-        It is a ``TableSampler``, a ``ContextSampler``, or one derived from ``Sampler`` that may have a state
-        of its own (docs/extending.md). A share ``loss`` of the messages is lost, whatever the law.
+        It is a ``TableSampler``, a ``ContextSampler``, or one derived from ``Sampler`` that may
+        have a state of its own (docs/extending.md). A share ``loss`` of the messages is lost,
+        whatever the law.
         """
 
 
 def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
     """Build the sampler of a law, a range, a function, or of what ``law_of`` takes.
 
-    The arguments are those of ``Law.sampler``. A range of steps (``1..7``) or of times, each rounded up to
-    whole steps (``3s..7s``), is uniform over these steps. A function is that of a ``ContextSampler`` that
-    loses nothing. A sampler is copied: transforms share none, because each may move to a device of its own.
+    The arguments are those of ``Law.sampler``. A range of steps (``1..7``) or of times, each
+    rounded up to whole steps (``3s..7s``), is uniform over these steps. A function is that of a
+    ``ContextSampler`` that
+    loses nothing. A sampler is copied: transforms share none, because each may move to a device of
+    its own.
     """
     checks.above("dt", dt, 0.0, "s")
     if isinstance(written, Sampler):
-        checks.require(loss == 0, "loss", loss, "does not go with a sampler, which has the losses of its own")
+        checks.require(
+            loss == 0, "loss", loss, "does not go with a sampler, which has the losses of its own"
+        )
         return copy.deepcopy(written)
     if callable(written) and not isinstance(written, type):
         return ContextSampler(cast(Any, written), LONGEST_OF_FUNCTION, loss, loses=False)
@@ -89,7 +97,8 @@ def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "del
 
 _NO_STEPS = "is neither a number of steps >= 0 (3) nor a time (3s, 2min)"
 _NO_DELAY = (
-    "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, 3s..7s), a "
+    "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, "
+    "3s..7s), a "
     "distribution ({law: geometric, mean: 2}; in Python Geometric(2)) or a function"
 )
 
@@ -100,7 +109,12 @@ def in_steps(key: str, delay: Delay, dt: float, problem: str = _NO_STEPS) -> int
         checks.require(delay.endswith(tuple(checks.UNITS_OF_TIME)), key, delay, problem)
         steps = math.ceil(_exact_steps(key, delay, dt) - 1e-9)
     else:
-        is_steps = isinstance(delay, Real) and not isinstance(delay, bool) and delay >= 0 and delay % 1 == 0
+        is_steps = (
+            isinstance(delay, Real)
+            and not isinstance(delay, bool)
+            and delay >= 0
+            and delay % 1 == 0
+        )
         checks.require(is_steps, key, delay, problem)
         steps = int(delay)
     checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
@@ -117,7 +131,8 @@ LAWS = Registry[type[Law]](
     lambda found: isinstance(found, type) and issubclass(found, Law) and is_dataclass(found),
     "is not a dataclass derived from damian.Law",
 )
-"""Laws by name; ``law_of`` also takes the path of a class outside the package, ``package.module:Class``."""
+"""Laws by name; ``law_of`` also takes the path of a class outside the package,
+``package.module:Class``."""
 
 
 @LAWS.register("constant")
@@ -135,10 +150,11 @@ class Constant(Law):
 @LAWS.register("uniform")
 @dataclass(frozen=True)
 class Uniform(Law):
-    """With a probability, a uniform delay between ``low`` and ``high``; otherwise none (paper, section 5).
+    """With a probability, a uniform delay between ``low`` and ``high``; otherwise none
+    (paper, section 5).
 
-    Delays in steps are equally likely whole numbers, both ends included. Delays in time are continuous and
-    rounded up to whole steps, so that 3 to 7 s are 4, 5, 6 or 7 steps of 1 s.
+    Delays in steps are equally likely whole numbers, both ends included. Delays in time are
+    continuous and rounded up to whole steps, so that 3 to 7 s are 4, 5, 6 or 7 steps of 1 s.
     """
 
     low: Delay = 0
@@ -151,7 +167,10 @@ class Uniform(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         for name in ("low", "high"):
             in_steps(f"{key}.{name}", getattr(self, name), dt)  # refuses what is not a delay
-        low, high = _exact_steps(f"{key}.low", self.low, dt), _exact_steps(f"{key}.high", self.high, dt)
+        low, high = (
+            _exact_steps(f"{key}.low", self.low, dt),
+            _exact_steps(f"{key}.high", self.high, dt),
+        )
         in_time = isinstance(self.low, str), isinstance(self.high, str)
         should = f"and high={self.high} are not two steps or two times in order"
         checks.require(low <= high and in_time[0] == in_time[1], f"{key}.low", self.low, should)
@@ -166,7 +185,8 @@ class Uniform(Law):
 @LAWS.register("geometric")
 @dataclass(frozen=True)
 class Geometric(Law):
-    """A message arrives in each step with the same probability, as if retransmitted until received."""
+    """A message arrives in each step with the same probability, as if retransmitted until
+    received."""
 
     mean: Delay = 1
     """Mean delay before the cut at ``longest``: steps, which may be a fraction, or a time."""
@@ -185,12 +205,14 @@ class Geometric(Law):
 @LAWS.register("burst")
 @dataclass(frozen=True)
 class Burst(Law):
-    """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963).
+    """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state
+    (1960, 1963).
 
-    ``Burst(enter, leave, good=0, bad=0, bad_loss=1)`` loses runs of messages, ``1 / leave`` in the mean.
+    ``Burst(enter, leave, good=0, bad=0, bad_loss=1)`` loses runs of messages, ``1 / leave`` in the
+    mean.
 
-    A worked timeline of ``Burst(good=0, bad=3, bad_loss=0)``, whose channel is bad at t = 0 and t = 1 and
-    good from t = 2 on: messages sent at t = 0, 1 and 2 arrive at t = 3, 4 and 2.
+    A worked timeline of ``Burst(good=0, bad=3, bad_loss=0)``, whose channel is bad at t = 0 and t =
+    1 and good from t = 2 on: messages sent at t = 0, 1 and 2 arrive at t = 3, 4 and 2.
     """
 
     enter: float = setting(0.05, low=0, high=1)
@@ -220,8 +242,8 @@ class Trace(Law):
     """Recorded delays of a file, one per step in its order; each sender starts at a random row."""
 
     path: str = ""
-    """CSV table with a column ``delay``: steps, times with their unit, or ``lost``. That of the package is
-    ``damian:queue_trace.csv``."""
+    """CSV table with a column ``delay``: steps, times with their unit, or ``lost``. That of the
+    package is ``damian:queue_trace.csv``."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
@@ -230,26 +252,31 @@ class Trace(Law):
             rows = parse_table(read_text(file), ["delay"])
             checks.require(bool(rows), "delay", "the column", "is empty")
             written = {f"line {row.line}: delay": row.cells["delay"] for row in rows}
-            delays = [-1 if d == LOST else in_steps(at, _number(d), dt) for at, d in written.items()]
+            delays = [
+                -1 if d == LOST else in_steps(at, _number(d), dt) for at, d in written.items()
+            ]
         return Recorded(delays, loss)
 
 
 @LAWS.register("lag")
 @dataclass(frozen=True)
 class Lag(Law):
-    """A sender draws a delay, the lag, from another law, and all its messages have it until the next draw.
+    """A sender draws a delay, the lag, from another law, and all its messages have it until the
+    next draw.
 
-    The first message of an episode always draws a lag. Losses (also those of the other law) are not held, but
-    drawn for each message. When the lag shrinks, messages overtake each other.
+    The first message of an episode always draws a lag. Losses (also those of the other law) are not
+    held, but drawn for each message. When the lag shrinks, messages overtake each other.
 
-    A worked timeline of ``Lag(Uniform(0, 3), update_period=2)``: at t = 0 a sender draws 3, so that messages
-    sent at t = 0 and t = 1 arrive at t = 3 and t = 4. At t = 2 it draws 0: that message arrives at once.
+    A worked timeline of ``Lag(Uniform(0, 3), update_period=2)``: at t = 0 a sender draws 3, so that
+    messages sent at t = 0 and t = 1 arrive at t = 3 and t = 4. At t = 2 it draws 0: that message
+    arrives at once.
     """
 
     lag: Any = 0
     """Law from which the lags are drawn; it must be memoryless."""
     update_period: Delay = 1
-    """Time between two draws: steps, a time, or ``episode``: a lag is held until the end of the episode."""
+    """Time between two draws: steps, a time, or ``episode``: a lag is held until the end of the
+    episode."""
     hold_probability: float = setting(0.0, low=0, high=1)
     """Probability that an update keeps the lag instead of drawing another one."""
     shared: bool = False
@@ -275,11 +302,13 @@ class Lag(Law):
 class Distance(Law):
     """Delays and losses that grow with the distance d between sender and receiver.
 
-    The delay is ``base + d / speed``. The path loss grows with log d, with log-normal shadowing, so that a
-    message is received with probability Q(10 n log10(d / range) / sigma), where Q is the tail of the standard
-    normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002, section 4.9).
+    The delay is ``base + d / speed``. The path loss grows with log d, with log-normal shadowing, so
+    that a message is received with probability Q(10 n log10(d / range) / sigma), where Q is the
+    tail of the standard normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002,
+    section 4.9).
 
-    The law reads the sender's ``position``, and ``receiver_position`` where it is given, [m], [M, 2].
+    The law reads the sender's ``position``, and ``receiver_position`` where it is given, [m],
+    [M, 2].
     """
 
     base: Delay = 0
@@ -291,7 +320,8 @@ class Distance(Law):
     path_loss_exponent: float = setting(2.0, above=0)
     """Exponent n of the path loss; 2 in free space, 3 to 5 in cities."""
     shadowing: float = setting(6.0, above=0, unit="dB")
-    """Standard deviation sigma of the path loss around its mean [dB]; a small one makes the range sharp."""
+    """Standard deviation sigma of the path loss around its mean [dB]; a small one makes the range
+    sharp."""
     receiver: Any = (0.0, 0.0)
     """Place of the receiver, east and north [m], if messages have no ``receiver_position``."""
     longest: Delay = 20
@@ -321,8 +351,8 @@ def law_of(written: Any, key: str = "delay") -> Law:
     """Convert a setting to a law: a law, steps, a time, or a mapping.
 
     ``{law: uniform, low: 3s, high: 7s}`` names a registered law and its settings; ``{law:
-    my_lab.delays:Satellite, mean: 2s}`` a frozen dataclass derived from ``Law`` in a module that can be
-    imported.
+    my_lab.delays:Satellite, mean: 2s}`` a frozen dataclass derived from ``Law`` in a module that
+    can be imported.
     """
     if isinstance(written, Law):
         return written
@@ -370,7 +400,9 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     ``delay[receiver][sender]`` is the law of a link; the diagonal is not used.
     """
     loss_key = f"{key.removesuffix('delay')}loss"
-    matrices = {name: each for name, each in {key: delay, loss_key: loss}.items() if is_matrix(each)}
+    matrices = {
+        name: each for name, each in {key: delay, loss_key: loss}.items() if is_matrix(each)
+    }
     if not matrices or isinstance(delay, Sampler):
         return sampler_of(delay, dt, loss, key)
     n = len(next(iter(matrices.values())))

@@ -1,4 +1,5 @@
-"""Reads from a table, or the journal of a service, when each report came in, and tells how late it was."""
+"""Reads from a table, or the journal of a service, when each report came in, and tells how late it
+was."""
 
 import math
 from collections.abc import Mapping
@@ -12,12 +13,12 @@ import pandas as pd
 
 from damian.common.errors import InputError
 from damian.common.text_files import named, parse_table, read_text, show
-from damian.delays.clocks import Flags
 from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers
 from damian.delays.laws import LOST, in_steps
 
 JOURNAL = ".jsonl"
-"""End of the name of a journal: a head on its first line, and reports with when they came in on others."""
+"""End of the name of a journal: a head on its first line, and reports with when they came in on
+others."""
 UNKNOWN = ("", "na", "nan", "none", "null")
 """Cells that mean that a value is not known."""
 LATEST = 4e9
@@ -32,7 +33,8 @@ def column_of(name: str) -> str:
 
 
 def seconds_of(text: str) -> float:
-    """Seconds, also of ISO 8601, which is UTC if it names no zone; ``ValueError`` if it is neither."""
+    """Seconds, also of ISO 8601, which is UTC if it names no zone; ``ValueError`` if it is
+    neither."""
     try:  # digits alone are seconds, though ISO 8601 would read a date from eight of them
         return float(text)
     except ValueError:
@@ -41,7 +43,8 @@ def seconds_of(text: str) -> float:
 
 
 def read_log(path: Path) -> pd.DataFrame:
-    """The log in a journal, or in a CSV table with receive times, as of ``damian.delays.clocks``."""
+    """The log in a journal, or in a CSV table with receive times, as of
+    ``damian.delays.clocks``."""
     with named(path):
         text = read_text(path)
         if path.suffix == JOURNAL:
@@ -58,7 +61,8 @@ def read_log(path: Path) -> pd.DataFrame:
 
 
 def _journal_rows(text: str) -> list[tuple[str, Any, Any]]:
-    """Reports of a journal, but for an unfinished last line, with their places and when they came in."""
+    """Reports of a journal, but for an unfinished last line, with their places and when they came
+    in."""
     rows, lines = [], text.rpartition("\n")[0].split("\n")
     for n, line in enumerate(lines, 1):
         with named(where := f"line {n}"):
@@ -78,39 +82,43 @@ def _row(said: Any, came: Any) -> dict[str, Any]:
         raise InputError("it is not a report")
     cells = {column_of(str(name)): str(cell).strip() for name, cell in said.items()}
     if came is not None:
-        cells["receive time"] = str(came)
+        cells = {"aoi": "0", **cells, "receive time": str(came)}
     cells = {name: cell for name, cell in cells.items() if cell.lower() not in UNKNOWN}
-    number = cells.get("sequence", cells.get("number", "nan"))
-    time, received, age = (_seconds(cells, name) for name in ("time", "receive time", "aoi"))
-    if came is not None and math.isnan(time):
-        time = received - (0.0 if math.isnan(age) else age)
+    names = "time", "receive time", "aoi", "sequence" if "sequence" in cells else "number"
+    time, received, age, number = (_number(cells, name) for name in names)
+    if math.isnan(time):
+        time = received - age
     if math.isnan(received):
         received = time + age
     if "id" not in cells or math.isnan(received - time):
-        raise InputError("it needs ID, time and receive time, or ID, time and AoI")
-    if number != "nan" and not number.removesuffix(".0").isdecimal():
-        raise InputError(f"sequence: {show(number)} is not the number of a report")
-    return {"uav": cells["id"], "time": time, "received": received, "sequence": float(number)}
+        raise InputError("it needs ID, and two of time, receive time and AoI")
+    return {"uav": cells["id"], "time": time, "received": received, "sequence": number}
 
 
-def _seconds(cells: Mapping[str, str], name: str) -> float:
-    """A time of a report [s]; nan if it does not say it."""
+def _number(cells: Mapping[str, str], name: str) -> float:
+    """A time [s], or the number of a report; nan if it does not say it."""
     try:
-        time = seconds_of(cells.get(name, "nan"))
+        number = seconds_of(cells.get(name, "nan"))
     except ValueError:
-        raise InputError(f"{name}: {show(cells[name])} is neither seconds nor a date of ISO 8601") from None
-    if name in cells and not 0 <= time <= LATEST:
-        raise InputError(f"{name}: {cells[name]}: give seconds since 1970, no milliseconds or microseconds")
-    return time
+        raise InputError(
+            f"{name}: {show(cells[name])} is neither a number nor a date of ISO 8601"
+        ) from None
+    if name in cells and not 0 <= number <= LATEST:
+        raise InputError(
+            f"{name}: {cells[name]}: give seconds since 1970, no milliseconds or microseconds"
+        )
+    return number
 
 
-def delays_of(messages: pd.DataFrame, right: Flags) -> pd.DataFrame:
-    """A row for each message from a right clock, in the order of ``in_order``, whose columns these are.
+def delays_of(messages: pd.DataFrame, right: pd.Series) -> pd.DataFrame:
+    """A row for each message from a right clock, in the order of ``in_order``, whose columns these
+    are.
 
-    Columns: ``uav`` (ID), ``time`` when it was generated [s], ``received`` when it came in first [s], and its
-    ``delay`` [s], 0 if clocks differ a little, so that it came in before its time; the last two are nan for a
-    message that never came in, whose time is estimated: one whose number is missing. Where a UAV does not
-    number its reports, no loss can be seen.
+    Columns: ``uav`` (ID), ``time`` when it was generated [s], ``received`` when it came in first
+    [s], and its ``delay`` [s], 0 if clocks differ a little, so that it came in before its time; the
+    last two are nan for a
+    message that never came in, whose time is estimated: one whose number is missing. Where a UAV
+    does not number its reports, no loss can be seen.
     """
     told = messages.assign(right=right).drop_duplicates(["uav", "run", "time", "sequence", "right"])
     parts = []
@@ -118,7 +126,9 @@ def delays_of(messages: pd.DataFrame, right: Flags) -> pd.DataFrame:
         gaps = own.groupby("run").sequence.diff().sub(1).fillna(0)
         rows = np.arange(len(own)) + gaps.where(gaps <= LONGEST_GAP, 0).cumsum().to_numpy(int)
         every = own.set_index(rows)[["time", "received", "right"]].reindex(range(rows[-1] + 1))
-        counts = every.right.bfill().astype(bool)  # what was lost before a message counts if that does
+        counts = every.right.bfill().astype(
+            bool
+        )  # what was lost before a message counts if that does
         time = every.time.where(counts).interpolate(limit_direction="both")
         part = every.assign(uav=uav, time=time)[counts].drop(columns="right")
         parts.append(part.sort_values("time", kind="stable") if own.sequence.isna().all() else part)
@@ -127,12 +137,16 @@ def delays_of(messages: pd.DataFrame, right: Flags) -> pd.DataFrame:
 
 
 def trace_rows(delays: pd.DataFrame) -> list[str]:
-    """The column ``delay`` of a trace, a row for each message: times, which a simulation rounds up."""
+    """The column ``delay`` of a trace, a row for each message: times, which a simulation rounds
+    up."""
     return [LOST if math.isnan(delay) else f"{delay:.6f}s" for delay in delays.delay]
 
 
 def steps_of(delays: pd.DataFrame, dt: float) -> Integers:
-    """Delays of the messages of each UAV in whole steps of ``dt`` seconds, for ``fit_laws``, [U, T]."""
-    steps = [LOST_STEPS if row == LOST else in_steps("delay", row, dt) for row in trace_rows(delays)]
+    """Delays of the messages of each UAV in whole steps of ``dt`` seconds, for ``fit_laws``,
+    [U, T]."""
+    steps = [
+        LOST_STEPS if row == LOST else in_steps("delay", row, dt) for row in trace_rows(delays)
+    ]
     table = pd.DataFrame({"uav": delays.uav, "n": delays.groupby("uav").cumcount(), "steps": steps})
     return table.pivot(index="uav", columns="n", values="steps").fillna(NO_MESSAGE).to_numpy(int)

@@ -15,12 +15,14 @@ _LOSS_DRAW, _HOLD_DRAW, _PHASE_DRAW, _LINK_LOSS_DRAW = 0, 1, 2, 3
 
 
 class MessageContext(NamedTuple):
-    """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the future."""
+    """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the
+    future."""
 
     sender: Tensor
     """Index of the sender among the agents of its world, [M] long; 0 if a world has one agent."""
     receiver: Tensor
-    """Index of the receiver among the agents of its world, [M] long; -1 for the server or the environment."""
+    """Index of the receiver among the agents of its world, [M] long; -1 for the server or the
+    environment."""
     n_sending: Tensor
     """Number of senders of the same world that send a message in this step, [M] long."""
     time: Tensor
@@ -30,20 +32,25 @@ class MessageContext(NamedTuple):
     dt: float
     """Length of a step [s]."""
     entries: dict[str, Tensor]
-    """The entries that the law reads, by name, [M, ...] each; ``position`` is east and north [m], [M, 2]."""
+    """The entries that the law reads, by name, [M, ...] each; ``position`` is east and north [m],
+    [M, 2]."""
 
 
 Context = MessageContext | None
 """None if the sampler sees no context."""
 Drawn = tuple[Tensor, Tensor]
-"""The delays of M messages, [M] long, from 0 to ``longest``, or ``lost``; and the next states, [M, ...]."""
+"""The delays of M messages, [M] long, from 0 to ``longest``, or ``lost``; and the next states,
+[M, ...]."""
 
 
 class Sampler(nn.Module, ABC):
-    """Draws a delay for each message; derive from it to draw by a rule, or with a state, of your own.
+    """Draws a delay for each message; derive from it to draw by a rule, or with a state, of your
+    own.
 
-    A sender has a state, by default an unused number, which is carried from message to message and on into
-    the next episode. Draws come from the streams: those of other worlds, and of other agents, are different.
+    A sender has a state, by default an unused number, which is carried from message to message and
+    on into
+    the next episode. Draws come from the streams: those of other worlds, and of other agents, are
+    different.
 
     Args:
         longest: longest delay [steps].
@@ -75,7 +82,8 @@ class Sampler(nn.Module, ABC):
         return self.constant_delay != 0
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        """The state of each sender before its first message [M, ...], from its random stream [M]."""
+        """The state of each sender before its first message [M, ...], from its random stream
+        [M]."""
         return torch.zeros_like(streams)
 
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
@@ -83,7 +91,9 @@ class Sampler(nn.Module, ABC):
         return state
 
     @abstractmethod
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         """Draw the delays of the messages sent at ``clock``, and the next states; pure."""
 
     def lose(self, delay: Tensor, streams: Tensor, clock: Tensor) -> Tensor:
@@ -98,9 +108,11 @@ class TableSampler(Sampler):
     """Draws delays from a table of probabilities.
 
     Args:
-        states: for the one state of a sender, or a good and a bad one, the probabilities of the delays 0, 1,
+        states: for the one state of a sender, or a good and a bad one, the probabilities of the
+            delays 0, 1,
             ... [steps]; if they sum to less than 1, the rest is the probability that the message is lost.
-        transitions: probabilities of the transitions between two states per step, [2, 2]; None for one state.
+        transitions: probabilities of the transitions between two states per step, [2, 2]; None for
+            one state.
         loss: probability that a message is lost, whatever its delay.
     """
 
@@ -109,7 +121,10 @@ class TableSampler(Sampler):
     _boundaries: Tensor
 
     def __init__(
-        self, states: list[list[float]], transitions: list[list[float]] | None = None, loss: float = 0.0
+        self,
+        states: list[list[float]],
+        transitions: list[list[float]] | None = None,
+        loss: float = 0.0,
     ) -> None:
         longest = max(map(len, states)) - 1
         super().__init__(longest, loses=False, loss=loss)
@@ -128,12 +143,16 @@ class TableSampler(Sampler):
         joint = (change.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)
         boundaries = (joint.cumsum(-1)[:, :-1] * 2**32).round().long()
         self.register_buffer("_boundaries", boundaries, persistent=False)
-        self._bad_share = (change[0, 1] / (change[0, 1] + change[1, 0])).item() if transitions else 0.0
+        self._bad_share = (
+            (change[0, 1] / (change[0, 1] + change[1, 0])).item() if transitions else 0.0
+        )
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return (counter_rng.uniform(streams) < self._bad_share).long()
 
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         if self.constant_delay is not None:
             return torch.full_like(streams, self.constant_delay), state
         draw = counter_rng.bits(streams, clock)
@@ -149,7 +168,8 @@ _ROUNDING = 1e-10
 
 
 class Recorded(Sampler):
-    """Plays back recorded delays [steps], -1 if lost, from a random one on; the state is the next one."""
+    """Plays back recorded delays [steps], -1 if lost, from a random one on; the state is the next
+    one."""
 
     _delays: Tensor
 
@@ -163,7 +183,9 @@ class Recorded(Sampler):
     def initial_state(self, streams: Tensor) -> Tensor:
         return counter_rng.bits(streams) % len(self._delays)
 
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         delay = self._delays[state]
         if self.loss:
             delay = torch.where(counter_rng.uniform(streams, clock) < self.loss, self.lost, delay)
@@ -171,7 +193,8 @@ class Recorded(Sampler):
 
 
 class HeldSampler(Sampler):
-    """Holds every message back until the longest delay of another sampler, which loses the same messages.
+    """Holds every message back until the longest delay of another sampler, which loses the same
+    messages.
 
     Methods for constant delays then work with random ones.
     """
@@ -188,20 +211,25 @@ class HeldSampler(Sampler):
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
         return self.drawn.begin_episode(state, mask)
 
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
         return torch.where(delay < self.lost, self.longest, self.lost), state
 
 
 class LossSampler(HeldSampler):
-    """Loses messages of another sampler with the probability that the entry ``loss`` of each world tells."""
+    """Loses messages of another sampler with the probability that the entry ``loss`` of each world
+    tells."""
 
     def __init__(self, drawn: Sampler) -> None:
         super().__init__(drawn)
         self.loses, self.constant_delay, self.sees_context = True, None, True
         self.reads = (*drawn.reads, "loss")
 
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
         draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
         chance = cast(MessageContext, context).entries["loss"].view_as(draw)
@@ -209,17 +237,20 @@ class LossSampler(HeldSampler):
 
 
 class LagSampler(Sampler):
-    """Draws a delay (a lag) from a table, and holds it for a period (None: an episode); losses are not held.
+    """Draws a delay (a lag) from a table, and holds it for a period (None: an episode); losses are
+    not held.
 
-    The state is [M, 2] long: the lag, -1 before the first message of an episode, and the number of steps that
-    it is still held.
+    The state is [M, 2] long: the lag, -1 before the first message of an episode, and the number of
+    steps that it is still held.
     """
 
     def __init__(self, law: Any, chances: list[float], loss: float, period: int | None) -> None:
         table, arrives = TableSampler([chances], loss=loss), sum(chances)
         super().__init__(table.longest, loses=False, loss=table.chances[0, -1].item())
         self.constant_delay = table.constant_delay
-        self._lags = TableSampler([[chance / arrives for chance in chances]] if arrives else [[1.0]])
+        self._lags = TableSampler(
+            [[chance / arrives for chance in chances]] if arrives else [[1.0]]
+        )
         self._period, self._hold_probability = period or _NEVER, law.hold_probability
         self.same_draws_for_all_agents, self._stagger = law.shared, law.stagger
 
@@ -229,7 +260,9 @@ class LagSampler(Sampler):
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
         return torch.where(mask.unsqueeze(-1), self.initial_state(state[:, 0]), state)
 
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         if self.constant_delay is not None:
             return torch.full_like(streams, self.constant_delay), state
         lag, wait = state.unbind(-1)
@@ -239,7 +272,9 @@ class LagSampler(Sampler):
             draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _HOLD_DRAW))
             renewed = first | (due & (draw >= self._hold_probability))
         if self._stagger:
-            phase = counter_rng.bits(streams, clock, torch.full_like(clock, _PHASE_DRAW)) % self._period
+            phase = (
+                counter_rng.bits(streams, clock, torch.full_like(clock, _PHASE_DRAW)) % self._period
+            )
             interval = torch.where(first, 1 + phase, interval)
         drawn, _ = self._lags(streams, clock, lag)
         lag = torch.where(renewed, drawn, lag)
@@ -255,14 +290,15 @@ class ContextSampler(Sampler):
     """Computes each delay from the context of the message, by a function.
 
     Args:
-        delay_fn: pure function of a ``MessageContext``, without branches on data, that returns the delays
-            [steps], [M]; they are rounded up and cut to ``longest``, and a message of negative delay is lost.
+        delay_fn: pure function of a ``MessageContext``, without branches on data, that returns the
+            delays [steps], [M]; they are rounded up and cut to ``longest``, and a message of
+            negative delay is lost.
         longest: longest delay [steps].
         loss: probability that a message is lost, whatever its delay.
-        loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, as rewards
-            need it.
-        reads: names of the entries that ``delay_fn`` must get, such as ``position``; it gets all those for
-            which the transform has a key.
+        loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, as
+            rewards need it.
+        reads: names of the entries that ``delay_fn`` must get, such as ``position``; it gets all
+            those for which the transform has a key.
 
     Examples:
         >>> ContextSampler(lambda context: context.n_sending // 4, longest=5, loses=False)
@@ -281,7 +317,9 @@ class ContextSampler(Sampler):
         self.sees_context, self.reads = True, tuple(reads)
         self._delay_fn, self._lost_if_negative = delay_fn, loses
 
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         delay = self._delay_fn(cast(MessageContext, context)).view_as(streams)
         arrives = delay >= 0  # false for nan too
         steps = torch.where(arrives, delay, 0)
@@ -294,11 +332,12 @@ class ContextSampler(Sampler):
 
 
 class LinkSampler(Sampler):
-    """Draws the delays of messages on the links between N agents, by a law and a loss for each link.
+    """Draws the delays of messages on the links between N agents, by a law and a loss for each
+    link.
 
-    Links are numbered receiver * N + sender; message m of the M of a step belongs to link m modulo N * N.
-    Every distinct law has one sampler, which draws for all links. The states of all samplers lie side by
-    side, [M, S].
+    Links are numbered receiver * N + sender; message m of the M of a step belongs to link m modulo
+    N * N. Every distinct law has one sampler, which draws for all links. The states of all samplers
+    lie side by side, [M, S].
     """
 
     _law_index: Tensor
@@ -325,7 +364,9 @@ class LinkSampler(Sampler):
         pairs = zip(self.samplers, self._split(state), strict=True)
         return _packed([sampler.begin_episode(part, mask) for sampler, part in pairs])
 
-    def forward(self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None) -> Drawn:
+    def forward(
+        self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
+    ) -> Drawn:
         n_links = len(self._law_index)
         n_worlds, delay, states = len(streams) // n_links, torch.zeros_like(streams), []
         index = self._law_index.repeat(n_worlds)
@@ -351,11 +392,14 @@ class LinkSampler(Sampler):
 def _packed(states: list[Tensor]) -> Tensor:
     """States [M, ...] side by side, [M, S] long; those that are floats keep their bits."""
     flat = [state.reshape(len(state), -1) for state in states]
-    return torch.cat([s.double().view(torch.long) if s.is_floating_point() else s.long() for s in flat], -1)
+    return torch.cat(
+        [s.double().view(torch.long) if s.is_floating_point() else s.long() for s in flat], -1
+    )
 
 
 def streams_for(sampler: Sampler, streams: Tensor, n_rows: int) -> Tensor:
-    """The random streams [M] from which a sampler draws: for ``n_rows`` rows of a world, maybe one."""
+    """The random streams [M] from which a sampler draws: for ``n_rows`` rows of a world, maybe
+    one."""
     if not sampler.same_draws_for_all_agents:
         return streams
     return streams.view(-1, n_rows)[:, :1].expand(-1, n_rows).reshape(-1)

@@ -12,28 +12,40 @@ from damian.delays.samplers import HeldSampler, LossSampler, Sampler
 class ScenarioDelays:
     """The samplers of all that can be late in a scenario, made by ``ScenarioConfig.make_delays``.
 
-    With ``draws_loss``, the loss of messages to the server differs by world and episode (``randomise``).
-    Raises ``InputError`` if a law is wrong, reads what no message carries, or loses rewards.
+    With ``draws_loss``, the loss of messages to the server differs by world and episode
+    (``randomise``). Raises ``InputError`` if a law is wrong, reads what no message carries, or
+    loses rewards.
     """
 
-    def __init__(self, delay: DelayConfig, links: LinkConfig, dt: float, draws_loss: bool = False) -> None:
+    def __init__(
+        self, delay: DelayConfig, links: LinkConfig, dt: float, draws_loss: bool = False
+    ) -> None:
         law = sampler_of(delay.obs, dt, 0.0 if draws_loss else delay.loss, "delay.obs")
         obs = LossSampler(law) if draws_loss else law
         self.obs: Sampler = HeldSampler(obs) if delay.hold == "max" else obs
         """Of the messages to the server, with their losses, and as the server holds them back."""
-        self.act, self.rew = (sampler_of(getattr(delay, n), dt, key=f"delay.{n}") for n in ("act", "rew"))
+        self.act, self.rew = (
+            sampler_of(getattr(delay, n), dt, key=f"delay.{n}") for n in ("act", "rew")
+        )
         """Of the actions, and of the rewards; no reward is lost."""
         self.links = link_sampler(links.delay, links.loss, dt, "links.delay")
         """Of what the UAVs receive from the server (updown), or from each other (matrix)."""
         checks.require(not self.rew.loses, "delay.rew", delay.rew, LOSES)
-        laws = {"delay.obs": law, "delay.act": self.act, "delay.rew": self.rew, "links.delay": self.links}
+        laws = {
+            "delay.obs": law,
+            "delay.act": self.act,
+            "delay.rew": self.rew,
+            "links.delay": self.links,
+        }
         for key, sampler in laws.items():
             told_receiver = key == "links.delay" and links.kind == "matrix"
             known = ["position", *["receiver_position"] * told_receiver]
             for name in sampler.reads:
                 problem = f"reads {name}, but a law can read only {', '.join(known)}"
                 checks.require(name in known, key, type(sampler).__name__, problem)
-        self.reads_positions = links.range is not None or any(sampler.reads for sampler in laws.values())
+        self.reads_positions = links.range is not None or any(
+            sampler.reads for sampler in laws.values()
+        )
         """Whether a law, or the range of the links, needs to know where the UAVs are."""
         context_keys = {"position": keys.POSITION} if self.reads_positions else {}
         context_keys |= {"loss": keys.LOSS} if draws_loss else {}
@@ -42,5 +54,6 @@ class ScenarioDelays:
 
     @property
     def longest(self) -> int:
-        """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
+        """Longest time until all that corrects a step has arrived: its messages, and its reward
+        [steps]."""
         return max(self.obs.longest, self.rew.longest)

@@ -17,19 +17,30 @@ if TYPE_CHECKING:
 
 @dataclass
 class ClockConfig(Settings):
-    """Periods of the clocks, such as ``1s``, ``200ms`` or ``2min``, each a multiple of the faster ones."""
+    """Periods of the clocks, such as ``1s``, ``200ms`` or ``2min``, each a multiple of the faster
+    ones."""
 
     section: ClassVar[str] = "clock"
 
     simulation: str = setting("1s", "Length of a simulation step, ``dt``.")
-    agents: str | None = setting(None, "Period at which an agent decides; ``simulation`` if not given.")
-    server: str | None = setting(None, "Period at which the server broadcasts; ``simulation`` if not given.")
-    system: str | None = setting(None, "Period of the learner's batches; from learner.steps if not given.")
+    agents: str | None = setting(
+        None, "Period at which an agent decides; ``simulation`` if not given."
+    )
+    server: str | None = setting(
+        None, "Period at which the server broadcasts; ``simulation`` if not given."
+    )
+    system: str | None = setting(
+        None, "Period of the learner's batches; from learner.steps if not given."
+    )
     trigger: str | None = setting(
-        None, "Change of that period at each tick: shorter if a UAV of half the worlds spots, else longer."
+        None,
+        "Change of that period at each tick: shorter if a UAV of half the worlds spots, else "
+        "longer.",
     )
     shortest: str | None = setting(None, "Shortest triggered period; ``trigger`` if not given.")
-    longest: str | None = setting(None, "Longest triggered period; twice the first one if not given.")
+    longest: str | None = setting(
+        None, "Longest triggered period; twice the first one if not given."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,10 +97,15 @@ class ScenarioConfig(WorldConfig):
         self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)
         problem = "does not go with links=updown: the server has computed what a UAV receives"
         self.refuse(observation.own and links == "updown", "observation.own", problem)
-        problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
+        problem = (
+            "does not go with links=matrix: no UAV computes a belief from what it hears directly"
+        )
         self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
         drawn = {"source.miss", "source.false_alarm"} & {*self.randomise}
-        problem = "does not go with randomise of source.miss or source.false_alarm, which the filter knows"
+        problem = (
+            "does not go with randomise of source.miss or source.false_alarm, which the filter "
+            "knows"
+        )
         self.refuse(observation.belief and drawn, "observation.belief", problem)
         per_action = "belief_gain" in observation.belief
         problem = "needs discrete actions: it has a value for each of them"
@@ -97,12 +113,21 @@ class ScenarioConfig(WorldConfig):
         problem = "is empty for a single UAV: add another feature"
         empty = self.agents == 1 and observation.critic == ["agent_distances"]
         self.refuse(empty, "observation.global_features", problem)
-        problem = f"does not go with links={links}: a UAV would get the messages that the server has received"
+        problem = (
+            f"does not go with links={links}: a UAV would get the messages that the server has "
+            "received"
+        )
         self.refuse(self.delay.messages and links != "server", "delay.messages", problem)
-        problem = "does not go with delay.order=arrival: a slot would change with when a message arrived"
-        self.refuse(observation.timeline and self.delay.order == "arrival", "observation.timeline", problem)
+        problem = (
+            "does not go with delay.order=arrival: a slot would change with when a message arrived"
+        )
+        self.refuse(
+            observation.timeline and self.delay.order == "arrival", "observation.timeline", problem
+        )
         asked = "requests" in observation.global_features or self.reward.served
-        self.refuse(asked and not self.requests.slots, "requests.rate", "is 0, so that no request appears")
+        self.refuse(
+            asked and not self.requests.slots, "requests.rate", "is 0, so that no request appears"
+        )
         never = episode.discharged_share is not None and not self.battery.enabled
         self.refuse(never, "episode.discharged_share", "needs battery.enabled=true")
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
@@ -127,6 +152,7 @@ class ScenarioConfig(WorldConfig):
 
     @property
     def time_scale(self) -> float:
-        """Time by which time features are divided [s]: the setting, else the time limit, else one hour."""
+        """Time by which time features are divided [s]: the setting, else the time limit, else one
+        hour."""
         limit = None if self.episode.max_steps is None else self.episode.max_steps * self.clock.dt
         return self.observation.time_scale or limit or 3600.0

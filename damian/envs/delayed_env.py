@@ -29,11 +29,12 @@ _BASE = "base_env."
 
 
 class DelayedEnv(TransformedEnv):
-    """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function, with equal results.
+    """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function, with equal
+    results.
 
-    ``step_fn`` and ``reset_fn`` are that function: pure, of the worlds and of the transforms' memories. All
-    leading transforms of damian's step in it; those after them, and steps of some worlds only (TorchRL's
-    ``_step``), go through TorchRL's hooks.
+    ``step_fn`` and ``reset_fn`` are that function: pure, of the worlds and of the transforms'
+    memories. All leading transforms of damian's step in it; those after them, and steps of some
+    worlds only (TorchRL's ``_step``), go through TorchRL's hooks.
     """
 
     delays: ScenarioDelays
@@ -75,21 +76,28 @@ class DelayedEnv(TransformedEnv):
         return super().set_seed(seed, static_seed)
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world [B] its own random streams: it evolves the same alone as among others."""
+        """Give every world [B] its own random streams: it evolves the same alone as among
+        others."""
         self.uav_env.seed_worlds(seeds)
         for module in self._stateful_modules():
             module.seed_worlds(seeds)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
-        """The state of the transforms and of the environment under them; an equal one continues with it."""
+        """The state of the transforms and of the environment under them; an equal one continues
+        with it."""
         state = cast(OrderedDict[str, Any], super().state_dict(*args, **kwargs))
         self.base_env.state_dict(destination=state, prefix=kwargs.get("prefix", "") + _BASE)
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
-        """Load a state; one without the environment's, as TorchRL's collectors save it, leaves the worlds."""
-        base = {k.removeprefix(_BASE): value for k, value in state_dict.items() if k.startswith(_BASE)}
-        others = OrderedDict((k, value) for k, value in state_dict.items() if not k.startswith(_BASE))
+        """Load a state; one without the environment's, as TorchRL's collectors save it, leaves the
+        worlds."""
+        base = {
+            k.removeprefix(_BASE): value for k, value in state_dict.items() if k.startswith(_BASE)
+        }
+        others = OrderedDict(
+            (k, value) for k, value in state_dict.items() if not k.startswith(_BASE)
+        )
         if base:
             self.base_env.load_state_dict(base, **kwargs)
             for module in self._stateful_modules():
@@ -97,13 +105,16 @@ class DelayedEnv(TransformedEnv):
         super().load_state_dict(others, **kwargs)
 
     def _stateful_modules(self) -> list[StatefulTransform]:
-        return [module for module in self.transform.modules() if isinstance(module, StatefulTransform)]
+        return [
+            module for module in self.transform.modules() if isinstance(module, StatefulTransform)
+        ]
 
     def compile(self, cuda_graph: bool = True, **options: Any) -> "DelayedEnv":
         """Compile a step with its transforms as one graph, on a GPU as one CUDA graph.
 
         Args:
-            cuda_graph: on a GPU, launch all kernels at once, for the memory of a state and a step. A step
+            cuda_graph: on a GPU, launch all kernels at once, for the memory of a state and a step.
+                A step
                 then changes the state in place: clone what ``state`` or ``state_dict`` have given.
             options: of ``torch.compile``.
         """
@@ -112,7 +123,8 @@ class DelayedEnv(TransformedEnv):
         return self
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Draw actions as TorchRL does, but write them without a TensorDict in between, a tenth of a step."""
+        """Draw actions as TorchRL does, but write them without a TensorDict in between, a tenth of
+        a step."""
         if tensordict is None:
             return super().rand_action()
         for key in self.action_keys:
@@ -132,7 +144,9 @@ class DelayedEnv(TransformedEnv):
         for i, transform in reversed([*enumerate(transforms)]):
             changed[i], written = transform.on_action(changed[i], entries)
             entries = entries | written
-        worlds, outputs = self.uav_env.step_fn(worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID))
+        worlds, outputs = self.uav_env.step_fn(
+            worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID)
+        )
         for i, transform in enumerate(transforms):
             changed[i], written = transform.on_step(changed[i], outputs)
             outputs = outputs | written
@@ -145,28 +159,34 @@ class DelayedEnv(TransformedEnv):
         transforms, changed = self._fused(), list(memories)
         worlds, outputs = self.uav_env.reset_fn(worlds, mask)
         for i, transform in enumerate(transforms):
-            changed[i], written = transform.on_reset(changed[i], outputs, transform.expand_worlds(mask))
+            changed[i], written = transform.on_reset(
+                changed[i], outputs, transform.expand_worlds(mask)
+            )
             outputs = outputs | written
         return worlds, changed, _without_dropped(outputs, transforms)
 
     def step_and_reset_fn(
         self, worlds: PackedState, memories: list[Memory], entries: Entries
     ) -> tuple[PackedState, list[Memory], Outputs, Outputs]:
-        """One step, and a reset of the worlds that it ends: also the outputs that begin the next step."""
+        """One step, and a reset of the worlds that it ends: also the outputs that begin the next
+        step."""
         worlds, memories, outputs = self.step_fn(worlds, memories, entries)
         following = {key: value for key, value in outputs.items() if key != keys.REWARD}
         done = outputs[keys.DONE]
         if torch.compiler.is_compiling() or not devices.data_dependent(done.device) or done.any():
             mask = done.view(-1)
             worlds, memories, first = self.reset_fn(worlds, memories, mask)
-            following |= {k: torch.where(expand_mask(mask, x), x, following[k]) for k, x in first.items()}
+            following |= {
+                k: torch.where(expand_mask(mask, x), x, following[k]) for k, x in first.items()
+            }
         return worlds, memories, outputs, following
 
     def _fused(self) -> list[StatefulTransform]:
         return self._split_transforms()[0]
 
     def _split_transforms(self) -> tuple[list[StatefulTransform], list[Transform]]:
-        """The leading stateful transforms that step in one function, and every transform after them."""
+        """The leading stateful transforms that step in one function, and every transform after
+        them."""
         transforms: list[Any] = [*cast(Compose, self.transform)]
         others = (i for i, each in enumerate(transforms) if not isinstance(each, StatefulTransform))
         n = next(others, len(transforms))
@@ -209,7 +229,9 @@ class DelayedEnv(TransformedEnv):
         return result
 
     @torch.no_grad()
-    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+    def _step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
         """As TorchRL's, in one graph; what a policy has written stays after a reset."""
         fused, others = self._split_transforms()
         partial = "_step" in tensordict or "next" in tensordict or tensordict.device != self.device
@@ -224,14 +246,20 @@ class DelayedEnv(TransformedEnv):
         return tensordict.set("next", env.to_tensordict(outputs)), begins
 
     def _compiled_fn(self, name: str, *variant: Any) -> Callable[..., Any]:
-        """The pure function of this name, compiled if ``compile`` was called: a graph for each variant."""
+        """The pure function of this name, compiled if ``compile`` was called: a graph for each
+        variant."""
         function = getattr(self, name)
-        return function if self._compiled is None else self._compiled.get(function, *self._fused(), *variant)
+        return (
+            function
+            if self._compiled is None
+            else self._compiled.get(function, *self._fused(), *variant)
+        )
 
     def _step_inputs(
         self, fused: list[StatefulTransform], tensordict: TensorDictBase
     ) -> tuple[list[Memory], Entries]:
-        """The memories of the transforms, and the entries that they and the worlds read before a step."""
+        """The memories of the transforms, and the entries that they and the worlds read before a
+        step."""
         memories, entries = [], select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
         for transform in fused:
             transform.require_memory()
@@ -239,14 +267,17 @@ class DelayedEnv(TransformedEnv):
             memories.append(transform.memory)
         return memories, entries
 
-    def _store(self, fused: list[StatefulTransform], worlds: PackedState, memories: list[Memory]) -> None:
+    def _store(
+        self, fused: list[StatefulTransform], worlds: PackedState, memories: list[Memory]
+    ) -> None:
         self.uav_env.worlds = worlds
         for transform, memory in zip(fused, memories, strict=True):
             transform.set_memory(memory)
 
 
 def _with_past_actions(layout: Layout, n_actions: int, spec: TensorSpec) -> Layout:
-    """A layout with the columns that an ``ActionHistory`` has appended, by the spec of the observation."""
+    """A layout with the columns that an ``ActionHistory`` has appended, by the spec of the
+    observation."""
     bounds = {}
     if isinstance(spec, Bounded):
         low, high = spec.low[..., layout.width :].amin(), spec.high[..., layout.width :].amax()
@@ -259,11 +290,14 @@ def _with_past_actions(layout: Layout, n_actions: int, spec: TensorSpec) -> Layo
 def _without_dropped(outputs: Outputs, transforms: Sequence[StatefulTransform]) -> Outputs:
     """The outputs without those that a transform drops."""
     dropped = {key for each in transforms if isinstance(each, Drop) for key in each.dropped_keys}
-    return {key: value for key, value in outputs.items() if key not in dropped} if dropped else outputs
+    return (
+        {key: value for key, value in outputs.items() if key not in dropped} if dropped else outputs
+    )
 
 
 def _keep_others(before: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
-    """Add to ``after`` the entries of ``before`` that it lacks, such as what the policy has written."""
+    """Add to ``after`` the entries of ``before`` that it lacks, such as what the policy has
+    written."""
     for name, value in before.items():
         if name not in after:
             after.set(name, value.copy() if isinstance(value, TensorDictBase) else value)

@@ -26,7 +26,8 @@ from damian.world.coverage import KnownCoverage
 
 
 class WorldTransform(StatefulTransform):
-    """Base class of transforms whose memory has a row for each world, whatever entries they read."""
+    """Base class of transforms whose memory has a row for each world, whatever entries they
+    read."""
 
     @property
     def row_key(self) -> NestedKey:
@@ -34,7 +35,8 @@ class WorldTransform(StatefulTransform):
 
 
 class Drop(WorldTransform):
-    """Removes entries, as far as there are any, that nothing reads after it: each one costs time."""
+    """Removes entries, as far as there are any, that nothing reads after it: each one costs
+    time."""
 
     stage = "history"
 
@@ -55,16 +57,17 @@ class Drop(WorldTransform):
 class ServerNode(WorldTransform):
     """Computes observations, rewards and the task's status from the messages that have arrived.
 
-    It writes the entries that ``UavEnv`` writes itself when no message is delayed, and, into the messages
-    that it holds, what the server knows without them; after a reset, the server, and every UAV, holds the
-    first message of every UAV. ``damian.make_env`` adds it where a scenario delays or loses messages, or UAVs
-    hear each other.
+    It writes the entries that ``UavEnv`` writes itself when no message is delayed, and, into the
+    messages that it holds, what the server knows without them; after a reset, the server, and every
+    UAV, holds the first message of every UAV. ``damian.make_env`` adds it where a scenario delays
+    or loses messages, or UAVs hear each other.
 
     Args:
         server: server node that does the computations.
         message_key: key of the packed messages that the server holds, [B, N, M].
-        heard_key: key of the packed messages from which the UAVs compute their own observations, by the same
-            formulas, [B, N, N, M] (receiver, sender); None if they get them from the server.
+        heard_key: key of the packed messages from which the UAVs compute their own observations, by
+            the same formulas, [B, N, N, M] (receiver, sender); None if they get them from the
+            server.
         reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
     """
 
@@ -101,17 +104,24 @@ class ServerNode(WorldTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])
         memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
-        memory["held"] = torch.zeros_like(rows[..., 0])  # when the messages were sent that the server held
+        memory["held"] = torch.zeros_like(
+            rows[..., 0]
+        )  # when the messages were sent that the server held
         if not self.server.remembers_coverage:
             return memory
         trail = self.server.counted(self.server.messages(rows))
-        return memory | {"trail": trail, "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype)}
+        return memory | {
+            "trail": trail,
+            "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype),
+        }
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         begun = {"elapsed": mask, "held": mask.unsqueeze(-1)}
         memory = memory | {name: memory[name].masked_fill(rows, 0) for name, rows in begun.items()}
         if "coverage" in memory:
-            memory["coverage"] = memory["coverage"].masked_fill(expand_mask(mask, memory["coverage"]), -1)
+            memory["coverage"] = memory["coverage"].masked_fill(
+                expand_mask(mask, memory["coverage"]), -1
+            )
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
@@ -132,7 +142,9 @@ class ServerNode(WorldTransform):
             rows = self.server.with_own_knowledge(entries[self.heard_key], sent.unsqueeze(-3))
             heard = self.server.messages(rows)
             heard_timeline = _by_sender(entries[keys.HEARD_STOPS]) if timeline is not None else None
-            written[keys.OBSERVATION] = self.server.observe_each(heard, steps, timeline=heard_timeline)
+            written[keys.OBSERVATION] = self.server.observe_each(
+                heard, steps, timeline=heard_timeline
+            )
         elif self.own_key:
             written[keys.OBSERVATION] = self.server.observe_with_own_messages(
                 received,
@@ -149,7 +161,8 @@ class ServerNode(WorldTransform):
 
 
 def _by_sender(own_first: Tensor) -> Tensor:
-    """Timelines of receivers [B, N, N, K, C], whose senders begin with the receiver, in the order of senders."""
+    """Timelines of receivers [B, N, N, K, C], whose senders begin with the receiver, in the order
+    of senders."""
     agent = torch.arange(own_first.shape[1], device=own_first.device)
     receiver = agent.unsqueeze(-1)
     return own_first[:, receiver, (agent - receiver) % len(agent)]
@@ -158,25 +171,34 @@ def _by_sender(own_first: Tensor) -> Tensor:
 class Belief(WorldTransform):
     """Writes the probability that each source is in each cell of a grid, by Bayes' rule.
 
-    The belief is exact for the messages that have arrived by now, whenever they were sent: when one comes in
-    late, the filter runs again from the step in which it was sent. It writes ``belief`` [B, K, C] and, if
-    ``own``, that of each UAV, which knows its own messages at once, ``("agents", "belief")`` [B, N, K, C].
+    The belief is exact for the messages that have arrived by now, whenever they were sent: when one
+    comes in late, the filter runs again from the step in which it was sent. It writes ``belief``
+    [B, K, C] and, if ``own``, that of each UAV, which knows its own messages at once,
+    ``("agents", "belief")`` [B, N, K, C].
 
     Args:
         server: server node, whose grid the belief is about.
         longest: longest delay of a message [steps].
-        delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
+        delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is
+            delayed.
         own: compute the belief of each UAV too.
     """
 
     def __init__(self, server: Server, longest: int, *, delayed: bool, own: bool = False) -> None:
-        reads: list[NestedKey] = [keys.MESSAGE, keys.MESSAGE_SENT, *([keys.DELAY] if delayed else [])]
+        reads: list[NestedKey] = [
+            keys.MESSAGE,
+            keys.MESSAGE_SENT,
+            *([keys.DELAY] if delayed else []),
+        ]
         super().__init__(reads, [keys.BELIEF, *([keys.OWN_BELIEF] if own else [])])
         self.server, self.longest, self.delayed, self.own = server, longest, delayed, own
         self.step_keys = reads
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        n_beliefs, n_agents = self.rows.numel() * self.grid.n_sources, tensordict[keys.MESSAGE].shape[-2]
+        n_beliefs, n_agents = (
+            self.rows.numel() * self.grid.n_sources,
+            tensordict[keys.MESSAGE].shape[-2],
+        )
         return empty_window(self.grid, self.longest, n_beliefs, n_agents, self.own)._asdict()
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
@@ -194,8 +216,14 @@ class Belief(WorldTransform):
         delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(messages.motions)
         every = torch.ones_like(region, dtype=torch.bool)
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        told = report.flatten(0, 1), self._of_each(delay), places(self.grid, region, level).flatten()
-        window, beliefs = advance_beliefs(self.grid, Window(**memory), *told, self._of_each(stepped))
+        told = (
+            report.flatten(0, 1),
+            self._of_each(delay),
+            places(self.grid, region, level).flatten(),
+        )
+        window, beliefs = advance_beliefs(
+            self.grid, Window(**memory), *told, self._of_each(stepped)
+        )
         return window._asdict(), self._written(beliefs)
 
     def _of_each(self, values: Tensor) -> Tensor:
@@ -204,7 +232,9 @@ class Belief(WorldTransform):
 
     def _written(self, beliefs: Beliefs) -> Entries:
         server, own = (each.unflatten(0, (-1, self.grid.n_sources)) for each in beliefs)
-        pairs = zip(self.out_keys, (server, own.transpose(1, 2)), strict=False)  # own ones if they are wanted
+        pairs = zip(
+            self.out_keys, (server, own.transpose(1, 2)), strict=False
+        )  # own ones if they are wanted
         return {key: self.from_rows(belief.contiguous()) for key, belief in pairs}
 
     @property
@@ -214,7 +244,10 @@ class Belief(WorldTransform):
         return self.server.grid
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        worlds, n_agents = observation_spec[keys.MESSAGE].shape[:-2], observation_spec[keys.MESSAGE].shape[-2]
+        worlds, n_agents = (
+            observation_spec[keys.MESSAGE].shape[:-2],
+            observation_spec[keys.MESSAGE].shape[-2],
+        )
         cells = self.grid.n_sources, self.grid.prior.shape[-1]
         for key, shape in ((keys.BELIEF, worlds), (keys.OWN_BELIEF, (*worlds, n_agents))):
             if key in self.out_keys:
@@ -224,7 +257,8 @@ class Belief(WorldTransform):
 
 
 class EpisodeTotals(WorldTransform):
-    """Writes each episode's sum of rewards and number of steps (TorchRL's ``RewardSum``, ``StepCounter``)."""
+    """Writes each episode's sum of rewards and number of steps
+    (TorchRL's ``RewardSum``, ``StepCounter``)."""
 
     stage = "history"
 
@@ -234,7 +268,10 @@ class EpisodeTotals(WorldTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         reward = self.env.full_reward_spec[keys.REWARD].zero()
-        return {"total": reward, "count": torch.zeros(len(reward), 1, dtype=torch.long, device=reward.device)}
+        return {
+            "total": reward,
+            "count": torch.zeros(len(reward), 1, dtype=torch.long, device=reward.device),
+        }
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory = {name: old.masked_fill(expand_mask(mask, old), 0) for name, old in memory.items()}
@@ -246,7 +283,10 @@ class EpisodeTotals(WorldTransform):
 
     def _outputs(self, memory: Memory) -> Entries:
         # Copies, because others may change what a step outputs in place.
-        return {keys.EPISODE_REWARD: memory["total"].clone(), keys.STEP_COUNT: memory["count"].clone()}
+        return {
+            keys.EPISODE_REWARD: memory["total"].clone(),
+            keys.STEP_COUNT: memory["count"].clone(),
+        }
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         reward = self.env.full_reward_spec[keys.REWARD]

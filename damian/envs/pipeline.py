@@ -1,4 +1,5 @@
-"""Builds a scenario's environment: the one place that decides the order of its delays, losses and clocks.
+"""Builds a scenario's environment: the one place that decides the order of its delays, losses and
+clocks.
 
 What a step passes, in this order (a transform is there only if the scenario asks for it)::
 
@@ -56,10 +57,10 @@ def make_env(
 ) -> DelayedEnv:
     """Build the environment of a scenario with all of its delays.
 
-    The arguments are those of ``UavEnv``. If messages are delayed, the extra ``message`` also outputs
-    ``received`` (the messages that the server holds), their ``age`` [steps], and the ``delay`` [steps] of the
-    messages sent, and if rewards are delayed, ``reward_delay`` [steps] and, without a message delay,
-    ``earned_reward``, all under ``"agents"``.
+    The arguments are those of ``UavEnv``. If messages are delayed, the extra ``message`` also
+    outputs ``received`` (the messages that the server holds), their ``age`` [steps], and the
+    ``delay`` [steps] of the messages sent, and if rewards are delayed, ``reward_delay`` [steps]
+    and, without a message delay, ``earned_reward``, all under ``"agents"``.
     """
     extras = checks.names("extras", extras, ALL_EXTRAS)
     delays = scenario.make_delays()
@@ -77,7 +78,8 @@ def make_env(
 def make_transforms(
     scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
 ) -> Compose:
-    """All transforms of a scenario in order: outputs pass them forwards, a policy's actions backwards."""
+    """All transforms of a scenario in order: outputs pass them forwards, a policy's actions
+    backwards."""
     remote = has_server_node(scenario, delays)
     transforms = [
         *action_transforms(scenario, delays),
@@ -95,7 +97,8 @@ def make_transforms(
 
 
 def action_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
-    """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not sent."""
+    """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not
+    sent."""
     clock, act = scenario.clock, delays.act
     if not act.late and clock.steps("agents") == 1:
         return []
@@ -113,9 +116,12 @@ def action_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[
 def server_transforms(
     scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
 ) -> list[Transform]:
-    """The message delay (paper, section 3.4), links, and the server node, which uses arrived messages."""
+    """The message delay (paper, section 3.4), links, and the server node, which uses arrived
+    messages."""
     output_messages, delayed, links = "message" in extras, delays.obs.late, scenario.links
-    remembers = server.grid is not None or scenario.delay.messages > 0 or scenario.observation.timeline > 0
+    remembers = (
+        server.grid is not None or scenario.delay.messages > 0 or scenario.observation.timeline > 0
+    )
     transforms: list[Transform] = []
     if delayed:
         uplink = ObservationDelay(
@@ -124,7 +130,9 @@ def server_transforms(
             keys.RECEIVED,
             order=scenario.delay.order,
             sent_key=keys.MESSAGE_SENT,
-            age_key=keys.AGE if output_messages or history_since_message(scenario, delays) else None,
+            age_key=keys.AGE
+            if output_messages or history_since_message(scenario, delays)
+            else None,
             delay_key=keys.DELAY if output_messages or remembers else None,
             **delays.told,
         )
@@ -148,7 +156,9 @@ def server_transforms(
             delay_key=keys.LINK_DELAY if scenario.observation.timeline else None,
         )
         transforms.append(channel)
-        transforms += timeline_transforms(scenario, server, keys.HEARD_STOPS, keys.LINK_DELAY, group=True)
+        transforms += timeline_transforms(
+            scenario, server, keys.HEARD_STOPS, keys.LINK_DELAY, group=True
+        )
     node = ServerNode(server, held, heard_key=heard, reward_terms="reward_terms" in extras)
     return [*transforms, node]
 
@@ -187,7 +197,8 @@ def timeline_transforms(
     *,
     group: bool = False,
 ) -> list[Transform]:
-    """What is known of the stops of the latest steps, for the feature ``timeline``, if it is observed."""
+    """What is known of the stops of the latest steps, for the feature ``timeline``, if it is
+    observed."""
     if not scenario.observation.timeline:
         return []
     timeline = ObservationTimeline(
@@ -215,7 +226,8 @@ def scaled_messages(server: Server, rows: Tensor) -> Tensor:
 def reward_transforms(
     scenario: ScenarioConfig, delays: ScenarioDelays, extras: Collection[str]
 ) -> list[Transform]:
-    """The reward delay, and the discounted sum of the latest rewards (paper, section 3.5, eq. 4)."""
+    """The reward delay, and the discounted sum of the latest rewards
+    (paper, section 3.5, eq. 4)."""
     delay, reported = scenario.delay, "message" in extras
     transforms: list[Transform] = []
     if delays.rew.late:
@@ -235,12 +247,15 @@ def reward_transforms(
 
 
 def observation_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
-    """Clocks of server and UAVs (paper, section 3.6), the broadcast, and the action history (section 3.3)."""
+    """Clocks of server and UAVs (paper, section 3.6), the broadcast, and the action history
+    (section 3.3)."""
     clock, links, n_actions = scenario.clock, scenario.links, scenario.delay.history
     transforms: list[Transform] = []
     broadcast = [keys.OBSERVATION, *[keys.TIMELINE] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
-        transforms.append(SampleAndHold(clock.steps("server"), [*broadcast, keys.GLOBAL_OBSERVATION]))
+        transforms.append(
+            SampleAndHold(clock.steps("server"), [*broadcast, keys.GLOBAL_OBSERVATION])
+        )
     if links.kind == "updown" and delays.links.late:
         downlink = ObservationDelay(
             delays.links,
@@ -261,8 +276,11 @@ def observation_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> 
             default=hold_action(scenario.actions),
             recorded_key="ready",
             age_key=keys.AGE if history_since_message(scenario, delays) else None,
-            # Features do not reflect a flight before it has ended, though a message is sent as it begins.
-            reflected_after=1 if MOTION_MODELS.get(scenario.motion.kind, "motion.kind").instant else 2,
+            # Features do not reflect a flight before it has ended, though a message is sent as it
+            # begins.
+            reflected_after=1
+            if MOTION_MODELS.get(scenario.motion.kind, "motion.kind").instant
+            else 2,
         )
         transforms.append(history)
     return transforms
@@ -271,7 +289,8 @@ def observation_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> 
 def history_since_message(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
     """Whether an action history holds only actions newer than the message that the server holds.
 
-    Not where a UAV cannot tell which are newer (slow clocks, delayed actions), or knows its own message.
+    Not where a UAV cannot tell which are newer (slow clocks, delayed actions), or knows its own
+    message.
     """
     clock = scenario.clock
     slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"
@@ -287,13 +306,15 @@ def has_server_node(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
 
 
 def hold_action(actions: ActionConfig) -> int:
-    """Index of the first discrete action that holds the position; 0 if there is none, or if continuous."""
+    """Index of the first discrete action that holds the position; 0 if there is none, or if
+    continuous."""
     discrete = actions.kind == "discrete" and 0.0 in actions.distances
     return actions.distances.index(0.0) * len(actions.headings) if discrete else 0
 
 
 def action_codes(actions: ActionConfig) -> Tensor | None:
-    """Codes of discrete actions, whose sums tell where a UAV is: displacements in [0, 1], [A, 2]."""
+    """Codes of discrete actions, whose sums tell where a UAV is: displacements in [0, 1],
+    [A, 2]."""
     if actions.kind == "continuous":
         return None
     distance, heading = action_table(actions).unbind(-1)

@@ -17,14 +17,15 @@ from damian.server.server import Server
 from damian.transforms.timeline import told_slots
 
 CORRECTED = {"reward": keys.REWARD, "critic": keys.GLOBAL_OBSERVATION, "actor": keys.OBSERVATION}
-"""What late messages can correct in stored steps, and where it lies; of the actors' observations not what
-``ActionHistory`` appends."""
+"""What late messages can correct in stored steps, and where it lies; of the actors' observations
+not what ``ActionHistory`` appends."""
 
 
 def server_recompute(
     server: Server, corrected: Collection[str] = ("reward", "critic"), reward_terms: bool = False
 ) -> Recompute:
-    """A ``BackupdateStorage.recompute``: what the server would have output, had it held other messages.
+    """A ``BackupdateStorage.recompute``: what the server would have output, had it held other
+    messages.
 
     ``corrected``: names in ``CORRECTED``; the ends of episodes always are.
     """
@@ -42,7 +43,9 @@ def server_recompute(
         timeline = timeline_in_hindsight(server, steps) if timed else None
         messages = server.with_own_knowledge(messages, steps[next_key(keys.MESSAGE)])
         held = server.messages(messages)
-        outputs = server(held, elapsed, source_over, belief=belief, timeline=timeline, observers=observers)
+        outputs = server(
+            held, elapsed, source_over, belief=belief, timeline=timeline, observers=observers
+        )
         entries = outputs.entries(reward_terms)
         if belief is not None:
             entries[keys.BELIEF] = belief
@@ -60,7 +63,8 @@ def server_recompute(
 
 
 def timeline_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
-    """What is known of stops after each stored step, by all that has arrived by now, [T, B, N, slots, 3]."""
+    """What is known of stops after each stored step, by all that has arrived by now,
+    [T, B, N, slots, 3]."""
     messages, n_steps = steps[next_key(keys.MESSAGE)], len(steps)
     places, told = told_slots(
         server.stop_places(messages), server.stop_ages(messages), server.observation.timeline
@@ -85,7 +89,8 @@ def timeline_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
 
 
 def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
-    """The belief after each stored step, from what has arrived by now, [T, B, K, C]; the first is final."""
+    """The belief after each stored step, from what has arrived by now, [T, B, K, C]; the first is
+    final."""
     assert server.grid is not None
     grid, messages = server.grid, server.messages(steps[next_key(keys.MESSAGE)])
     delay = steps[next_key(keys.DELAY)].squeeze(-1)

@@ -36,40 +36,46 @@ EXTRAS = ("message", "state", "reward_terms")
 """Default optional outputs."""
 
 ALL_EXTRAS = (*EXTRAS, "position", "privileged")
-"""All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments only."""
+"""All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments
+only."""
 
 
 class UavEnv(EnvBase):
-    """B worlds, in each of which N UAVs search for and track a source or cover a region, without any delay.
+    """B worlds, in each of which N UAVs search for and track a source or cover a region, without
+    any delay.
 
-    ``damian.make_env`` adds the delays and slower clocks of a scenario as transforms. The batch size is
-    ``[B]``. Entries of the UAVs lie under ``"agents"``, with batch size ``[B, N]``:
+    ``damian.make_env`` adds the delays and slower clocks of a scenario as transforms. The batch
+    size is ``[B]``. Entries of the UAVs lie under ``"agents"``, with batch size ``[B, N]``:
 
-    - ``action``: discrete [B, N], or continuous [B, N, 2] in [0, 1]: distance and heading (paper, section
-      4.2);
+    - ``action``: discrete [B, N], or continuous [B, N, 2] in [0, 1]: distance and heading
+      (paper, section 4.2);
     - ``action_mask``: legal discrete actions, [B, N, A] (if ``actions.mask``);
     - ``ready``: whether the UAV can choose an action now, [B, N];
-    - ``observation``, ``global_observation``: features of the actor [B, N, F] and of the critic [B, N, G];
-    - ``message``: the latest message of each UAV, [B, N, M] (``server.messages`` names its fields), and
+    - ``observation``, ``global_observation``: features of the actor [B, N, F] and of the critic
+      [B, N, G];
+    - ``message``: the latest message of each UAV, [B, N, M] (``server.messages`` names its fields),
+      and
       ``message_sent``: whether it was sent in this step, [B, N];
     - ``position``: true position, east and north in the coordinates of the settings [m], [B, N, 2];
-    - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, with the belief
-      that each source is in its cell, and the offset to the nearest (over the region's size, [-1, 1]),
-      [B, N, G + 2];
+    - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, with
+      the belief that each source is in its cell, and the offset to the nearest
+      (over the region's size, [-1, 1]), [B, N, G + 2];
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
-    At the root lie ``state`` (the simulator's truth, never for an actor), ``success``, and TorchRL's
-    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over`` [B, 1]. A
-    step also reads the flag ``("agents", "action_valid")`` [B, N], if it exists: a UAV with a false flag does
-    not act; and TorchRL's ``_step`` [B].
+    At the root lie ``state`` (the simulator's truth, never for an actor), ``success``, and
+    TorchRL's ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also
+    ``source_over`` [B, 1]. A step also reads the flag ``("agents", "action_valid")`` [B, N], if it
+    exists: a UAV with a false flag does not act; and TorchRL's ``_step`` [B].
 
     Args:
         scenario: all settings, which are copied; the defaults if not given.
         num_worlds: number of parallel environments, B.
-        seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
+        seed: of the regions and initial conditions drawn at construction, and of the worlds' random
+            streams.
         device: of all tensors.
-        extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and (reference experiments
-            only) ``privileged`` are output; each costs time. Delays need ``message``.
+        extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and
+            (reference experiments only) ``privileged`` are output; each costs time. Delays need
+            ``message``.
         messages_only: a step outputs no observation, reward or end: a ``ServerNode`` computes them.
     """
 
@@ -135,13 +141,15 @@ class UavEnv(EnvBase):
         return self.worlds._asdict()
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """Put the worlds into the state of a ``state_dict``, of as many worlds and the same scenario."""
+        """Put the worlds into the state of a ``state_dict``, of as many worlds and the same
+        scenario."""
         own = self.worlds._asdict()
         loaded = {name: state[name].view_as(own[name]).to(own[name], copy=True) for name in own}
         self.worlds = PackedState(**loaded)
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own random stream, [B] integers; the next reset begins its first episode.
+        """Give every world its own random stream, [B] integers; the next reset begins its first
+        episode.
 
         Until then, a world that has been reset goes on: TorchRL's collectors reset first, and seed
         afterwards.
@@ -149,7 +157,9 @@ class UavEnv(EnvBase):
         seeds = seeds.to(self.device, torch.long)
         zero = torch.zeros_like(seeds)
         if "worlds" not in self.__dict__:
-            self.state = tree_map(lambda table: table.index_select(0, zero), self.simulation.initial)
+            self.state = tree_map(
+                lambda table: table.index_select(0, zero), self.simulation.initial
+            )
         self.state = self.state._replace(seed=seeds, episode=zero)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -165,7 +175,9 @@ class UavEnv(EnvBase):
         if self.messages_only:  # TorchRL expects a reward from every environment
             outputs[keys.REWARD] = self.full_reward_spec[keys.REWARD].zero()
         stepped = tensordict.get(keys.STEPPED, None)
-        if stepped is not None:  # the others keep their state, and repeat what they have output last
+        if (
+            stepped is not None
+        ):  # the others keep their state, and repeat what they have output last
             stepped = stepped.view(-1)
             self.worlds = tree_where(stepped, self.worlds, before)
             for key, new in outputs.items():
@@ -186,15 +198,20 @@ class UavEnv(EnvBase):
     # Pure functions of the state, which can be compiled.
 
     def reset_fn(self, worlds: PackedState, mask: Tensor) -> tuple[PackedState, Outputs]:
-        """Begin new episodes in the worlds of the mask [B]; the outputs are those of the new episodes."""
+        """Begin new episodes in the worlds of the mask [B]; the outputs are those of the new
+        episodes."""
         if torch.compiler.is_compiling() or not devices.data_dependent(mask.device):
             fresh = self.simulation.next_episode(worlds)
-            worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
+            worlds = tree_map(
+                lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds
+            )
         else:
             worlds = self.simulation.reset(worlds, mask)
         condition = worlds.integers[:, INITIAL_CONDITION]
         outputs = {k: table.index_select(0, condition) for k, table in self._reset_outputs.items()}
-        if self.simulation.draws:  # a table cannot hold first readings, which differ in every episode
+        if (
+            self.simulation.draws
+        ):  # a table cannot hold first readings, which differ in every episode
             state = self.simulation.layout.unpack(worlds)
             features = self.server.features(state.sent, state.steps)
             outputs = self._outputs_at_reset(state, features)
@@ -209,15 +226,20 @@ class UavEnv(EnvBase):
         if self.messages_only:
             return self.simulation.layout.pack(state), self._state_outputs(state)
         remembers = self.server.remembers_coverage
-        known = KnownCoverage(self.server.counted(before.sent), before.coverage) if remembers else None
+        known = (
+            KnownCoverage(self.server.counted(before.sent), before.coverage) if remembers else None
+        )
         served = self.server(state.sent, state.steps, state.source_over, known)
         if served.coverage is not None:
             state = state._replace(coverage=served.coverage.share)
         outputs = self._state_outputs(state, served.global_observation)
-        return self.simulation.layout.pack(state), outputs | served.entries("reward_terms" in self.extras)
+        return self.simulation.layout.pack(state), outputs | served.entries(
+            "reward_terms" in self.extras
+        )
 
     def _state_outputs(self, state: State, global_observation: Tensor | None = None) -> Outputs:
-        """The outputs that depend on a state alone; the critic's observation [B, N, G] saves time."""
+        """The outputs that depend on a state alone; the critic's observation [B, N, G] saves
+        time."""
         outputs: Outputs = {keys.READY: self.simulation.vehicles.ready(state)}
         if self.scenario.actions.kind == "discrete" and self.scenario.actions.mask:
             outputs[keys.ACTION_MASK] = self.simulation.action_mask(state)
@@ -229,7 +251,9 @@ class UavEnv(EnvBase):
         values = self.simulation.vehicles.values
         if "delay.loss" in values.choices:
             loss = values.get("delay.loss", state.drawn)
-            outputs[keys.LOSS] = torch.as_tensor(loss).unsqueeze(-1).expand(-1, state.track.shape[1], 1)
+            outputs[keys.LOSS] = (
+                torch.as_tensor(loss).unsqueeze(-1).expand(-1, state.track.shape[1], 1)
+            )
         if "privileged" in self.extras:
             outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, global_observation)
         if self.scenario.episode.end_with_source:
@@ -255,7 +279,8 @@ class UavEnv(EnvBase):
         return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
-        """Outputs of a reset, [Q, ...] by key, from Q first states of episodes and their features."""
+        """Outputs of a reset, [Q, ...] by key, from Q first states of episodes and their
+        features."""
         observation, global_observation = self.server.observations(features)
         outputs = self._state_outputs(initial, global_observation)
         outputs |= {keys.OBSERVATION: observation, keys.GLOBAL_OBSERVATION: global_observation}
@@ -269,7 +294,10 @@ class UavEnv(EnvBase):
 
     def to_tensordict(self, outputs: Outputs) -> TensorDict:
         """Outputs as a TensorDict of batch size [B], with ``"agents"`` of batch size [B, N]."""
-        shape, make = torch.Size((*self.batch_size, self.n_agents)), TensorDict._new_unsafe  # saves 4 %
+        shape, make = (
+            torch.Size((*self.batch_size, self.n_agents)),
+            TensorDict._new_unsafe,
+        )  # saves 4 %
         levels: dict[tuple[str, ...], dict[str, Any]] = {(): {}, (keys.AGENTS,): {}}
         for key, value in outputs.items():
             *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
@@ -292,10 +320,16 @@ class UavEnv(EnvBase):
 
     def _make_specs(self) -> None:
         """Specs with the bounds that the layouts state."""
-        bounds: Bounds = {(keys.AGENTS, name): layout.bounds() for name, layout in self.layout.items()}
+        bounds: Bounds = {
+            (keys.AGENTS, name): layout.bounds() for name, layout in self.layout.items()
+        }
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
-        ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in keys.ENDS}
-        observations: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}
+        ends: Outputs = {
+            key: table for key, table in self._reset_outputs.items() if key in keys.ENDS
+        }
+        observations: Outputs = {
+            key: table for key, table in self._reset_outputs.items() if key not in ends
+        }
         self.observation_spec = self._specs_of(observations, bounds)
         config = self.scenario.actions
         if config.kind == "discrete":
@@ -310,14 +344,25 @@ class UavEnv(EnvBase):
         self.done_spec = self._specs_of(ends)
 
     def _specs_of(self, tables: Outputs, bounds: Bounds | None = None) -> Composite:
-        """Specs of outputs, derived from examples with any number of rows and the bounds of observations."""
-        found = {k: table[:1].expand(*self.batch_size, *table.shape[1:]) for k, table in tables.items()}
-        specs = make_composite_from_td(self.to_tensordict(found).select(*found), unsqueeze_null_shapes=False)
+        """Specs of outputs, derived from examples with any number of rows and the bounds of
+        observations."""
+        found = {
+            k: table[:1].expand(*self.batch_size, *table.shape[1:]) for k, table in tables.items()
+        }
+        specs = make_composite_from_td(
+            self.to_tensordict(found).select(*found), unsqueeze_null_shapes=False
+        )
         for key, value in found.items():
-            like: dict[str, Any] = {"shape": value.shape, "dtype": value.dtype, "device": self.device}
+            like: dict[str, Any] = {
+                "shape": value.shape,
+                "dtype": value.dtype,
+                "device": self.device,
+            }
             limits = (bounds or {}).get(key)
             if value.dtype == torch.bool:
                 specs[key] = Categorical(2, **like)
             elif limits is not None:
-                specs[key] = Bounded(limits[0].expand(value.shape), limits[1].expand(value.shape), **like)
+                specs[key] = Bounded(
+                    limits[0].expand(value.shape), limits[1].expand(value.shape), **like
+                )
         return specs.to(self.device)

@@ -1,4 +1,5 @@
-"""The environments for Gymnasium, which importing registers, and (in ``pettingzoo``) for PettingZoo."""
+"""The environments for Gymnasium, which importing registers, and (in ``pettingzoo``) for
+PettingZoo."""
 
 import gymnasium
 

@@ -1,4 +1,5 @@
-"""Delays of what agents observe, do and earn, whatever their spaces are, and a wrapper for Gymnasium."""
+"""Delays of what agents observe, do and earn, whatever their spaces are, and a wrapper for
+Gymnasium."""
 
 import copy
 import math
@@ -26,26 +27,31 @@ ByName = dict[str, Any]
 
 
 class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
-    """Delays what the agent observes, does and earns, as the transforms do, whatever the spaces are.
+    """Delays what the agent observes, does and earns, as the transforms do, whatever the spaces
+    are.
 
-    The agent holds the observation that was made last among those that have arrived, at first that of the
-    reset; ``info["age"]`` is its age [steps]. The environment executes the action that was chosen last among
-    those that have arrived, until then ``default``. Rewards that arrive in the same step are added up, in the
-    last step of an episode all that are in transit; ``info["received"]`` lists pairs of age [steps] and
-    reward. The end of an episode is not late. With delay 0 nothing changes.
+    The agent holds the observation that was made last among those that have arrived, at first that
+    of the reset; ``info["age"]`` is its age [steps]. The environment executes the action that was
+    chosen last among those that have arrived, until then ``default``. Rewards that arrive in the
+    same step are added up, in the last step of an episode all that are in transit;
+    ``info["received"]`` lists pairs of age [steps] and reward. The end of an episode is not late.
+    With delay 0 nothing changes.
 
     Args:
-        env: any Gymnasium environment, with its time limit; many: ``make_vec(..., wrappers=[...])``.
+        env: any Gymnasium environment, with its time limit; many:
+            ``make_vec(..., wrappers=[...])``.
         observation, action, reward: delay of each: steps (``3``), a time (``"3s"``), a distribution
-            (``Uniform(3, 7)``), or a function, as ``ObservationDelay`` takes. The parts of a ``Dict`` may be
-            messages of their own, with laws by name; those not named are not late.
+            (``Uniform(3, 7)``), or a function, as ``ObservationDelay`` takes. The parts of a
+            ``Dict`` may be messages of their own, with laws by name; those not named are not late.
         loss: probability that an observation never arrives; also by part.
-        history, timeline: numbers of steps K. With either, the observation is a ``Dict`` with ``observation``
-            (or its own entries), ``age`` [1], ``action_history`` [K * A] as ``ActionHistory`` writes it, with
-            discrete actions one-hot, and ``timeline`` [K, D + 1] as ``ObservationTimeline`` does (float32).
-            Parts have ages of their own, and lie in the timeline side by side, each with its mark.
-        default: the action that is executed until the first one arrives, and fills the history at first; if
-            not given, 0 (in all parts). It is not needed if no action is late and there is no history.
+        history, timeline: numbers of steps K. With either, the observation is a ``Dict`` with
+            ``observation`` (or its own entries), ``age`` [1], ``action_history`` [K * A] as
+            ``ActionHistory`` writes it, with discrete actions one-hot, and ``timeline`` [K, D + 1]
+            as ``ObservationTimeline`` does (float32). Parts have ages of their own, and lie in the
+            timeline side by side, each with its mark.
+        default: the action that is executed until the first one arrives, and fills the history at
+            first; if not given, 0 (in all parts). It is not needed if no action is late and there
+            is no history.
         dt: length of a step [s], for delays given as times.
 
     Examples:
@@ -65,7 +71,12 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         default: Any = None,
         dt: float = 1.0,
     ) -> None:
-        told: dict[str, Any] = {"observation": observation, "action": action, "reward": reward, "loss": loss}
+        told: dict[str, Any] = {
+            "observation": observation,
+            "action": action,
+            "reward": reward,
+            "loss": loss,
+        }
         told |= {"history": history, "timeline": timeline, "default": default, "dt": dt}
         gymnasium.utils.RecordConstructorArgs.__init__(self, **told)
         super().__init__(env)
@@ -76,7 +87,9 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         self._delays = Delays(observed, {"": env.action_space}, told)
         self.observation_space = self._delays.space("", space)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
         told, more = self._delays.reset(observation if self._in_parts else {"": observation}, seed)
         return told[""], info | more[""]
@@ -91,10 +104,12 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
 
 
 class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
-    """Delays the B worlds of a Gymnasium vector environment as one batch, each as ``DelayWrapper`` does.
+    """Delays the B worlds of a Gymnasium vector environment as one batch, each as ``DelayWrapper``
+    does.
 
-    Its arguments are those of ``DelayWrapper``; the parts of an observation have one law. Each world draws
-    its own delays. New episodes begin as those of ``env`` do, in the same step or in the next one.
+    Its arguments are those of ``DelayWrapper``; the parts of an observation have one law. Each
+    world draws its own delays. New episodes begin as those of ``env`` do, in the same step or in
+    the next one.
     """
 
     def __init__(
@@ -111,22 +126,38 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         dt: float = 1.0,
     ) -> None:
         super().__init__(env)
-        mode, self._worlds = env.metadata.get("autoreset_mode"), [str(i) for i in range(env.num_envs)]
+        mode, self._worlds = (
+            env.metadata.get("autoreset_mode"),
+            [str(i) for i in range(env.num_envs)],
+        )
         self._at_once = mode == AutoresetMode.SAME_STEP
         known = self._at_once or mode == AutoresetMode.NEXT_STEP
-        checks.require(known, "env", mode, "is no autoreset_mode in which episodes begin by themselves")
-        told: ByName = {"observation": observation, "action": action, "reward": reward, "loss": loss}
+        checks.require(
+            known, "env", mode, "is no autoreset_mode in which episodes begin by themselves"
+        )
+        told: ByName = {
+            "observation": observation,
+            "action": action,
+            "reward": reward,
+            "loss": loss,
+        }
         told |= {"history": history, "timeline": timeline, "dt": dt}
         told["default"] = {} if default is None else dict.fromkeys(self._worlds, default)
         space, acting = env.single_observation_space, env.single_action_space
-        self._delays = Delays(dict.fromkeys(self._worlds, space), dict.fromkeys(self._worlds, acting), told)
+        self._delays = Delays(
+            dict.fromkeys(self._worlds, space), dict.fromkeys(self._worlds, acting), told
+        )
         self.single_observation_space = self._delays.space("0", space)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict]:
         observations, infos = self.env.reset(seed=seed, options=options)
         self._over: list[str] = []
-        told, more = self._delays.reset(self._by_world(self.env.observation_space, observations), seed)
+        told, more = self._delays.reset(
+            self._by_world(self.env.observation_space, observations), seed
+        )
         return self._batch(self.single_observation_space, told), self._with(infos, more)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -170,9 +201,10 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
 class Delays:
     """What some agents observe, do and earn, late: the wrappers pass it through here in each step.
 
-    ``acting`` has the spaces of the actions by agent; ``observed`` those of the observations by agent, or by
-    part if these are messages of their own; ``told`` the arguments of a wrapper, ``default`` by agent. An
-    agent that joins, or joins again, begins anew. Others may write over what they give or get.
+    ``acting`` has the spaces of the actions by agent; ``observed`` those of the observations by
+    agent, or by part if these are messages of their own; ``told`` the arguments of a wrapper,
+    ``default`` by agent. An agent that joins, or joins again, begins anew. Others may write over
+    what they give or get.
     """
 
     def __init__(self, observed: ByName, acting: ByName, told: ByName) -> None:
@@ -184,19 +216,27 @@ class Delays:
         self.actions, self._rewards = (_Link(name, acting, told) for name in ("action", "reward"))
         checks.require(not self._rewards.sampler.loses, "reward", told["reward"], LOSES)
         needed, given = self.actions.sampler.late or self._history, told["default"]
-        default = {a: given[a] if a in given else _zero(acting[a]) if needed else None for a in acting}
+        default = {
+            a: given[a] if a in given else _zero(acting[a]) if needed else None for a in acting
+        }
         self._default = copy.deepcopy(default)
         self.present: set[str] = set()
         """Agents whose episode goes on."""
-        self._messages = {n: _flat("timeline", each) for n, each in observed.items() if self._timeline}
+        self._messages = {
+            n: _flat("timeline", each) for n, each in observed.items() if self._timeline
+        }
         self._chosen = {a: _flat("history", each) for a, each in acting.items() if self._history}
 
     def space(self, agent: str, space: Space[Any]) -> Space[Any]:
         """The space of what an agent is told, whose observations are in ``space``."""
-        added = {name: Box(-np.inf, np.inf, each.shape) for name, each in self._added(agent).items()}
+        added = {
+            name: Box(-np.inf, np.inf, each.shape) for name, each in self._added(agent).items()
+        }
         own = dict(space.spaces) if isinstance(space, Dict) else {"observation": space}
         taken = sorted(added.keys() & own.keys())
-        checks.require(not taken, "observation", listed(taken), "is an entry of it already: rename that")
+        checks.require(
+            not taken, "observation", listed(taken), "is an entry of it already: rename that"
+        )
         return Dict({**own, **added}) if added else space
 
     def reset(self, observations: ByName, seed: int | None) -> tuple[ByName, ByName]:
@@ -221,19 +261,30 @@ class Delays:
         self.actions.send(sent)
         return {**actions, **{agent: self.actions.held(agent) for agent in sent}}
 
-    def step(self, observations: ByName, rewards: ByName, ended: list[str]) -> tuple[ByName, ByName, ByName]:
+    def step(
+        self, observations: ByName, rewards: ByName, ended: list[str]
+    ) -> tuple[ByName, ByName, ByName]:
         """What agents are told, receive, and their infos; the episodes of some have ``ended``."""
         agents, rewards = self._agents(observations), dict(rewards)
         self._observations.send(observations)
         if joining := {*agents} - self.present:
-            self.begin({part: observations[part] for agent in joining for part in self._parts[agent]})
+            self.begin(
+                {part: observations[part] for agent in joining for part in self._parts[agent]}
+            )
         told, infos = self._told(agents)
         if self._rewards.sampler.late:
             self._rewards.send(rewards)
             for agent in rewards:
                 sent = self._rewards.recent(agent).items()
-                due = [(age, r) for age, (r, wait) in sent if wait == 0 or (wait > 0 and agent in ended)]
-                infos[agent]["received"], rewards[agent] = due, float(sum(reward for _, reward in due))
+                due = [
+                    (age, r)
+                    for age, (r, wait) in sent
+                    if wait == 0 or (wait > 0 and agent in ended)
+                ]
+                infos[agent]["received"], rewards[agent] = (
+                    due,
+                    float(sum(reward for _, reward in due)),
+                )
         self.present -= {*ended}
         return told, rewards, infos
 
@@ -250,7 +301,10 @@ class Delays:
             if agent in found:
                 found, age = found[agent], age[agent]
             if added := self._added(agent):
-                found = {**(found if isinstance(found, Mapping) else {"observation": found}), **added}
+                found = {
+                    **(found if isinstance(found, Mapping) else {"observation": found}),
+                    **added,
+                }
             told[agent], infos[agent] = found, {"age": age}
         return told, infos
 
@@ -265,7 +319,11 @@ class Delays:
             chosen = [sent.get(age, first)[0] for age in reversed(range(self._history))]
             numbers = [np.asarray(flatten(space, action), np.float32) for action in chosen]
             added["action_history"] = np.concatenate([(each - low) / width for each in numbers])
-        return added | {"age": np.array([link.age[part] for part in parts], np.float32)} if added else {}
+        return (
+            added | {"age": np.array([link.age[part] for part in parts], np.float32)}
+            if added
+            else {}
+        )
 
     def _slots(self, part: str) -> NDArray[np.float32]:
         """The timeline of what is sent under a name, [K, D + 1]."""
@@ -278,7 +336,8 @@ class Delays:
 
 
 class _Link:
-    """The messages of some senders; a ``DelayLine`` delays their times, so that they may be anything.
+    """The messages of some senders; a ``DelayLine`` delays their times, so that they may be
+    anything.
 
     It keeps copies, and gives copies, because environments and agents may write over their arrays.
     """
@@ -289,7 +348,9 @@ class _Link:
             unknown = [each for each in given if each not in senders] if _by_name(given) else []
             should = f"is named, but the names are: {listed(filter(None, senders))}"
             checks.require(not unknown, key, listed(unknown), should)
-        each = [[law.get(sender, 0) if _by_name(law) else law for law in laws] for sender in senders]
+        each = [
+            [law.get(sender, 0) if _by_name(law) else law for law in laws] for sender in senders
+        ]
         distinct = [law for i, law in enumerate(each) if law not in each[:i]]
         samplers = [sampler_of(law, told["dt"], loss, name) for law, loss in distinct]
         self.sampler: Sampler = samplers[0]
@@ -297,8 +358,12 @@ class _Link:
             index = torch.tensor([distinct.index(law) for law in each])
             self.sampler = LinkSampler(samplers, index, torch.zeros(len(index)))
         self._line = DelayLine(self.sampler, "generation")
-        self._contexts = ContextReader(self.sampler, None, told["dt"], name, before_step=name == "action")
-        self._numbers = torch.tensor([counter_rng.number_of(f"{name} {each}".strip()) for each in senders])
+        self._contexts = ContextReader(
+            self.sampler, None, told["dt"], name, before_step=name == "action"
+        )
+        self._numbers = torch.tensor(
+            [counter_rng.number_of(f"{name} {each}".strip()) for each in senders]
+        )
         self._memory: Memory | None = None
         self._now, self._kept = 0, max(self.sampler.longest, told["timeline"], told["history"])
         self.age = dict.fromkeys(senders, 0)
@@ -350,18 +415,28 @@ class _Link:
 
     def recent(self, sender: str) -> dict[int, tuple[Any, float]]:
         """What a sender sent lately, and the time until it arrives, by age [steps]."""
-        return {self._now - t: (thing, due - self._now) for t, (thing, due) in self._sent[sender].items()}
+        return {
+            self._now - t: (thing, due - self._now)
+            for t, (thing, due) in self._sent[sender].items()
+        }
 
 
-def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], NDArray[np.float32], NDArray[np.float32]]:
-    """A space, and the bound and width of each of its D numbers, 0 and 1 if they have no bounds, [D]."""
+def _flat(
+    key: str, space: Space[Any]
+) -> tuple[Space[Any], NDArray[np.float32], NDArray[np.float32]]:
+    """A space, and the bound and width of each of its D numbers, 0 and 1 if they have no bounds,
+    [D]."""
     flat = flatten_space(space)
     if not isinstance(flat, Box):
         raise InputError(f"{key}: {space} has no vectors of a fixed length")
     with np.errstate(over="ignore"):  # a bound may be the largest number
         low, width = np.float32(flat.low), np.float32(flat.high) - np.float32(flat.low)
     bounded = np.isfinite(width)
-    return space, np.where(bounded, low, np.float32(0)), np.where(bounded & (width > 0), width, np.float32(1))
+    return (
+        space,
+        np.where(bounded, low, np.float32(0)),
+        np.where(bounded & (width > 0), width, np.float32(1)),
+    )
 
 
 def _copied(infos: ByName) -> ByName:

@@ -21,7 +21,8 @@ from damian.envs.delayed_env import DelayedEnv
 
 
 class ExportedPolicy(nn.Module):
-    """A policy as a function of tensors, which are called ``inputs`` and ``outputs``, in this order."""
+    """A policy as a function of tensors, which are called ``inputs`` and ``outputs``, in this
+    order."""
 
     def __init__(self, actor: ProbabilisticActor, spec: TensorSpec) -> None:
         super().__init__()
@@ -30,8 +31,12 @@ class ExportedPolicy(nn.Module):
         self.last.return_log_prob = False
         self.layers, self.in_keys = nn.ModuleList(layers), [*actor.in_keys]
         self.recurrent = keys.HIDDEN in self.in_keys
-        self.discrete = isinstance(spec, Categorical) and hasattr(self.last.distribution_class, "probs")
-        self.parameter_keys: list[NestedKey] = [key for key in self.last.in_keys if key not in self.in_keys]
+        self.discrete = isinstance(spec, Categorical) and hasattr(
+            self.last.distribution_class, "probs"
+        )
+        self.parameter_keys: list[NestedKey] = [
+            key for key in self.last.in_keys if key not in self.in_keys
+        ]
         names = ["probability"] if self.discrete else map(keys.last_part, self.parameter_keys)
         self.inputs = [*map(keys.last_part, self.in_keys)]
         self.outputs = ["action", *names, *["hidden"] * self.recurrent]
@@ -57,7 +62,8 @@ class ExportedPolicy(nn.Module):
 def exported(
     actor: ProbabilisticActor, env: DelayedEnv, any_number: bool, learner: str
 ) -> tuple[ExportedPolicy, torch.export.ExportedProgram, Any]:
-    """The policy, and it as a program of torch and of ONNX, for any number of worlds and, if so, of UAVs.
+    """The policy, and it as a program of torch and of ONNX, for any number of worlds and, if so, of
+    UAVs.
 
     Raises:
         InputError: no program gives the actions of the actor.
@@ -87,5 +93,7 @@ def exported(
         program = torch.export.export(policy, examples, dynamic_shapes=((sizes,) * len(examples),))
         found, should = program.module()(*inputs)[0], "are not those of the program"
         checks.require(found.allclose(live), key, "the actor's actions", should)
-        onnx = torch.onnx.export(program, (), input_names=policy.inputs, output_names=outputs, verbose=False)
+        onnx = torch.onnx.export(
+            program, (), input_names=policy.inputs, output_names=outputs, verbose=False
+        )
     return policy, program, onnx

@@ -1,4 +1,5 @@
-"""What programs around real UAVs, as in ``examples/fleet``, may use of damian, beside its own public names.
+"""What programs around real UAVs, as in ``examples/fleet``, may use of damian, beside its own
+public names.
 
 A test of theirs holds them to it, so that all other names can change freely.
 """

@@ -1,4 +1,5 @@
-"""What the wrappers share: a scenario's environment whose entries are NumPy arrays, and its spaces."""
+"""What the wrappers share: a scenario's environment whose entries are NumPy arrays, and its
+spaces."""
 
 from typing import Any, NamedTuple, cast
 
@@ -25,7 +26,8 @@ Array = NDArray[Any]
 
 
 class Instant(NamedTuple):
-    """What B worlds with N UAVs output after a step or a reset; rewards and flags are 0 after a reset."""
+    """What B worlds with N UAVs output after a step or a reset; rewards and flags are 0 after a
+    reset."""
 
     observation: Array
     """What the actors observe, float32, [B, N, F]."""
@@ -36,14 +38,17 @@ class Instant(NamedTuple):
     truncated: Array
     """Whether it has reached its time limit, [B] bool."""
     infos: dict[str, Array]
-    """``ready`` [B, N] and ``is_success`` [B] bool, and if masked ``action_mask`` [B, N, A] int8."""
+    """``ready`` [B, N] and ``is_success`` [B] bool, and if masked ``action_mask`` [B, N, A]
+    int8."""
 
 
 class Flight:
-    """A scenario's environment, with its delays, stepped with NumPy arrays; ``seed`` as in ``UavGymEnv``."""
+    """A scenario's environment, with its delays, stepped with NumPy arrays; ``seed`` as in
+    ``UavGymEnv``."""
 
     _now: TensorDictBase
-    """What the environment has output last, with which its next step begins; there after a reset."""
+    """What the environment has output last, with which its next step begins; there after a
+    reset."""
 
     def __init__(
         self,
@@ -65,11 +70,16 @@ class Flight:
     def action_space(self) -> Space[Any]:
         """What an agent chooses: one of A actions, or a distance and a heading in [0, 1]."""
         spec = self.env.full_action_spec[keys.ACTION]
-        return Discrete(spec.space.n) if isinstance(spec, Categorical) else Box(0.0, 1.0, (2,), np.float32)
+        return (
+            Discrete(spec.space.n)
+            if isinstance(spec, Categorical)
+            else Box(0.0, 1.0, (2,), np.float32)
+        )
 
     @torch.no_grad()
     def reset(self, seed: int | None) -> Instant:
-        """Begin a new episode in every world; with a seed, world number i draws from ``seed + i``."""
+        """Begin a new episode in every world; with a seed, world number i draws from ``seed +
+        i``."""
         if seed is not None:
             self.env.seed_worlds(seed + torch.arange(self.env.batch_size[0]))
         self._now = self.env.reset()
@@ -79,7 +89,8 @@ class Flight:
 
     @torch.no_grad()
     def step(self, action: Array, *, reset: bool = False) -> tuple[Instant, Instant]:
-        """Take a step, and if ``reset`` begin new episodes; its outputs, and those that come next."""
+        """Take a step, and if ``reset`` begin new episodes; its outputs, and those that come
+        next."""
         self._now[keys.ACTION] = torch.as_tensor(action)
         if reset:
             stepped, self._now = self.env.step_and_maybe_reset(self._now)
@@ -96,7 +107,8 @@ class Flight:
         return self.film.picture() if self.film else None
 
     def state(self) -> Array:
-        """What a central critic observes of the first world, from the messages at the server, [N G]."""
+        """What a central critic observes of the first world, from the messages at the server,
+        [N G]."""
         return cast(Tensor, self._now[keys.GLOBAL_OBSERVATION])[0].flatten().numpy().copy()
 
     def state_space(self) -> Box:
@@ -121,8 +133,14 @@ def _instant(outputs: TensorDictBase) -> Instant:
     if keys.ACTION_MASK in outputs.keys(True, True):
         infos["action_mask"] = array(keys.ACTION_MASK).astype(np.int8)
     reward = outputs.get(keys.REWARD, None)
-    rewards = np.zeros(observation.shape[:2], np.float32) if reward is None else reward[..., 0].numpy().copy()
-    return Instant(observation, rewards, array(keys.TERMINATED)[:, 0], array(keys.TRUNCATED)[:, 0], infos)
+    rewards = (
+        np.zeros(observation.shape[:2], np.float32)
+        if reward is None
+        else reward[..., 0].numpy().copy()
+    )
+    return Instant(
+        observation, rewards, array(keys.TERMINATED)[:, 0], array(keys.TRUNCATED)[:, 0], infos
+    )
 
 
 def actions_in(space: Space[Any], key: str, given: Any) -> Array:
@@ -134,6 +152,9 @@ def actions_in(space: Space[Any], key: str, given: Any) -> Array:
 
 
 def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:
-    """The infos of one UAV, copied; flags are Python's: Gymnasium's vector environments know no others."""
-    found = {n: each[world] if n == "is_success" else each[world, agent] for n, each in infos.items()}
+    """The infos of one UAV, copied; flags are Python's: Gymnasium's vector environments know no
+    others."""
+    found = {
+        n: each[world] if n == "is_success" else each[world, agent] for n, each in infos.items()
+    }
     return {name: each.copy() if each.ndim else each.item() for name, each in found.items()}

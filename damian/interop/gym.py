@@ -15,13 +15,15 @@ from damian.interop.flight import METADATA, Array, Flight, actions_in, row
 class UavGymEnv(gymnasium.Env[Array, Any]):
     """One UAV of a scenario, with its delays, as a Gymnasium environment.
 
-    Observations are float32 [F], rewards those that the server perceives; ``info`` has ``ready`` (may the UAV
-    choose an action now; if not, its action changes nothing), ``is_success``, and, if actions are masked,
-    ``action_mask`` [A] int8, as ``action_space.sample`` takes it. ``action_masks()`` is for sb3-contrib.
+    Observations are float32 [F], rewards those that the server perceives; ``info`` has ``ready``
+    (may the UAV choose an action now; if not, its action changes nothing), ``is_success``, and, if
+    actions are masked, ``action_mask`` [A] int8, as ``action_space.sample`` takes it.
+    ``action_masks()`` is for sb3-contrib.
 
     Args:
         scenario: all settings, with ``agents=1``.
-        seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides the rest.
+        seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides
+            the rest.
         render_mode: ``rgb_array``, or None.
         view: of the pictures: ``2d``, from above, or ``3d``.
     """
@@ -29,7 +31,11 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
     metadata = METADATA
 
     def __init__(
-        self, scenario: ScenarioConfig, seed: int = 0, render_mode: str | None = None, view: str = "2d"
+        self,
+        scenario: ScenarioConfig,
+        seed: int = 0,
+        render_mode: str | None = None,
+        view: str = "2d",
     ) -> None:
         one_uav(scenario)
         self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
@@ -63,9 +69,9 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
     """B = ``num_envs`` worlds of one UAV as a Gymnasium vector environment.
 
-    A world whose episode ends begins a new one in the same step (``AutoresetMode.SAME_STEP``); ``infos`` then
-    has its last observation as ``final_obs``, and its last infos as ``final_info``. World number i equals a
-    ``UavGymEnv`` that is reset with ``seed + i``.
+    A world whose episode ends begins a new one in the same step (``AutoresetMode.SAME_STEP``);
+    ``infos`` then has its last observation as ``final_obs``, and its last infos as ``final_info``.
+    World number i equals a ``UavGymEnv`` that is reset with ``seed + i``.
     """
 
     def __init__(self, scenario: ScenarioConfig, num_envs: int = 1, seed: int = 0) -> None:
@@ -81,7 +87,9 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        checks.require(not isinstance(seed, list), "seed", seed, "is a list: world i draws from seed + i")
+        checks.require(
+            not isinstance(seed, list), "seed", seed, "is a list: world i draws from seed + i"
+        )
         instant = self.flight.reset(seed)  # type: ignore[arg-type]
         return instant.observation[:, 0], _infos(instant.infos)
 
@@ -99,7 +107,8 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
 
 
 def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, Any]:
-    """Infos of the worlds [B, ...] by name, each with a mask of the worlds [B] that have it (all)."""
+    """Infos of the worlds [B, ...] by name, each with a mask of the worlds [B] that have it
+    (all)."""
     found = {name: each if name == "is_success" else each[:, 0] for name, each in infos.items()}
     mask = np.ones(len(infos["ready"]), bool) if worlds is None else worlds
     return found | {f"_{name}": mask.copy() for name in found}
@@ -107,5 +116,8 @@ def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, An
 
 def one_uav(scenario: ScenarioConfig) -> None:
     """Refuse a scenario of several UAVs, because a Gymnasium environment has one agent."""
-    should = "is not 1: a Gymnasium environment has one agent; take damian.interop.pettingzoo.UavParallelEnv"
+    should = (
+        "is not 1: a Gymnasium environment has one agent; take "
+        "damian.interop.pettingzoo.UavParallelEnv"
+    )
     checks.require(scenario.agents == 1, "agents", scenario.agents, should)

@@ -20,12 +20,17 @@ except ImportError as error:
 class UavParallelEnv(ParallelEnv[str, Array, Any]):
     """The UAVs of a scenario, with its delays, as a PettingZoo ``ParallelEnv``, from ``uav_0`` on.
 
-    All episodes end together. Observations are float32 [F]; infos and arguments are those of ``UavGymEnv``.
-    ``state()``: what the server observes of the messages that it holds, for a central critic.
+    All episodes end together. Observations are float32 [F]; infos and arguments are those of
+    ``UavGymEnv``. ``state()``: what the server observes of the messages that it holds, for a
+    central critic.
     """
 
     def __init__(
-        self, scenario: ScenarioConfig, seed: int = 0, render_mode: str | None = None, view: str = "2d"
+        self,
+        scenario: ScenarioConfig,
+        seed: int = 0,
+        render_mode: str | None = None,
+        view: str = "2d",
     ) -> None:
         self.metadata = {**METADATA, "name": "damian_v0", "is_parallelizable": True}
         self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
@@ -43,7 +48,9 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
     def action_space(self, agent: str) -> Space[Any]:
         return self.action_spaces[agent]
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[ByName, ByName]:
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ByName, ByName]:
         instant = self.flight.reset(seed)
         self.agents = [*self.possible_agents]
         return self._by_agent(instant.observation[0]), self._infos(instant.infos)
@@ -52,7 +59,8 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
         if not self.agents:
             return {}, {}, {}, {}, {}
         chosen = [
-            actions_in(self.action_spaces[name], f"action of {name}", actions[name]) for name in self.agents
+            actions_in(self.action_spaces[name], f"action of {name}", actions[name])
+            for name in self.agents
         ]
         instant, _ = self.flight.step(np.stack(chosen)[None])
         n_agents, infos = len(self.agents), self._infos(instant.infos)
@@ -82,16 +90,18 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
 
 
 class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
-    """Delays what the agents of any ``ParallelEnv`` observe, do and earn, each as ``DelayWrapper`` does.
+    """Delays what the agents of any ``ParallelEnv`` observe, do and earn, each as ``DelayWrapper``
+    does.
 
-    An agent may leave the episode, with all its rewards, or join it (again), with an observation that is not
-    late and nothing of its former life.
+    An agent may leave the episode, with all its rewards, or join it (again), with an observation
+    that is not late and nothing of its former life.
     ``state()`` is not late.
 
     Args:
         env, history, timeline, dt: as in ``DelayWrapper``.
-        observation, action, reward, loss: a law for all agents, or by agent; those not named are not late. A
-            function knows the agent as ``message.sender``, its place among ``possible_agents``.
+        observation, action, reward, loss: a law for all agents, or by agent; those not named are
+            not late. A function knows the agent as ``message.sender``, its place among
+            ``possible_agents``.
         default: the action that is executed until the first one arrives, by agent; if not given, 0.
     """
 
@@ -109,23 +119,44 @@ class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
         dt: float = 1.0,
     ) -> None:
         super().__init__(env)
-        told: ByName = {"observation": observation, "action": action, "reward": reward, "loss": loss}
+        told: ByName = {
+            "observation": observation,
+            "action": action,
+            "reward": reward,
+            "loss": loss,
+        }
         told |= {"history": history, "timeline": timeline, "default": default or {}, "dt": dt}
         observed = {agent: env.observation_space(agent) for agent in env.possible_agents}
-        self._delays = Delays(observed, {agent: env.action_space(agent) for agent in observed}, told)
-        self._spaces = {agent: self._delays.space(agent, space) for agent, space in observed.items()}
+        self._delays = Delays(
+            observed, {agent: env.action_space(agent) for agent in observed}, told
+        )
+        self._spaces = {
+            agent: self._delays.space(agent, space) for agent, space in observed.items()
+        }
 
     def observation_space(self, agent: str) -> Space[Any]:
         return self._spaces[agent]
 
-    def reset(self, seed: int | None = None, options: ByName | None = None) -> tuple[ByName, ByName]:
+    def reset(
+        self, seed: int | None = None, options: ByName | None = None
+    ) -> tuple[ByName, ByName]:
         observations, infos = self.env.reset(seed=seed, options=options)
         told, more = self._delays.reset(observations, seed)
         return told, {agent: infos.get(agent, {}) | info for agent, info in more.items()}
 
     def step(self, actions: ByName) -> tuple[ByName, ByName, ByName, ByName, ByName]:
-        observations, rewards, terminated, truncated, infos = self.env.step(self._delays.act(actions))
+        observations, rewards, terminated, truncated, infos = self.env.step(
+            self._delays.act(actions)
+        )
         ended = [agent for agent in rewards if terminated[agent] or truncated[agent]]
-        ended += self._delays.present.difference(self.env.agents, ended)  # some leave without a flag
+        ended += self._delays.present.difference(
+            self.env.agents, ended
+        )  # some leave without a flag
         told, rewards, more = self._delays.step(observations, rewards, ended)
-        return told, rewards, terminated, truncated, {a: infos.get(a, {}) | info for a, info in more.items()}
+        return (
+            told,
+            rewards,
+            terminated,
+            truncated,
+            {a: infos.get(a, {}) | info for a, info in more.items()},
+        )

@@ -1,1 +1,2 @@
-"""Reinforcement learning: networks, losses, and learners that turn collected steps into better policies."""
+"""Reinforcement learning: networks, losses, and learners that turn collected steps into better
+policies."""

@@ -19,21 +19,24 @@ class Learner(Protocol):
     """A learner updates its actor from batches as they are collected."""
 
     actor: ProbabilisticActor
-    """The policy that the collector uses; ``LearnerConfig.make_actor`` makes an equal one for evaluations."""
+    """The policy that the collector uses; ``LearnerConfig.make_actor`` makes an equal one for
+    evaluations."""
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Update the networks from consecutive steps [B, T]; returns numbers to log, by name.
 
-        The batch has the environment's entries, the extras in ``reads``, and what the actor has written.
+        The batch has the environment's entries, the extras in ``reads``, and what the actor has
+        written.
         """
         ...
 
     def components(self) -> dict[str, Any]:
-        """What a checkpoint stores, by name, ``actor`` among them: everything that changes in training.
+        """What a checkpoint stores, by name, ``actor`` among them: everything that changes in
+        training.
 
-        Each has ``state_dict`` (of tensors, numbers, strings, lists and dicts) and ``load_state_dict``. The
-        replay buffer of ``LearnerConfig.make`` is stored without them; what it holds must not be changed in
-        place.
+        Each has ``state_dict`` (of tensors, numbers, strings, lists and dicts) and
+        ``load_state_dict``. The replay buffer of ``LearnerConfig.make`` is stored without them;
+        what it holds must not be changed in place.
         """
         ...
 
@@ -52,7 +55,9 @@ def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> s
             return f"{name} is {number}"
     for name, component in components.items():
         weights = component.parameters() if isinstance(component, nn.Module) else []
-        largest = nn.utils.get_total_norm([each for each in weights if each.numel()], math.inf).item()
+        largest = nn.utils.get_total_norm(
+            [each for each in weights if each.numel()], math.inf
+        ).item()
         if not largest <= LARGEST_WEIGHT:  # true also for nan
             return f"a weight of {name} is {largest:.3g}, not at most {LARGEST_WEIGHT:g}"
     return None
@@ -62,9 +67,9 @@ def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> s
 def undelayed_talk(actor: ProbabilisticActor, env: EnvBase) -> bool:
     """Whether what an actor computes for one UAV changes with the row of another one.
 
-    That is, the parameters of the actions' distribution, or the next hidden state. The actor is tried in
-    evaluation mode with random weights, because a last layer of zeros hides what it reads, on random entries
-    of the environment.
+    That is, the parameters of the actions' distribution, or the next hidden state. The actor is
+    tried in evaluation mode with random weights, because a last layer of zeros hides what it reads,
+    on random entries of the environment.
     """
     device = torch.device(env.device or "cpu")
     with torch.random.fork_rng([device] if device.type == "cuda" else []):

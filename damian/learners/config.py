@@ -25,7 +25,9 @@ def _is_learner(found: Any) -> bool:
 
 
 LEARNERS = Registry[type["LearnerConfig"]](
-    "learner", _is_learner, "is not a @dataclass derived from damian.LearnerConfig with a method make"
+    "learner",
+    _is_learner,
+    "is not a @dataclass derived from damian.LearnerConfig with a method make",
 )
 """Settings of learners, by name; the user's own as ``package.module:Name``."""
 
@@ -44,11 +46,14 @@ class LearningSetup(NamedTuple):
     longest_delay: int = 0
     """Longest delay of a message, or with back-updating of a reward, if that is longer [steps]."""
     backupdate: bool = False
-    """Whether the replay buffer corrects stored steps as late messages arrive (paper, section 3.4)."""
+    """Whether the replay buffer corrects stored steps as late messages arrive
+    (paper, section 3.4)."""
     settle: bool = False
-    """Whether to learn from a step only when neither its messages nor its reward can be in transit."""
+    """Whether to learn from a step only when neither its messages nor its reward can be in
+    transit."""
     recompute_actor: bool = False
-    """Whether late messages also replace the actor's observations (the original authors' variant)."""
+    """Whether late messages also replace the actor's observations
+    (the original authors' variant)."""
     critic_key: "NestedKey" = keys.GLOBAL_OBSERVATION
     """Key of the critic's observation."""
     compile: bool = False
@@ -65,7 +70,8 @@ class LearningSetup(NamedTuple):
 
     @property
     def least_buffer(self) -> int:
-        """Environment steps that back-updating needs in the buffer: a period and twice the longest delay."""
+        """Environment steps that back-updating needs in the buffer: a period and twice the longest
+        delay."""
         return (self.longest_period + 2 * self.longest_delay) * self.worlds
 
 
@@ -73,13 +79,15 @@ class LearningSetup(NamedTuple):
 class LearnerConfig(Settings):
     """Settings of a learner, which make it; those that all learners share.
 
-    A learner of your own has a dataclass derived from this class, with fields for its own settings, that
-    implements ``make``. Whatever changes in the learner must be among its ``components``, or a resumed run
-    loses it. The settings ``learner=package.module:Name learner.lr=1e-3`` choose it."""
+    A learner of your own has a dataclass derived from this class, with fields for its own settings,
+    that implements ``make``. Whatever changes in the learner must be among its ``components``, or a
+    resumed run loses it. The settings ``learner=package.module:Name learner.lr=1e-3`` choose it."""
 
     section: ClassVar[str] = "learner"
 
-    name: str = setting("", "Name of the learner, or package.module:Name; the group ``learner`` sets it.")
+    name: str = setting(
+        "", "Name of the learner, or package.module:Name; the group ``learner`` sets it."
+    )
     lr: float = setting(0.0003, "Learning rate of Adam.", above=0, high=1)
     gamma: float = setting(0.95, "Discount factor per step.", low=0, high=1)
     steps: int = setting(
@@ -90,14 +98,16 @@ class LearnerConfig(Settings):
     )
 
     reads: ClassVar[tuple[str, ...]] = ()
-    """Optional outputs of the environment that the learner needs in its batches: ``message``, ``state``,
-    ``reward_terms`` or ``privileged`` (``damian.make_env``); ``timeline``: what ``delay.messages`` adds; and
-    ``hindsight``: with back-updating, stored steps then also hold the newest message that has arrived since
-    (``keys.HINDSIGHT``)."""
+    """Optional outputs of the environment that the learner needs in its batches: ``message``,
+    ``state``, ``reward_terms`` or ``privileged`` (``damian.make_env``); ``timeline``: what
+    ``delay.messages`` adds; and
+    ``hindsight``: with back-updating, stored steps then also hold the newest message that has
+    arrived since (``keys.HINDSIGHT``)."""
     actor_follows_critic: ClassVar[bool] = False
     """Whether the sizes of the actor's layers also follow from what the critic observes."""
     learner: ClassVar[str] = ""
-    """Path of the class that ``make`` builds, from environment, settings, setup and replay buffer."""
+    """Path of the class that ``make`` builds, from environment, settings, setup and replay
+    buffer."""
 
     @classmethod
     def class_for(cls, values: Mapping[str, Any]) -> type[Settings]:
@@ -111,7 +121,8 @@ class LearnerConfig(Settings):
         """
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
-        """Environment steps, over all worlds, that the replay buffer must hold; None if none is needed."""
+        """Environment steps, over all worlds, that the replay buffer must hold; None if none is
+        needed."""
         return None
 
     def make(self, env: "EnvBase", setup: LearningSetup, buffer: "ReplayBuffer | None") -> Any:
@@ -120,8 +131,9 @@ class LearnerConfig(Settings):
         Args:
             env: environment of the training, with batch size [B].
             setup: properties of the run.
-            buffer: replay buffer of ``buffer_size`` steps, on a ``TimeStorage``, or with back-updating on a
-                ``BackupdateStorage``, which corrects what is stored; None if ``buffer_size`` is None.
+            buffer: replay buffer of ``buffer_size`` steps, on a ``TimeStorage``, or with
+                back-updating on a ``BackupdateStorage``, which corrects what is stored; None if
+                ``buffer_size`` is None.
         """
         return resolved(self.learner)(env, copy.deepcopy(self), copy.deepcopy(setup), buffer)
 
@@ -140,21 +152,33 @@ class MappoConfig(LearnerConfig):
     clip_epsilon: float = setting(0.2, "Clipping of the importance ratio.", low=0, high=1)
     entropy_coeff: float = setting(0.01, "Weight of the entropy bonus.", low=0)
     critic_coeff: float = constant(0.5, "Weight of the critic's loss, which Adam cancels.", low=0)
-    max_grad_norm: float = setting(0.5, "Largest norm of the gradient, which is scaled down.", above=0)
+    max_grad_norm: float = setting(
+        0.5, "Largest norm of the gradient, which is scaled down.", above=0
+    )
     epochs: int = setting(4, "Passes over the batch per update.", low=1, high=checks.STEPS)
     minibatches: int = setting(4, "Minibatches per pass.", low=1, high=checks.STEPS)
-    normalize_advantage: bool = setting(True, "Scale the advantages of a batch to mean 0 and deviation 1.")
+    normalize_advantage: bool = setting(
+        True, "Scale the advantages of a batch to mean 0 and deviation 1."
+    )
     normalize_value: bool = setting(
-        False, "The critic learns values of mean 0 and deviation 1, whatever the scale of the rewards."
+        False,
+        "The critic learns values of mean 0 and deviation 1, whatever the scale of the rewards.",
     )
 
     learner: ClassVar[str] = "damian.learners.mappo:Mappo"
 
     def check(self, setup: LearningSetup) -> None:
-        recurrent, shortest, longest = setup.model.recurrent, setup.shortest_period, setup.longest_delay
+        recurrent, shortest, longest = (
+            setup.model.recurrent,
+            setup.shortest_period,
+            setup.longest_delay,
+        )
         most_minibatches = setup.worlds if recurrent else setup.worlds * shortest
         checks.in_range("learner.minibatches", self.minibatches, 1, most_minibatches)
-        should = f"needs more than {longest} steps (longest delay) per update (learner.steps), not {shortest}"
+        should = (
+            f"needs more than {longest} steps (longest delay) per update (learner.steps), not "
+            f"{shortest}"
+        )
         checks.require(not setup.settle or longest < shortest, "settle", True, should)
         should = "does not go with model.rnn: hidden states are not recomputed"
         checks.require(not (recurrent and setup.recompute_actor), "corrected", "actor", should)
@@ -166,16 +190,24 @@ class MappoConfig(LearnerConfig):
 @LEARNERS.register("sac")
 @dataclass
 class SacConfig(LearnerConfig):
-    """Soft actor-critic (Haarnoja et al. 2018; discrete: Christodoulou 2019) with one shared policy."""
+    """Soft actor-critic (Haarnoja et al. 2018; discrete: Christodoulou 2019) with one shared
+    policy."""
 
     name: str = "sac"
     lr: float = 0.001
     steps: int = 4
-    alpha_lr: float = setting(0.01, "Learning rate of the temperature's logarithm.", above=0, high=1)
+    alpha_lr: float = setting(
+        0.01, "Learning rate of the temperature's logarithm.", above=0, high=1
+    )
     alpha_init: float = setting(0.01, "Initial temperature (weight of the entropy).", above=0)
-    tau: float = setting(0.01, "Share by which the target networks follow in each update.", above=0, high=1)
+    tau: float = setting(
+        0.01, "Share by which the target networks follow in each update.", above=0, high=1
+    )
     target_entropy: float = setting(
-        0.5, "Target entropy of discrete actions, as a share of that of a uniform choice.", low=0, high=1
+        0.5,
+        "Target entropy of discrete actions, as a share of that of a uniform choice.",
+        low=0,
+        high=1,
     )
     updates: int = setting(4, "Updates per round.", low=1, high=checks.STEPS)
     batch_size: int = setting(512, "Decisions per update.", low=1, high=checks.STEPS)
@@ -199,8 +231,8 @@ class SacConfig(LearnerConfig):
     def critic_keys(self, setup: LearningSetup) -> "list[NestedKey]":
         """Entries that the critics read, besides the action.
 
-        Only the actor's observation holds the UAV's past actions: if a critic of late observations did not
-        read them, the actor could not learn to use them.
+        Only the actor's observation holds the UAV's past actions: if a critic of late observations
+        did not read them, the actor could not learn to use them.
         """
         return list(dict.fromkeys((setup.critic_key, keys.OBSERVATION)))
 
@@ -214,13 +246,14 @@ class BpqlConfig(SacConfig):
     """BPQL (Kim et al. 2023): soft actor-critic with critics that are free of delay.
 
     The actor reads the newest observation that has arrived and its own actions since
-    (``aware=backupdate+history``). The critics read nothing but the state in which the action was chosen,
-    which the replay buffer knows by the time of learning: Q(s, a), with a from the policy at what the actor
-    observed. Those of ``learner=sac`` also read what the actor observed. A step is learnt from when all of
-    its messages must have arrived, as with ``settle=true``.
+    (``aware=backupdate+history``). The critics read nothing but the state in which the action was
+    chosen,
+    which the replay buffer knows by the time of learning: Q(s, a), with a from the policy at what
+    the actor observed. Those of ``learner=sac`` also read what the actor observed. A step is learnt
+    from when all of its messages must have arrived, as with ``settle=true``.
 
-    The state is the entry ``LearningSetup.critic_key``. It has no actions that wait for their execution: with
-    ``delay.act`` the critics do not know these."""
+    The state is the entry ``LearningSetup.critic_key``. It has no actions that wait for their
+    execution: with ``delay.act`` the critics do not know these."""
 
     name: str = "bpql"
 
@@ -229,8 +262,15 @@ class BpqlConfig(SacConfig):
 
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
-        true = setup.longest_delay == 0 or setup.backupdate or setup.critic_key != keys.GLOBAL_OBSERVATION
-        should = "needs back-updating, which gives its critics what has arrived: aware=backupdate+history"
+        true = (
+            setup.longest_delay == 0
+            or setup.backupdate
+            or setup.critic_key != keys.GLOBAL_OBSERVATION
+        )
+        should = (
+            "needs back-updating, which gives its critics what has arrived: "
+            "aware=backupdate+history"
+        )
         checks.require(true, "learner", self.name, should)
 
     def make(self, env: "EnvBase", setup: LearningSetup, buffer: "ReplayBuffer | None") -> Any:

@@ -38,12 +38,17 @@ LOSS_KEYS: list[NestedKey] = [
 
 
 class Mappo:
-    """Multi-agent PPO, which with a replay ``buffer`` on a ``BackupdateStorage`` reads corrected batches."""
+    """Multi-agent PPO, which with a replay ``buffer`` on a ``BackupdateStorage`` reads corrected
+    batches."""
 
     loss_keys: Sequence[NestedKey] = LOSS_KEYS
 
     def __init__(
-        self, env: EnvBase, config: MappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None = None
+        self,
+        env: EnvBase,
+        config: MappoConfig,
+        setup: LearningSetup,
+        buffer: ReplayBuffer | None = None,
     ) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = config.make_actor(env, setup.model)
@@ -62,7 +67,8 @@ class Mappo:
         return {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make one update from a batch [B, T]; also logs ``explained_variance`` and ``backupdated``."""
+        """Make one update from a batch [B, T]; also logs ``explained_variance`` and
+        ``backupdated``."""
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
         numbers = self.optimize(corrected)
@@ -73,11 +79,12 @@ class Mappo:
 
     @torch.no_grad()
     def backupdated_batch(self, batch: TensorDictBase) -> TensorDictBase:
-        """Store a batch [B, T], and return it as corrected by all messages that have arrived by now, [B, T].
+        """Store a batch [B, T], and return it as corrected by all messages that have arrived by
+        now, [B, T].
 
-        With ``settle`` the returned steps end ``settle_steps`` before the latest step. Steps between the end
-        of an episode and the time at which the server learnt of it stay: until then a UAV must not undo the
-        success.
+        With ``settle`` the returned steps end ``settle_steps`` before the latest step. Steps
+        between the end of an episode and the time at which the server learnt of it stay: until then
+        a UAV must not undo the success.
         """
         if self.buffer is None:
             return batch
@@ -90,7 +97,8 @@ class Mappo:
         return batch
 
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make ``epochs`` passes over a batch [B, T]; means of ``LOSSES``, ``NUMBERS``, ``gradient_norm``."""
+        """Make ``epochs`` passes over a batch [B, T]; means of ``LOSSES``, ``NUMBERS``,
+        ``gradient_norm``."""
         terms = []
         for entries in self._minibatches(batch):
             losses, numbers = self.losses(entries)
@@ -108,12 +116,16 @@ class Mappo:
         recurrent = self.setup.model.recurrent
         read = [*self.loss_keys, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
         found = {key: batch.get(key, None) for key in read}
-        samples = {k: v if recurrent else v.flatten(0, 1) for k, v in found.items() if v is not None}
+        samples = {
+            k: v if recurrent else v.flatten(0, 1) for k, v in found.items() if v is not None
+        }
         n_samples, device = len(samples[keys.READY]), samples[keys.READY].device
         n_minibatches = min(self.config.minibatches, n_samples)
         for _ in range(self.config.epochs):
             order = torch.randperm(n_samples, device=device)
-            parts = {k: v.index_select(0, order).tensor_split(n_minibatches) for k, v in samples.items()}
+            parts = {
+                k: v.index_select(0, order).tensor_split(n_minibatches) for k, v in samples.items()
+            }
             for i in range(n_minibatches):
                 yield {key: part[i] for key, part in parts.items()}
 
@@ -122,17 +134,23 @@ class Mappo:
 
 
 def mappo_losses(
-    entries: dict[NestedKey, Tensor], actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig
+    entries: dict[NestedKey, Tensor],
+    actor: ProbabilisticActor,
+    critic: TensorDictModule,
+    config: MappoConfig,
 ) -> tuple[Tensor, Tensor]:
-    """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
+    """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names,
+    [3].
 
-    The terms of the loss are the clipped objective of PPO and the entropy (Schulman et al. 2017), over
-    decisions, and the error of the critic, over all steps. The numbers are means over decisions: an estimate
-    of the Kullback-Leibler divergence from the policy that collected the steps (ratio - 1 - log ratio), the
-    share of importance ratios beyond the clipping, and the entropy [nats].
+    The terms of the loss are the clipped objective of PPO and the entropy (Schulman et al. 2017),
+    over decisions, and the error of the critic, over all steps. The numbers are means over
+    decisions: an estimate of the Kullback-Leibler divergence from the policy that collected the
+    steps (ratio - 1 - log ratio), the share of importance ratios beyond the clipping, and the
+    entropy [nats].
 
-    The ``entries`` by key, what the networks read and ``LOSS_KEYS``, are not a TensorDict, so that a compiled
-    function works with any number of steps; for a recurrent actor they are sequences [B, T].
+    The ``entries`` by key, what the networks read and ``LOSS_KEYS``, are not a TensorDict, so that
+    a compiled function works with any number of steps; for a recurrent actor they are sequences
+    [B, T].
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
@@ -142,7 +160,9 @@ def mappo_losses(
     objective = torch.minimum(ratio * advantage, clipped * advantage)
     n_decisions, scale = ready.sum().clamp(min=1), value_scale(critic)
     mean_entropy = (entropy * ready).sum() / n_decisions
-    error = smooth_l1_loss(critic(steps)[keys.STATE_VALUE] / scale, entries[keys.VALUE_TARGET] / scale)
+    error = smooth_l1_loss(
+        critic(steps)[keys.STATE_VALUE] / scale, entries[keys.VALUE_TARGET] / scale
+    )
     losses = [
         -(objective * ready).sum() / n_decisions,
         -config.entropy_coeff * mean_entropy,
@@ -156,7 +176,8 @@ def mappo_losses(
 
 
 def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
-    """Log-ratios of importance, and entropies (estimated by one draw if continuous), [*, N], on steps [*]."""
+    """Log-ratios of importance, and entropies (estimated by one draw if continuous), [*, N], on
+    steps [*]."""
     with set_recurrent_mode(True):
         policy = actor.get_dist(steps)
     log_ratio = policy.log_prob(steps[keys.ACTION]) - steps[keys.ACTION_LOG_PROB]
@@ -169,10 +190,10 @@ def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tens
 def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: MappoConfig) -> None:
     """Write values, advantages and value targets into a batch [B, T], in place.
 
-    The return of a decision sums the rewards until the UAV's next decision, k steps later, whose value is
-    discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999). At the steps
-    between two decisions lambda of the generalised advantage estimate (Schulman et al. 2016) is 1, and the
-    advantage is 0.
+    The return of a decision sums the rewards until the UAV's next decision, k steps later, whose
+    value is discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999).
+    At the steps between two decisions lambda of the generalised advantage estimate
+    (Schulman et al. 2016) is 1, and the advantage is 0.
     """
     next_step = cast(TensorDictBase, batch["next"])
     value, next_value = state_values(batch, critic)
@@ -195,19 +216,22 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
 
 
 def value_scale(critic: TensorDictModule) -> Tensor | float:
-    """Running standard deviation of a critic's value targets, [1]; 1 if its values are not normalised."""
+    """Running standard deviation of a critic's value targets, [1]; 1 if its values are not
+    normalised."""
     return critic.module.norm.scale().float() if isinstance(critic.module, NormalizedValue) else 1.0
 
 
 def explained_variance(batch: TensorDictBase) -> Tensor:
-    """Share of the variance of a batch's value targets that its values explain, []; nan if there is none."""
+    """Share of the variance of a batch's value targets that its values explain, []; nan if there is
+    none."""
     target = batch[keys.VALUE_TARGET].double()
     variance, left = target.var(correction=0), (target - batch[keys.STATE_VALUE]).var(correction=0)
     return torch.where(variance > 0, 1 - left / variance, torch.nan)
 
 
 def state_values(batch: TensorDictBase, critic: TensorDictModule) -> tuple[Tensor, Tensor]:
-    """Values before and after each step of a batch [B, T], [B, T, N, 1]; equal observations count once."""
+    """Values before and after each step of a batch [B, T], [B, T, N, 1]; equal observations count
+    once."""
     (key,) = critic.in_keys
     before, after = (cast(Tensor, batch[at]) for at in (key, keys.next_key(key)))
     followed = after[:, :-1].eq(before[:, 1:]).flatten(2).all(-1)

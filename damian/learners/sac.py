@@ -29,7 +29,8 @@ N_CRITICS = 2
 
 
 class Sac:
-    """Soft actor-critic on decisions drawn from a replay buffer, which may be a back-updating one."""
+    """Soft actor-critic on decisions drawn from a replay buffer, which may be a back-updating
+    one."""
 
     def __init__(
         self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer | None
@@ -44,9 +45,13 @@ class Sac:
         self.loss.register_load_state_dict_post_hook(
             lambda loss, _: loss.make_value_estimator(gamma=config.gamma)
         )
-        networks = [weights for name, weights in self.loss.named_parameters() if name != "log_alpha"]
+        networks = [
+            weights for name, weights in self.loss.named_parameters() if name != "log_alpha"
+        ]
         temperature = {"params": [self.loss.log_alpha], "lr": config.alpha_lr}
-        self.optimizer = torch.optim.Adam([{"params": networks}, temperature], lr=config.lr, fused=True)
+        self.optimizer = torch.optim.Adam(
+            [{"params": networks}, temperature], lr=config.lr, fused=True
+        )
         self.targets = SoftUpdate(self.loss, tau=config.tau)
         masked = keys.ACTION_MASK in self.actor.in_keys
         self.observed = ["observation", setup.critic_key[-1], *["action_mask"] * masked]
@@ -59,22 +64,31 @@ class Sac:
         return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store a batch [B, T], and make a round of updates; means of ``NUMBERS``, nan before it begins."""
+        """Store a batch [B, T], and make a round of updates; means of ``NUMBERS``, nan before it
+        begins."""
         self.buffer.extend(batch.exclude(*self.unread))
         storage = cast(TimeStorage, self.buffer.storage)
         steps, order = storage.steps, storage.latest()
         settled = order[: max(len(order) - self.setup.settle_steps, 0)]
-        ready, ready_next = (cast(Tensor, steps[k])[settled] for k in (keys.READY, next_key(keys.READY)))
-        if (valid := steps.get(keys.VALID, None)) is not None:  # not after an end that was known only later
+        ready, ready_next = (
+            cast(Tensor, steps[k])[settled] for k in (keys.READY, next_key(keys.READY))
+        )
+        if (
+            valid := steps.get(keys.VALID, None)
+        ) is not None:  # not after an end that was known only later
             ready = ready & cast(Tensor, valid)[settled]
-        done, terminated = (steps[next_key(key)][settled].squeeze(-1) for key in (keys.DONE, keys.TERMINATED))
+        done, terminated = (
+            steps[next_key(key)][settled].squeeze(-1) for key in (keys.DONE, keys.TERMINATED)
+        )
         decisions = find_decisions(ready, ready_next, done, terminated)
         if len(order) * batch.shape[0] < self.config.warm_up or not len(decisions.begin):
             return dict.fromkeys(NUMBERS, math.nan)
         rounds = []
         for _ in range(self.config.updates):
             sample = decisions.sample(self.config.batch_size)
-            numbers = self.update(transitions(steps, order, sample, self.config.gamma, self.observed))
+            numbers = self.update(
+                transitions(steps, order, sample, self.config.gamma, self.observed)
+            )
             rounds.append(torch.stack([numbers[name] for name in NUMBERS]))
         # A number that is read at once would make the device wait at every update.
         return dict(zip(NUMBERS, torch.stack(rounds).double().mean(0).tolist(), strict=True))
@@ -101,7 +115,8 @@ _UNREAD: list[NestedKey] = [
     next_key(keys.REWARD_TERMS),
     next_key(keys.EPISODE_REWARD),
 ]
-"""Entries that SAC never reads; they are not stored, to save memory, unless back-updating reads them."""
+"""Entries that SAC never reads; they are not stored, to save memory, unless back-updating reads
+them."""
 
 
 def sac_loss(
@@ -119,7 +134,8 @@ def sac_loss(
     if isinstance(spec, Categorical):
         loss = MaskedDiscreteSACLoss(actor, critics, spec.n, config.target_entropy, **options)
     else:
-        # Target entropy of one UAV: minus its action dimensions on [-1, 1], shifted to its actions' bounds.
+        # Target entropy of one UAV: minus its action dimensions on [-1, 1], shifted to its actions'
+        # bounds.
         bounds = cast(Bounded, spec)
         width = (bounds.high - bounds.low).reshape(-1, spec.shape[-1])[0]
         target = ((width / 2).log() - 1).sum().item()
@@ -130,7 +146,8 @@ def sac_loss(
 
 
 class MaskedDiscreteSACLoss(DiscreteSACLoss):
-    """Discrete SAC loss with a target entropy for each state: a share of that of its legal actions."""
+    """Discrete SAC loss with a target entropy for each state: a share of that of its legal
+    actions."""
 
     def __init__(self, actor: Any, critics: Any, n: int, share: float, **options: Any) -> None:
         options |= {"target_entropy": 0.0}  # ``forward`` adds the target itself
@@ -138,7 +155,8 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
         self.share, self.n_actions = share, n
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """TorchRL's losses of transitions [K], by private parts of it, so that critics are evaluated once."""
+        """TorchRL's losses of transitions [K], by private parts of it, so that critics are
+        evaluated once."""
         target = self._compute_target(tensordict)
         evaluate: Any = self._vmap_qnetworkN0
         observed = tensordict.select(*self.qvalue_network.in_keys)

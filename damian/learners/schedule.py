@@ -10,7 +10,8 @@ from damian.envs.config import ClockConfig
 
 
 class SystemClock:
-    """Period between two updates of the learner [steps], fixed or triggered (paper, sections 3.6 and 4.3)."""
+    """Period between two updates of the learner [steps], fixed or triggered
+    (paper, sections 3.6 and 4.3)."""
 
     def __init__(self, config: ClockConfig, period: int) -> None:
         self.period, self.change = period, 0
@@ -20,7 +21,9 @@ class SystemClock:
             self.shortest = config.steps("shortest") if config.shortest else self.change
             self.longest = config.steps("longest") if config.longest else 2 * period
             steps = f"{period} steps"
-            should = f"is out of clock.shortest, clock.longest = {self.shortest}, {self.longest} steps"
+            should = (
+                f"is out of clock.shortest, clock.longest = {self.shortest}, {self.longest} steps"
+            )
             checks.require(self.shortest <= period <= self.longest, "clock.system", steps, should)
 
     @property
@@ -29,7 +32,8 @@ class SystemClock:
         return math.gcd(self.period, self.change, self.shortest, self.longest)
 
     def tick(self, spotting: Tensor) -> None:
-        """Shorten the period if a UAV spots the source, [B, N], in half of the worlds; else lengthen it."""
+        """Shorten the period if a UAV spots the source, [B, N], in half of the worlds; else
+        lengthen it."""
         in_half_of_worlds = spotting.any(-1).float().mean() >= 0.5
         changed = self.period - self.change if in_half_of_worlds else self.period + self.change
         self.period = min(max(changed, self.shortest), self.longest)

@@ -1,4 +1,5 @@
-"""Actors: a model's network, with a memory, a skip connection, or one network for each UAV, and a policy."""
+"""Actors: a model's network, with a memory, a skip connection, or one network for each UAV, and a
+policy."""
 
 import torch
 from tensordict import NestedKey
@@ -16,12 +17,16 @@ from damian.models.separate import SeparateNetworks
 from damian.server.layout import Layout, layout_at
 
 FIRST_WEIGHT, LEAST = 8.0, 1e-3
-"""Initial weight of a skip connection, and the lower bound of the probabilities of which it takes the log."""
+"""Initial weight of a skip connection, and the lower bound of the probabilities of which it takes
+the log."""
 
 
 def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
     """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``."""
-    layout, n_agents = layout_at(env, keys.OBSERVATION), env.observation_spec[keys.OBSERVATION].shape[-2]
+    layout, n_agents = (
+        layout_at(env, keys.OBSERVATION),
+        env.observation_spec[keys.OBSERVATION].shape[-2],
+    )
 
     def make(n_out: int, *out_keys: NestedKey) -> TensorDictModule:
         if not model.recurrent:
@@ -45,7 +50,11 @@ def _network(model: ModelConfig, layout: Layout, n_out: int, n_agents: int) -> n
 
 
 def _module(
-    network: nn.Module, in_key: NestedKey, model: ModelConfig, layout: Layout, out_keys: tuple[NestedKey, ...]
+    network: nn.Module,
+    in_key: NestedKey,
+    model: ModelConfig,
+    layout: Layout,
+    out_keys: tuple[NestedKey, ...],
 ) -> TensorDictModule:
     """A network from an entry to the parameters of the actions' distribution."""
     normal = len(out_keys) == 2
@@ -53,13 +62,16 @@ def _module(
         should = "needs a probability for each discrete action: observation.belief=[belief_gain]"
         checks.require("belief_gain" in layout and not normal, "model.skip", True, should)
         skipping = SkipConnection(network, layout["belief_gain"].columns)
-        return TensorDictModule(skipping, in_keys=[in_key, keys.OBSERVATION], out_keys=list(out_keys))
+        return TensorDictModule(
+            skipping, in_keys=[in_key, keys.OBSERVATION], out_keys=list(out_keys)
+        )
     module = nn.Sequential(network, NormalParamExtractor()) if normal else network
     return TensorDictModule(module, in_keys=[in_key], out_keys=list(out_keys))
 
 
 class SkipConnection(nn.Module):
-    """A network's outputs, zero at first, plus the logs of the observation's ``columns`` times a weight."""
+    """A network's outputs, zero at first, plus the logs of the observation's ``columns`` times a
+    weight."""
 
     def __init__(self, network: nn.Module, columns: slice) -> None:
         super().__init__()

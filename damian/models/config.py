@@ -1,4 +1,5 @@
-"""Settings of models, which say how networks are made. Those of a user's own are ``package.module:Name``."""
+"""Settings of models, which say how networks are made. Those of a user's own are
+``package.module:Name``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +20,9 @@ def _is_model(found: Any) -> bool:
 
 
 MODELS = Registry[type["ModelConfig"]](
-    "model", _is_model, "is not a @dataclass derived from damian.ModelConfig with a method make_network"
+    "model",
+    _is_model,
+    "is not a @dataclass derived from damian.ModelConfig with a method make_network",
 )
 """Settings of models, by name; the user's own as ``package.module:Name``."""
 
@@ -28,19 +31,25 @@ MODELS = Registry[type["ModelConfig"]](
 class ModelConfig(Settings):
     """Settings of the networks of actor and critics; those that all models share.
 
-    A model of your own has a dataclass derived from this class, with fields for its own settings, that
-    implements ``make_network``, from which actor, critic and action values are made. A memory, a skip
-    connection, and networks for each UAV combine with it. ``model=package.module:Name`` chooses it.
+    A model of your own has a dataclass derived from this class, with fields for its own settings,
+    that implements ``make_network``, from which actor, critic and action values are made. A memory,
+    a skip connection, and networks for each UAV combine with it. ``model=package.module:Name``
+    chooses it.
     """
 
     section: ClassVar[str] = "model"
 
-    name: str = setting("mlp", "Name of the model, or package.module:Name; the group ``model`` sets it.")
+    name: str = setting(
+        "mlp", "Name of the model, or package.module:Name; the group ``model`` sets it."
+    )
     hidden: list[int] = setting([256, 256], "Width of each hidden layer.", low=1, high=16384)
-    activation: str = setting("tanh", "Activation function.", choices=("tanh", "relu", "elu", "silu"))
+    activation: str = setting(
+        "tanh", "Activation function.", choices=("tanh", "relu", "elu", "silu")
+    )
     rnn: str = setting(
         "none",
-        "Recurrence: with gru the actor's last hidden layer remembers its observations of the episode.",
+        "Recurrence: with gru the actor's last hidden layer remembers its observations of the "
+        "episode.",
         choices=("none", "gru"),
     )
     skip: bool = setting(False, "The actor begins by preferring actions of high ``belief_gain``.")
@@ -68,7 +77,8 @@ class ModelConfig(Settings):
     def make_network(self, layout: "Layout", n_out: int) -> "nn.Module":
         """A network from observations [*, F], whose columns the layout describes, to [*, n_out].
 
-        Actors, critics and action values are such networks; a critic has the columns of what it observes.
+        Actors, critics and action values are such networks; a critic has the columns of what it
+        observes.
 
         Raises:
             InputError: the model cannot read such a layout; the message names a setting.

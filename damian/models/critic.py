@@ -13,7 +13,8 @@ from damian.models.config import ModelConfig
 from damian.server.layout import joined, layout_at
 
 FORGETTING = 0.99
-"""Share of the running statistics of values that an update keeps: they reflect about the last 100 updates."""
+"""Share of the running statistics of values that an update keeps: they reflect about the last 100
+updates."""
 
 
 def make_critic(
@@ -22,7 +23,8 @@ def make_critic(
     critic_key: NestedKey = keys.GLOBAL_OBSERVATION,
     normalize: bool = False,
 ) -> TensorDictModule:
-    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1]."""
+    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")``
+    [*, N, 1]."""
     layout, n_agents = layout_at(env, critic_key), env.observation_spec[critic_key].shape[-2]
     if model.shared_value:
         network: nn.Module = SharedValue(model.make_network(joined([layout] * n_agents), 1))
@@ -30,12 +32,17 @@ def make_critic(
         network = model.make_network(layout, 1)
     if normalize:
         network = NormalizedValue(network)
-    return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE]).to(env.device)
+    return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE]).to(
+        env.device
+    )
 
 
 def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -> TensorDictModule:
     """Make a Q-function of the entries ``read``: values of all discrete actions, or of the one."""
-    layout, spec = joined([layout_at(env, key) for key in read]), env.full_action_spec_unbatched[keys.ACTION]
+    layout, spec = (
+        joined([layout_at(env, key) for key in read]),
+        env.full_action_spec_unbatched[keys.ACTION],
+    )
     if isinstance(spec, Categorical):
         in_keys, out_key, n_out = read, "action_value", spec.n
     else:
@@ -71,7 +78,8 @@ class SharedValue(nn.Module):
 
 
 class NormalizedValue(nn.Module):
-    """Values from a network whose outputs are values of mean 0 and standard deviation 1 (Yu et al. 2022)."""
+    """Values from a network whose outputs are values of mean 0 and standard deviation 1
+    (Yu et al. 2022)."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()

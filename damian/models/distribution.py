@@ -15,7 +15,8 @@ from damian import keys
 
 
 class LegalCategorical(Distribution):
-    """Categorical distribution of logits [*, A] over legal actions; TorchRL's takes four times as long.
+    """Categorical distribution of logits [*, A] over legal actions; TorchRL's takes four times as
+    long.
 
     Actions are drawn by the inverse of the cumulative distribution, in a third of the time of
     ``torch.multinomial``.
@@ -25,7 +26,9 @@ class LegalCategorical(Distribution):
         lowest = torch.finfo(logits.dtype).min
         logits = logits.clamp(min=lowest / 4)  # finite, so that an entropy is
         if mask is not None:
-            logits = logits.masked_fill(~mask, lowest / 2)  # far below all legal ones, whatever these are
+            logits = logits.masked_fill(
+                ~mask, lowest / 2
+            )  # far below all legal ones, whatever these are
         self.logits = logits.log_softmax(-1)
         super().__init__(logits.shape[:-1], validate_args=False)
 
@@ -43,11 +46,13 @@ class LegalCategorical(Distribution):
         """Draw actions, [*sample_shape, *]."""
         cumulative = self.probs.cumsum(-1)
         drawn = torch.rand(*sample_shape, *self.batch_shape, 1, device=cumulative.device)
-        # Below the last sum even after rounding; an action of probability 0 adds nothing to the one before.
+        # Below the last sum even after rounding; an action of probability 0 adds nothing to the one
+        # before.
         return (cumulative <= drawn * cumulative[..., -1:]).sum(-1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability of actions [*sample_shape, *], finite but very low where they are illegal."""
+        """Log-probability of actions [*sample_shape, *], finite but very low where they are
+        illegal."""
         logits = self.logits.expand(*value.shape, -1)
         return logits.gather(-1, value.unsqueeze(-1)).squeeze(-1)
 
@@ -56,7 +61,9 @@ class LegalCategorical(Distribution):
         return -(self.probs * self.logits).sum(-1)
 
 
-def with_distribution(env: EnvBase, make_network: Callable[..., TensorDictModule]) -> ProbabilisticActor:
+def with_distribution(
+    env: EnvBase, make_network: Callable[..., TensorDictModule]
+) -> ProbabilisticActor:
     """Make a policy of a network, which is made from its number of outputs and their keys."""
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):

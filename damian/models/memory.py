@@ -17,17 +17,22 @@ RECURRENT_KEYS: list[NestedKey] = [keys.HIDDEN_BEFORE, keys.IS_INIT]
 
 
 class AgentGRU(TensorDictModuleBase):
-    """Gated recurrent unit from observations to hidden states, for each UAV by itself (Cho et al. 2014).
+    """Gated recurrent unit from observations to hidden states, for each UAV by itself
+    (Cho et al. 2014).
 
-    A single step [B]: reads ``("agents", "observation")`` [B, N, F] and ``("agents", "hidden")`` [B, N, H];
-    writes the next hidden state, and the previous one as ``("agents", "hidden_before")``. A whole sequence
-    [B, T], in TorchRL's recurrent mode: starts from the first ``hidden_before``, and from zeros where
-    ``is_init`` [B, T, 1] marks a new episode.
+    A single step [B]: reads ``("agents", "observation")`` [B, N, F] and ``("agents", "hidden")``
+    [B, N, H]; writes the next hidden state, and the previous one as
+    ``("agents", "hidden_before")``. A whole sequence [B, T], in TorchRL's recurrent mode: starts
+    from the first ``hidden_before``, and from zeros where ``is_init`` [B, T, 1] marks a new
+    episode.
     """
 
     def __init__(self, encoder: nn.Module, n_features: int, n_hidden: int) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = [keys.OBSERVATION, keys.HIDDEN], [keys.HIDDEN, keys.HIDDEN_BEFORE]  # type: ignore[assignment]
+        self.in_keys, self.out_keys = (
+            [keys.OBSERVATION, keys.HIDDEN],
+            [keys.HIDDEN, keys.HIDDEN_BEFORE],
+        )  # type: ignore[assignment]
         self.encoder, self.cell = encoder, nn.GRUCell(n_features, n_hidden)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -36,17 +41,20 @@ class AgentGRU(TensorDictModuleBase):
             first, begins = tensordict[keys.HIDDEN_BEFORE][:, 0], tensordict[keys.IS_INIT]
             return tensordict.set(keys.HIDDEN, self.replay(features, first, begins))
         before = tensordict[keys.HIDDEN]
-        return tensordict.set(keys.HIDDEN_BEFORE, before).set(keys.HIDDEN, self.step(features, before))
+        return tensordict.set(keys.HIDDEN_BEFORE, before).set(
+            keys.HIDDEN, self.step(features, before)
+        )
 
     def step(self, features: Tensor, hidden: Tensor) -> Tensor:
-        """Return the next hidden state from features [*, N, E] and the previous hidden state [*, N, H]."""
+        """Return the next hidden state from features [*, N, E] and the previous hidden state
+        [*, N, H]."""
         return self.cell(features.flatten(0, -2), hidden.flatten(0, -2)).view_as(hidden)
 
     def replay(self, features: Tensor, hidden: Tensor, begins: Tensor) -> Tensor:
         """The hidden states [B, T, N, H] of a sequence; ``begins`` [B, T, 1] restarts them."""
         states: list[Tensor] = []
-        # This loop is as fast as nn.GRU, which cannot restart within a sequence. TorchRL's GRUModule can,
-        # but pads episodes and takes twice the time.
+        # This loop is as fast as nn.GRU, which cannot restart within a sequence. TorchRL's
+        # GRUModule can, but pads episodes and takes twice the time.
         for feature, begin in zip(features.unbind(1), begins.unbind(1), strict=True):
             hidden = self.step(feature, hidden.masked_fill(begin.unsqueeze(-1), 0.0))
             states.append(hidden)
@@ -54,7 +62,8 @@ class AgentGRU(TensorDictModuleBase):
 
 
 def add_recurrent_state(env: TransformedEnv, policy: nn.Module) -> None:
-    """Make an environment carry the hidden states of a policy, if it is recurrent, with zeros at a reset."""
+    """Make an environment carry the hidden states of a policy, if it is recurrent, with zeros at a
+    reset."""
     cells = [module.cell for module in policy.modules() if isinstance(module, AgentGRU)]
     if not cells or keys.HIDDEN in env.observation_spec.keys(True, True):
         return

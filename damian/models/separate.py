@@ -8,7 +8,8 @@ from torch.func import functional_call, stack_module_state
 
 
 class SeparateNetworks(nn.Module):
-    """N networks of one architecture, the first of which reads the first UAV's observation, and so on."""
+    """N networks of one architecture, the first of which reads the first UAV's observation, and so
+    on."""
 
     def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()

@@ -1,1 +1,2 @@
-"""Replay storages: back-updating of stored steps with late messages, and semi-Markov transitions."""
+"""Replay storages: back-updating of stored steps with late messages, and semi-Markov
+transitions."""

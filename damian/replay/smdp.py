@@ -1,4 +1,5 @@
-"""Finds decisions in stored steps and joins each into a semi-Markov transition (Sutton et al. 1999)."""
+"""Finds decisions in stored steps and joins each into a semi-Markov transition
+(Sutton et al. 1999)."""
 
 from typing import NamedTuple, cast
 
@@ -29,14 +30,19 @@ class Decisions(NamedTuple):
         return Decisions(*(part[drawn] for part in self))
 
 
-def find_decisions(ready: Tensor, ready_next: Tensor, done: Tensor, terminated: Tensor) -> Decisions:
+def find_decisions(
+    ready: Tensor, ready_next: Tensor, done: Tensor, terminated: Tensor
+) -> Decisions:
     """All decisions in T consecutive steps that have ended by the last of these steps.
 
-    Decisions that a time limit truncates in flight are left out, because their outcome is unknown. ``ready``
-    and ``ready_next`` [T, B, N] tell whether a UAV could choose before and after each step, ``done`` and
-    ``terminated`` [T, B] how the episode ended.
+    Decisions that a time limit truncates in flight are left out, because their outcome is unknown.
+    ``ready`` and ``ready_next`` [T, B, N] tell whether a UAV could choose before and after each
+    step, ``done`` and ``terminated`` [T, B] how the episode ended.
     """
-    n_steps, end = len(ready), next_true(ready_next | done.unsqueeze(-1))  # n_steps: it has not ended yet
+    n_steps, end = (
+        len(ready),
+        next_true(ready_next | done.unsqueeze(-1)),
+    )  # n_steps: it has not ended yet
     outcome_known = (ready_next | terminated.unsqueeze(-1)).gather(0, end.clamp(max=n_steps - 1))
     begin, world, agent = (ready & outcome_known & (end < n_steps)).nonzero().unbind(-1)
     return Decisions(begin, world, agent, end[begin, world, agent])
@@ -45,18 +51,27 @@ def find_decisions(ready: Tensor, ready_next: Tensor, done: Tensor, terminated: 
 def transitions(
     steps: TensorDictBase, order: Tensor, decisions: Decisions, gamma: float, observed: list[str]
 ) -> TensorDict:
-    """Turn K decisions into transitions of single agents, [K], in the form that TorchRL's losses read.
+    """Turn K decisions into transitions of single agents, [K], in the form that TorchRL's losses
+    read.
 
-    The reward of a transition is the sum of the rewards from ``begin`` to ``end``, discounted by step;
-    ``steps_to_next_obs`` [K, 1] is the number of steps by which the next value is to be discounted. ``order``
-    is the index in ``steps`` [*, B] of each of T consecutive steps, from which the decisions count;
-    ``observed`` names the agents' entries that a transition has before and after the decision.
+    The reward of a transition is the sum of the rewards from ``begin`` to ``end``, discounted by
+    step; ``steps_to_next_obs`` [K, 1] is the number of steps by which the next value is to be
+    discounted. ``order`` is the index in ``steps`` [*, B] of each of T consecutive steps, from
+    which the decisions count; ``observed`` names the agents' entries that a transition has before
+    and after the decision.
     """
     begin, world, agent, end = decisions
     before, last = (order[begin], world, agent), (order[end], world, agent)
-    agents, after = (cast(TensorDictBase, steps[key]) for key in (keys.AGENTS, next_key(keys.AGENTS)))
-    at_begin = {"action": agents["action"][before], **{key: agents[key][before] for key in observed}}
-    step = begin + torch.arange(int((end - begin).max()) + 1, device=begin.device).unsqueeze(-1)  # [H, K]
+    agents, after = (
+        cast(TensorDictBase, steps[key]) for key in (keys.AGENTS, next_key(keys.AGENTS))
+    )
+    at_begin = {
+        "action": agents["action"][before],
+        **{key: agents[key][before] for key in observed},
+    }
+    step = begin + torch.arange(int((end - begin).max()) + 1, device=begin.device).unsqueeze(
+        -1
+    )  # [H, K]
     index = order[torch.minimum(step, end)], world
     rewards = after["reward"].squeeze(-1)[*index, agent] * (step <= end)
     reward = (gamma ** (step - begin) * rewards).sum(0)

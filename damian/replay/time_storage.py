@@ -12,7 +12,8 @@ from torchrl.data import LazyTensorStorage
 class TimeStorage(LazyTensorStorage):
     """Keeps the latest ``max_size`` = T times B steps of B worlds in order of time, [T, B].
 
-    The writer must be a round robin (TorchRL's default), and all batches must have the same B worlds.
+    The writer must be a round robin (TorchRL's default), and all batches must have the same B
+    worlds.
     """
 
     def __init__(self, max_size: int, **options: Any) -> None:
@@ -41,7 +42,8 @@ class TimeStorage(LazyTensorStorage):
         self._bump_mutation_revision()
 
     def latest(self, n_steps: int | None = None) -> Tensor:
-        """Indices of the latest ``n_steps`` steps (all if not given) in order of time, [min(n_steps, T)]."""
+        """Indices of the latest ``n_steps`` steps (all if not given) in order of time,
+        [min(n_steps, T)]."""
         stored = self.n_steps
         n_steps = stored if n_steps is None else min(n_steps, stored)
         last = self._last or 0  # nothing is stored if there is none
@@ -63,4 +65,6 @@ class TimeStorage(LazyTensorStorage):
         self._last_cursor = state_dict["last"]
 
     def dumps(self, path: Any) -> None:
-        raise NotImplementedError("the files do not tell which step is the latest: save state_dict()")
+        raise NotImplementedError(
+            "the files do not tell which step is the latest: save state_dict()"
+        )

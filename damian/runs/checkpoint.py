@@ -55,7 +55,11 @@ def plain(value: Any) -> Any:
         tensor = value.detach().cpu()
         # torch.save would write the whole storage that a view was cut from.
         whole = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
-        return tensor if whole and type(tensor) is Tensor else torch.Tensor.clone(tensor).as_subclass(Tensor)
+        return (
+            tensor
+            if whole and type(tensor) is Tensor
+            else torch.Tensor.clone(tensor).as_subclass(Tensor)
+        )
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, _PLAIN):
@@ -81,7 +85,8 @@ def to_tensordict(stored: Mapping[str, Any]) -> TensorDict:
 
 
 def restore(components: Mapping[str, Any], stored: Mapping[str, Any], path: Path, key: str) -> None:
-    """Restore components in place with their ``load_state_dict``; ``key`` is the setting of the file."""
+    """Restore components in place with their ``load_state_dict``; ``key`` is the setting of the
+    file."""
     for name, component in components.items():
         if name not in stored:
             raise InputError(f"{key}: {path}: it has no {name}, only {', '.join(map(str, stored))}")

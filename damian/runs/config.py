@@ -15,5 +15,7 @@ class LoggerConfig(Settings):
     tensorboard: bool = setting(True, "Write TensorBoard events.")
     csv: bool = setting(True, "Write ``metrics.csv``.")
     custom: list[Any] = setting(
-        [], "Further loggers: wandb or package.module:Name, or {logger: wandb, project: ..., offline: true}."
+        [],
+        "Further loggers: wandb or package.module:Name, or "
+        "{logger: wandb, project: ..., offline: true}.",
     )

@@ -25,12 +25,15 @@ class Metric:
     share: bool = False
     """Whether it lies between 0 and 1, and its intervals end there."""
     where: str = ""
-    """Tables show it only where a task can succeed (``success``), or where messages are late (``late``)."""
+    """Tables show it only where a task can succeed (``success``), or where messages are late
+    (``late``)."""
     tables: tuple[str, ...] = ("run", "sweep")
     """Tables that show it, beside that of ``damian compare``, which has all."""
 
 
-METRICS = Registry[Metric]("metric", Metric, "is not a metric: decorate a function with damian.metric")
+METRICS = Registry[Metric](
+    "metric", Metric, "is not a metric: decorate a function with damian.metric"
+)
 """Metrics by name; those outside the package as ``package.module:name``."""
 
 
@@ -60,11 +63,18 @@ def _add(name: str, compute: Compute, better: str = "", **declared: Any) -> None
     METRICS.register(name)(Metric(compute, better, **declared))
 
 
-# Columns of stored tables are in this order. First what truly happened, then what the server perceived.
+# Columns of stored tables are in this order. First what truly happened, then what the server
+# perceived.
 _add("success_rate", lambda flights: flights.true.succeeded, "higher", share=True, where="success")
 _add("steps", lambda flights: flights.true.steps, "lower", where="success")
 _add("return", lambda flights: flights.true.returns, "higher")
-_add("perceived_success_rate", lambda flights: flights.perceived.succeeded, "higher", share=True, tables=())
+_add(
+    "perceived_success_rate",
+    lambda flights: flights.perceived.succeeded,
+    "higher",
+    share=True,
+    tables=(),
+)
 _add("perceived_steps", lambda flights: flights.perceived.steps, "lower", tables=())
 _add("perceived_return", lambda flights: flights.perceived.returns, "higher", where="late")
 _add("age", lambda flights: flights.age[flights.in_episode], where="late")

@@ -51,17 +51,23 @@ class Flights(NamedTuple):
     age: Tensor
     """Age of the message of each UAV that the server holds [steps], [B, T, N]."""
     delay: Tensor
-    """Delays of the messages sent in the episodes [steps], negative if lost, [M]; 0 if none is late."""
+    """Delays of the messages sent in the episodes [steps], negative if lost, [M]; 0 if none is
+    late."""
 
 
 @torch.no_grad()
 def evaluate(
-    env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = True, metrics: Sequence[str] = ()
+    env: DelayedEnv,
+    policy: nn.Module,
+    horizon: int,
+    sample: bool = True,
+    metrics: Sequence[str] = (),
 ) -> Evaluation:
-    """Fly one episode of at most ``horizon`` steps in every world of an environment with ``message``.
+    """Fly one episode of at most ``horizon`` steps in every world of an environment with
+    ``message``.
 
-    With ``sample``, actions are drawn from the policy's distribution, else the most likely ones are taken.
-    ``metrics`` are names or paths of further ones.
+    With ``sample``, actions are drawn from the policy's distribution, else the most likely ones are
+    taken. ``metrics`` are names or paths of further ones.
     """
     add_recurrent_state(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
@@ -75,7 +81,9 @@ def evaluation(rollout: TensorDictBase, server: Server, metrics: Sequence[str] =
     flights, found = flights_of(rollout, server), Evaluation(episodes=len(rollout))
     for name in dict.fromkeys((*BUILT_IN, *metrics)):
         with naming_errors(f"metric {name}"):
-            found[name] = torch.as_tensor(METRICS.get(name, "metrics").compute(flights)).float().mean().item()
+            found[name] = (
+                torch.as_tensor(METRICS.get(name, "metrics").compute(flights)).float().mean().item()
+            )
     return found
 
 
@@ -86,7 +94,9 @@ def flights_of(rollout: TensorDictBase, server: Server) -> Flights:
     message = next_step[keys.MESSAGE]
     over, belief = next_step.get(keys.SOURCE_OVER, None), _true_belief(rollout, server, elapsed)
     truth = server(server.messages(message), elapsed, over, belief=belief)
-    done, success, reward = (next_step[k].squeeze(-1) for k in (keys.DONE, keys.SUCCESS, keys.REWARD))
+    done, success, reward = (
+        next_step[k].squeeze(-1) for k in (keys.DONE, keys.SUCCESS, keys.REWARD)
+    )
     in_episode = _up_to_first_end(done)
     true_end = in_episode & _up_to_first_end(truth.status.terminated)
     held = server.messages(next_step.get(keys.RECEIVED, message))
@@ -114,7 +124,8 @@ def _episodes(success: Tensor, reward: Tensor, counted: Tensor, can_succeed: boo
 
 
 def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Tensor | None:
-    """The belief from undelayed messages in first episodes, [B, T, K]; None if no reward term reads it."""
+    """The belief from undelayed messages in first episodes, [B, T, K]; None if no reward term reads
+    it."""
     if not server.rewards_belief:
         return None
     steps = rollout.select(keys.MESSAGE, keys.BELIEF, next_key(keys.MESSAGE), next_key(keys.BELIEF))
@@ -130,11 +141,13 @@ def _up_to_first_end(ended: Tensor) -> Tensor:
 
 
 class EpisodeLog:
-    """Means over the latest episodes of the training, as many of each world, at least ``EPISODES`` in all.
+    """Means over the latest episodes of the training, as many of each world, at least ``EPISODES``
+    in all.
 
-    Every world counts the same, and nothing is known before one has ended in each: the first episodes to end
-    are the shortest, and their means would be too good. ``hindsight`` gives the rewards as they are known
-    once they have settled; None if none is late, so that they are those perceived.
+    Every world counts the same, and nothing is known before one has ended in each: the first
+    episodes to end are the shortest, and their means would be too good. ``hindsight`` gives the
+    rewards as they are known once they have settled; None if none is late, so that they are those
+    perceived.
     """
 
     NAMES = ("perceived_return", "perceived_success_rate", "perceived_steps")
@@ -143,7 +156,9 @@ class EpisodeLog:
     def __init__(self, worlds: int, hindsight: "HindsightReturns | None" = None) -> None:
         self.finished, self.hindsight = 0, hindsight
         parts = [(worlds, len(self.NAMES)), *([(hindsight.worlds, 1)] if hindsight else [])]
-        self._known = [torch.full((b, math.ceil(self.EPISODES / b), n), torch.nan) for b, n in parts]
+        self._known = [
+            torch.full((b, math.ceil(self.EPISODES / b), n), torch.nan) for b, n in parts
+        ]
         """Numbers of the latest episodes of each world [B, K, N], perceived and in hindsight."""
 
     def add(self, batch: TensorDictBase) -> None:
@@ -183,16 +198,22 @@ def _latest(known: Tensor, ended: Tensor) -> Tensor:
     """
     both = torch.cat([known, ended], 1)
     when = torch.arange(both.shape[1]).where(~both[..., 0].isnan(), -1)
-    latest = when.topk(known.shape[1], 1).indices.sort(1).values.unsqueeze(-1).expand(-1, -1, both.shape[2])
+    latest = (
+        when.topk(known.shape[1], 1)
+        .indices.sort(1)
+        .values.unsqueeze(-1)
+        .expand(-1, -1, both.shape[2])
+    )
     return both.gather(1, latest)
 
 
 class HindsightReturns:
-    """Returns of the training's episodes from late data only, as they are known once they have settled.
+    """Returns of the training's episodes from late data only, as they are known once they have
+    settled.
 
-    The reward of a step has settled when its messages and it itself can no longer be in transit; until then
-    it waits in a storage of its own, whatever the learner does. Only a few worlds are followed, because that
-    costs time.
+    The reward of a step has settled when its messages and it itself can no longer be in transit;
+    until then it waits in a storage of its own, whatever the learner does. Only a few worlds are
+    followed, because that costs time.
 
     Args:
         storage: an empty storage that corrects the rewards of ``worlds`` worlds.
@@ -212,7 +233,8 @@ class HindsightReturns:
         """Return so far of the current episode of each world."""
 
     def add(self, batch: TensorDictBase) -> Tensor:
-        """Returns of the episodes whose last steps settle by the end of a batch [B, T], else nan, [W, T']."""
+        """Returns of the episodes whose last steps settle by the end of a batch [B, T], else nan,
+        [W, T']."""
         steps = batch[: self.worlds].transpose(0, 1)
         self._store(steps)
         self._waiting += len(steps)
@@ -223,16 +245,21 @@ class HindsightReturns:
             return torch.full((self.worlds, 0), torch.nan)
         valid, over = (settled[key].squeeze(-1).cpu() for key in (keys.VALID, keys.RESET_AFTER))
         reward = settled[next_key(keys.REWARD)].squeeze(-1).double().mean(-1).cpu()
-        total = torch.cat([self._running[None], self._running + (reward * valid).cumsum(0)])  # [T' + 1, W]
+        total = torch.cat(
+            [self._running[None], self._running + (reward * valid).cumsum(0)]
+        )  # [T' + 1, W]
         step = torch.arange(n_settled).view(-1, 1)
-        ended = torch.where(over, step + 1, 0).cummax(0).values  # the end of the latest episode before
+        ended = (
+            torch.where(over, step + 1, 0).cummax(0).values
+        )  # the end of the latest episode before
         before = torch.cat([torch.zeros_like(ended[:1]), ended])
         begun = torch.where(before > 0, total.gather(0, before), 0.0)
         self._running = total[-1] - begun[-1]
         return torch.where(over, total[1:] - begun[:-1], torch.nan).T.float()
 
     def _store(self, steps: TensorDictBase, corrected: bool = False) -> None:
-        """Write steps [T, W] behind the latest ones, and correct all unless they are ``corrected``."""
+        """Write steps [T, W] behind the latest ones, and correct all unless they are
+        ``corrected``."""
         index = torch.arange(self._written, self._written + len(steps))
         self._written += len(steps)
         write: Any = super(BackupdateStorage, self.storage).set if corrected else self.storage.set

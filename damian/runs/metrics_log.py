@@ -1,4 +1,5 @@
-"""Numbers of a training: row by row in ``metrics.csv``, and given to loggers such as TensorBoard."""
+"""Numbers of a training: row by row in ``metrics.csv``, and given to loggers such as
+TensorBoard."""
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
@@ -20,8 +21,8 @@ from damian.runs.config import LoggerConfig
 class Logger(Protocol):
     """Receives numbers, as TorchRL's loggers do.
 
-    If it has them, ``log_hparams(settings)`` is called at first, with every setting by its dotted key,
-    ``flush()`` before a checkpoint, and ``close()`` at the end.
+    If it has them, ``log_hparams(settings)`` is called at first, with every setting by its dotted
+    key, ``flush()`` before a checkpoint, and ``close()`` at the end.
     """
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
@@ -46,7 +47,8 @@ def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Lo
     Args:
         config: the settings.
         folder: the run folder.
-        frames: environment steps that a resumed run has made; TensorBoard drops what it logged of later ones.
+        frames: environment steps that a resumed run has made; TensorBoard drops what it logged of
+            later ones.
     """
     loggers: list[Logger] = [TensorBoard(folder, frames)] if config.tensorboard else []
     for path, make, parameters in map(read_logger, config.custom):
@@ -59,7 +61,8 @@ def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Lo
 
 
 class TensorBoard:
-    """Writes TensorBoard events into the run folder; the files that a resumed run adds belong to the same."""
+    """Writes TensorBoard events into the run folder; the files that a resumed run adds belong to
+    the same."""
 
     def __init__(self, folder: Path, frames: int) -> None:
         self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
@@ -75,7 +78,8 @@ class TensorBoard:
 
 
 def read_logger(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
-    """Path, class and parameters of ``package.module:Name`` or ``{logger: package.module:Name, ...}``."""
+    """Path, class and parameters of ``package.module:Name`` or
+    ``{logger: package.module:Name, ...}``."""
     key, entry = "logger.custom", written if isinstance(written, Mapping) else {"logger": written}
     path, make, parameters = LOGGERS.read(entry, key, "logger")
     check_parameters(make, parameters, path, key)
@@ -89,7 +93,9 @@ def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Lo
 
     not_linked(folder / "wandb")
     number = uuid5(NAMESPACE_URL, str(folder.resolve())).hex
-    logger: Any = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
+    logger: Any = WandbLogger(
+        folder.name, offline, str(folder), number, project, log_env_packages=False
+    )
     logger.close = import_module("wandb").finish
     return logger
 
@@ -99,7 +105,8 @@ _FIRST_COLUMN = "frames"
 
 
 class MetricsLog:
-    """Gives named numbers to loggers, and writes them to ``metrics.csv`` with each checkpoint and at the end.
+    """Gives named numbers to loggers, and writes them to ``metrics.csv`` with each checkpoint and
+    at the end.
 
     A number that a row lacks is nan; rows after ``frames``, where a run resumes, are dropped.
     """

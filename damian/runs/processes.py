@@ -1,4 +1,5 @@
-"""Runs in processes, and how a signal ends them: a training after its current update, many runs at once."""
+"""Runs in processes, and how a signal ends them: a training after its current update, many runs at
+once."""
 
 import multiprocessing
 import os
@@ -18,13 +19,16 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """Context in which the first Ctrl-C or SIGTERM only sets ``asked``; a second one ends the run at once."""
+    """Context in which the first Ctrl-C or SIGTERM only sets ``asked``; a second one ends the run
+    at once."""
 
     asked: int | None = None
     """Number of the signal that asked to stop."""
 
     def __enter__(self) -> "Interrupt":
-        self._before: dict[int, Any] = {number: signal.signal(number, self._ask) for number in SIGNALS}
+        self._before: dict[int, Any] = {
+            number: signal.signal(number, self._ask) for number in SIGNALS
+        }
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -45,10 +49,13 @@ def end_interrupted(remedy: str = "", number: int = signal.SIGINT) -> NoReturn:
 R = TypeVar("R")
 
 
-def each_in_processes(perform: Callable[[R], None], runs: Sequence[R], processes: int) -> Iterator[R]:
+def each_in_processes(
+    perform: Callable[[R], None], runs: Sequence[R], processes: int
+) -> Iterator[R]:
     """Perform runs, and yield each that has ended.
 
-    After Ctrl-C or SIGTERM it raises ``KeyboardInterrupt``, when every training has written a checkpoint.
+    After Ctrl-C or SIGTERM it raises ``KeyboardInterrupt``, when every training has written a
+    checkpoint.
     """
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it
     try:
@@ -59,7 +66,9 @@ def each_in_processes(perform: Callable[[R], None], runs: Sequence[R], processes
                 perform(run)
                 yield run
     except BrokenExecutor as error:
-        raise RunError("a worker process was killed; the same command continues all runs") from error
+        raise RunError(
+            "a worker process was killed; the same command continues all runs"
+        ) from error
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -69,7 +78,9 @@ def _in_pool(perform: Callable[[R], None], runs: Sequence[R], processes: int) ->
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin) as pool:
         try:
             while True:
-                for run in islice(waiting, processes - len(futures)):  # none waits in a worker's queue
+                for run in islice(
+                    waiting, processes - len(futures)
+                ):  # none waits in a worker's queue
                     futures[pool.submit(perform, run)] = run
                 if not futures:
                     return
@@ -77,13 +88,16 @@ def _in_pool(perform: Callable[[R], None], runs: Sequence[R], processes: int) ->
                     future.result()
                     yield futures.pop(future)
         except KeyboardInterrupt:
-            for worker in multiprocessing.active_children():  # a signal to this process alone reaches none
+            for (
+                worker
+            ) in multiprocessing.active_children():  # a signal to this process alone reaches none
                 os.kill(worker.pid or 0, signal.SIGINT)
             raise
 
 
 def _begin() -> None:
-    """Initialise a worker: only a training handles Ctrl-C, and a worker ends with its main process."""
+    """Initialise a worker: only a training handles Ctrl-C, and a worker ends with its main
+    process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -1,4 +1,5 @@
-"""Replay memory in checkpoints: steps that stay as they are go into files of their own, each written once."""
+"""Replay memory in checkpoints: steps that stay as they are go into files of their own, each
+written once."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -16,10 +17,12 @@ FILES = 32
 
 
 class ReplayMemory:
-    """The steps of a replay buffer, as a component of a checkpoint, which costs as much as the new steps.
+    """The steps of a replay buffer, as a component of a checkpoint, which costs as much as the new
+    steps.
 
-    Row k is step k of all worlds since the beginning of the training. File f has the rows from f R up to
-    (f + 1) R, and is written when late messages cannot change them any more; later rows are in the state.
+    Row k is step k of all worlds since the beginning of the training. File f has the rows from f R
+    up to (f + 1) R, and is written when late messages cannot change them any more; later rows are
+    in the state.
     """
 
     def __init__(self, buffer: ReplayBuffer | None, folder: Path) -> None:
@@ -63,7 +66,9 @@ class ReplayMemory:
         storage = self._storage
         if storage.device != "auto":
             rows = rows.to(storage.device)
-        index = torch.arange(state["oldest"], state["written"]) % -(-storage.max_size // rows.shape[1])
+        index = torch.arange(state["oldest"], state["written"]) % -(
+            -storage.max_size // rows.shape[1]
+        )
         # Not ``storage.set``: a BackupdateStorage has corrected these rows already.
         LazyTensorStorage.set(storage, index, rows)  # type: ignore[arg-type]
         self._buffer.writer.load_state_dict(state["writer"])

@@ -25,11 +25,13 @@ FAILED = "failed.json"
 """Words and error of a run of a sweep that was refused or could not go on."""
 TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
 DETERMINISTIC = ", deterministic"
-"""Ending of the name of a policy whose most likely actions are taken, not drawn from its distribution."""
+"""Ending of the name of a policy whose most likely actions are taken, not drawn from its
+distribution."""
 
 
 def check_no_links(folder: Path) -> None:
-    """Refuse a folder in which a link stands where a run reads, writes or deletes, before it does so."""
+    """Refuse a folder in which a link stands where a run reads, writes or deletes, before it does
+    so."""
     for each in (folder, folder / REPLAY, folder / EXPORT):
         for path in each.iterdir() if each.is_dir() else ():
             not_linked(path)
@@ -43,7 +45,8 @@ server [steps]; late and lost: shares of the messages."""
 def save_results(
     rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool, note: str = ""
 ) -> str:
-    """Write evaluations by policy to ``result.csv`` and, as the returned table, to ``result.md``."""
+    """Write evaluations by policy to ``result.csv`` and, as the returned table, to
+    ``result.md``."""
     below = "\n".join(filter(None, [note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
@@ -62,7 +65,8 @@ def read_results(path: Path) -> pd.DataFrame:
 
 
 def measured_in(table: pd.DataFrame, score: str) -> list[str]:
-    """Metrics of a table of evaluations, the columns behind the number of episodes, first the score."""
+    """Metrics of a table of evaluations, the columns behind the number of episodes, first the
+    score."""
     names = [*map(str, table)]
     metrics = names[names.index("episodes") + 1 :]
     checks.require(score in metrics, "score", score, f"is not stored, only {', '.join(metrics)}")
@@ -70,7 +74,8 @@ def measured_in(table: pd.DataFrame, score: str) -> list[str]:
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
-    """Evaluations of policies as a Markdown table; NAME``, deterministic`` gives columns of NAME's line."""
+    """Evaluations of policies as a Markdown table; NAME``, deterministic`` gives columns of NAME's
+    line."""
     hidden = {*["success"] * (not can_succeed), *["late"] * (not late)}
     names = [name for name in next(iter(rows.values())) if name != "episodes"]
     measures = [n for n in names if "run" in declared(n).tables and declared(n).where not in hidden]
@@ -88,7 +93,8 @@ def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = F
 
 
 LOCK = ".lock"
-"""The file that is locked; a process that was killed leaves it in the folder, where it does no harm."""
+"""The file that is locked; a process that was killed leaves it in the folder, where it does no
+harm."""
 
 
 @contextmanager
@@ -105,7 +111,8 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
     try:
         yield
     finally:
-        # While the lock is held: who opened this file before sees that it is gone, and makes a new one.
+        # While the lock is held: who opened this file before sees that it is gone, and makes a new
+        # one.
         with suppress(OSError):  # Windows cannot delete an open file
             (folder / LOCK).unlink()
         lock.release()

@@ -22,7 +22,8 @@ PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra", "numpy", "sh
 
 
 def write_record(folder: Path, command: str, resumes: bool = False, **entries: Any) -> None:
-    """Write the record of a run that begins; that of a resumed one gets the command in its ``resumed``."""
+    """Write the record of a run that begins; that of a resumed one gets the command in its
+    ``resumed``."""
     record = {"command": command, "started": datetime.now(UTC).isoformat(timespec="seconds")}
     if resumes and (first := read_record(folder)):
         record = {**first, "resumed": [*first.get("resumed", []), record]}
@@ -40,11 +41,21 @@ def write_record(folder: Path, command: str, resumes: bool = False, **entries: A
 
 
 def commit() -> str | None:
-    """The commit of DAMIAN's source if it is a git checkout, with ``+changes`` if files were changed."""
+    """The commit of DAMIAN's source if it is a git checkout, with ``+changes`` if files were
+    changed."""
     folder = Path(damian.__file__).parents[1]
     if not (folder / ".git").exists():
         return None
-    git = ["git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes"]
+    git = [
+        "git",
+        "-C",
+        str(folder),
+        "describe",
+        "--always",
+        "--abbrev=40",
+        "--exclude=*",
+        "--dirty=+changes",
+    ]
     try:
         return subprocess.run(git, capture_output=True, encoding="utf-8", check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
@@ -73,7 +84,8 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def check_version(folder: Path, key: str) -> None:
-    """Check that this minor version of damian wrote a run folder; no version reads files of another one."""
+    """Check that this minor version of damian wrote a run folder; no version reads files of another
+    one."""
     writer = str(read_record(folder).get("damian", damian.__version__))
     if writer.split(".")[:2] != damian.__version__.split(".")[:2]:
         problem = f"damian {writer} wrote it, and this is damian {damian.__version__}"

@@ -1,4 +1,5 @@
-"""What a training needs to continue exactly where it was: learner, environment, progress, random numbers."""
+"""What a training needs to continue exactly where it was: learner, environment, progress, random
+numbers."""
 
 import math
 import random
@@ -39,7 +40,8 @@ class Progress:
 
 
 class TrainingState:
-    """All that changes in a training, stored in a run folder: resumed, it goes on bit for bit on a CPU."""
+    """All that changes in a training, stored in a run folder: resumed, it goes on bit for bit on a
+    CPU."""
 
     def __init__(
         self,
@@ -51,7 +53,10 @@ class TrainingState:
         hindsight: HindsightReturns | None = None,
     ) -> None:
         self.folder, self.components = folder, components
-        self.progress, self.episodes = Progress(), EpisodeLog(collector.env.batch_size[0], hindsight)
+        self.progress, self.episodes = (
+            Progress(),
+            EpisodeLog(collector.env.batch_size[0], hindsight),
+        )
         self.saved = 0
         """The update after which the checkpoint of the run was written."""
         self._replay = ReplayMemory(buffer, folder / REPLAY)
@@ -67,7 +72,8 @@ class TrainingState:
 
     def save(self) -> None:
         """Replace the checkpoint of the run; if that fails, the older one is intact."""
-        # The states of the parts first: that of the replay memory writes files, which the checkpoint names.
+        # The states of the parts first: that of the replay memory writes files, which the
+        # checkpoint names.
         parts, networks = _states(self._parts), _states(self.components)
         write_checkpoint(self.folder / CHECKPOINT, {"components": networks, "training": parts})
         self.saved = self.progress.updates
@@ -88,7 +94,8 @@ class TrainingState:
         write_checkpoint(self.folder / BEST, content)
 
     def load(self) -> None:
-        """Continue from the checkpoint of the run, and remove what a killed run has left beside it."""
+        """Continue from the checkpoint of the run, and remove what a killed run has left beside
+        it."""
         path = self.folder / CHECKPOINT
         content = read_checkpoint(path, "resume")
         restore(self.components, content.get("components", {}), path, "resume")
@@ -104,7 +111,8 @@ def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> Non
 
 
 def checkpoint_file(written: Path) -> Path:
-    """The file that a run folder, a file in one, or ``damian:NAME`` of the package's own, stands for."""
+    """The file that a run folder, a file in one, or ``damian:NAME`` of the package's own, stands
+    for."""
     written = Path(data_file(str(written), "checkpoint"))
     return written if written.is_file() else written / CHECKPOINT
 

@@ -1,17 +1,19 @@
 """Where the sources are, as far as messages tell: a Bayes filter of each over the cells of a grid.
 
-``SourceGrid`` tabulates what a server assumes of the sources, the filter turns reports into probabilities,
-and a ``Window`` repeats its latest steps when messages of them come in late: a belief is exact for the
-messages that have arrived. All functions of the filter are pure and batched.
+``SourceGrid`` tabulates what a server assumes of the sources, the filter turns reports into
+probabilities, and a ``Window`` repeats its latest steps when messages of them come in late: a
+belief is exact for the messages that have arrived. All functions of the filter are pure and
+batched.
 
-A message tells which sources its UAV reports. Misses and false alarms of one source are drawn independently
-of those of the others: in each step, a listening UAV out of reach of a source reports that very source with
-its probability ``false_alarm``. So what is reported of the others says nothing of a source, and each one's
-filter is exact without them.
+A message tells which sources its UAV reports. Misses and false alarms of one source are drawn
+independently
+of those of the others: in each step, a listening UAV out of reach of a source reports that very
+source with its probability ``false_alarm``. So what is reported of the others says nothing of a
+source, and each one's filter is exact without them.
 
-Everywhere, ``grid`` is a ``SourceGrid``, ``rows`` are rows of its table ``log_reports`` [*, N], a ``belief``
-is the probability of each of its C cells [*, C], and ``place`` the index of a source's table for its region
-(``places``) [*]. One of the dimensions * is that of the K sources.
+Everywhere, ``grid`` is a ``SourceGrid``, ``rows`` are rows of its table ``log_reports`` [*, N], a
+``belief`` is the probability of each of its C cells [*, C], and ``place`` the index of a source's
+table for its region (``places``) [*]. One of the dimensions * is that of the K sources.
 """
 
 import functools
@@ -37,7 +39,8 @@ from damian.world.signal_source import SourceConfig, draw_walks, footprint_radiu
 CELL = 0.8
 """Edge of a cell over the footprint's radius, if the settings do not give it."""
 MOST_CELLS = 256
-"""A cell whose edge the settings do not give is so large that there are no more cells than about this."""
+"""A cell whose edge the settings do not give is so large that there are no more cells than about
+this."""
 LEAST_REPORT_PROBABILITY = 1e-3
 """Least probability that a UAV reports something else than the grid says: cells are not points."""
 _MAX_CELLS = 10_000
@@ -45,9 +48,11 @@ _MAX_CELLS = 10_000
 _SAMPLES = 6
 """Points along each edge of a cell at which detection is tested."""
 _WALKS, _STEPS, _SEED = 512, 128, 0
-"""Walks, and their steps, from which the moves are counted, and the seed with which they are drawn."""
+"""Walks, and their steps, from which the moves are counted, and the seed with which they are
+drawn."""
 STEPS_PER_MOVE = 4
-"""Steps over which a move is measured: straight moves get further than those that turn in each step."""
+"""Steps over which a move is measured: straight moves get further than those that turn in each
+step."""
 _RARE = 1e-6
 """Weight of a move that was never counted."""
 
@@ -55,7 +60,8 @@ _RARE = 1e-6
 class SourceGrid(NamedTuple):
     """``C`` cells in which the sources may be, in ``R`` regions with ``L`` landing points each.
 
-    Sources that are alike share their tables. The tables of each of G kinds of sources lie behind each other,
+    Sources that are alike share their tables. The tables of each of G kinds of sources lie behind
+    each other,
     as if they were of further regions: P = G R places.
     """
 
@@ -64,24 +70,29 @@ class SourceGrid(NamedTuple):
     prior: Tensor
     """Share of each region's area that lies in each cell, [P, C]."""
     moves: Tensor | None
-    """Weights of a source's moves in a step, from cell to cell, [G, C, C]; None if none moves. If there is
-    only one region, they are probabilities."""
+    """Weights of a source's moves in a step, from cell to cell, [G, C, C]; None if none moves. If
+    there is only one region, they are probabilities."""
     staying: Tensor
     """Sum of the weights of the moves from each cell that end in the region, [P, C]."""
     next_detection: Tensor
-    """Probability that a UAV that lands next on a point detects the source in a cell now, [P*L, C]."""
+    """Probability that a UAV that lands next on a point detects the source in a cell now,
+    [P*L, C]."""
     next_staying: Tensor
-    """The same for one that stays, [2*P*L + 1, C]: row 2p if it detects nothing now on the landing point of
-    flat id p, row 2p + 1 if it detects the source. The last row, of zeros: it is in flight."""
+    """The same for one that stays, [2*P*L + 1, C]: row 2p if it detects nothing now on the landing
+    point of flat id p, row 2p + 1 if it detects the source. The last row, of zeros: it is in
+    flight."""
     log_reports: Tensor
-    """Log-probability of what a UAV reports if the source emits in a cell, [4*P*L + 1, C]: rows as above;
+    """Log-probability of what a UAV reports if the source emits in a cell, [4*P*L + 1, C]: rows as
+    above;
     2*P*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
     emits: Tensor | None
-    """Probability that the source emits in a step, [P] in double precision; None if all always emit."""
+    """Probability that the source emits in a step, [P] in double precision; None if all always
+    emit."""
     false_alarm: Tensor
     """Probability of a report from out of reach, [P] in double precision."""
     first: Tensor
-    """Index of the first region's tables for each source, at each level that may be drawn, [V, K]."""
+    """Index of the first region's tables for each source, at each level that may be drawn,
+    [V, K]."""
 
     @property
     def n_sources(self) -> int:
@@ -102,22 +113,29 @@ class SourceGrid(NamedTuple):
 def build_source_grids(
     airspace: Airspace, sources: Sequence[SourceConfig], dt: float, cell: float | None = None
 ) -> SourceGrid:
-    """The grid of K sources: ``build_source_grid`` of each kind, with cells as for the faintest of them."""
+    """The grid of K sources: ``build_source_grid`` of each kind, with cells as for the faintest of
+    them."""
     alike = [replace(each, position=None) for each in sources]
     kinds = [each for number, each in enumerate(alike) if each not in alike[:number]]
-    cell = cell or _edge([region.polygon for region in airspace.regions], min(map(footprint_radius, kinds)))
+    cell = cell or _edge(
+        [region.polygon for region in airspace.regions], min(map(footprint_radius, kinds))
+    )
     grids = [build_source_grid(airspace, kind, footprint_radius(kind), dt, cell) for kind in kinds]
     still, half = torch.eye(len(grids[0].centres)).unsqueeze(0), grids[0].no_report // 2
     moves = [still if each.moves is None else each.moves for each in grids]
     reports = [each.log_reports[rows] for rows in (slice(half), slice(half, -1)) for each in grids]
     by_place = ("prior", "staying", "next_detection", "emits", "false_alarm")
-    joined: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in grids]) for name in by_place}
+    joined: dict[str, Any] = {
+        name: torch.cat([getattr(each, name) for each in grids]) for name in by_place
+    }
     joined["emits"] = joined["emits"] if (joined["emits"] < 1).any() else None
     last = grids[0].log_reports[-1:]
     return grids[0]._replace(
         **joined,
         moves=None if all(each.moves is None for each in grids) else torch.cat(moves),
-        next_staying=torch.cat([*(each.next_staying[:-1] for each in grids), torch.zeros_like(last)]),
+        next_staying=torch.cat(
+            [*(each.next_staying[:-1] for each in grids), torch.zeros_like(last)]
+        ),
         log_reports=torch.cat([*reports, last]),
         first=torch.tensor([[kinds.index(each) for each in alike]]) * len(airspace.regions),
     )
@@ -133,7 +151,8 @@ def build_source_grid(
 ) -> SourceGrid:
     """Lay the grid over all regions, and tabulate what is known of one source (lengths in metres).
 
-    How it moves is counted from walks as the settings draw them. Whether it emits is taken as drawn anew at
+    How it moves is counted from walks as the settings draw them. Whether it emits is taken as drawn
+    anew at
     every step: with ``emission=per_stop``, silence counts for too much.
     """
     polygons = [region.polygon for region in airspace.regions]
@@ -144,7 +163,9 @@ def build_source_grid(
     columns = _columns(polygons, edge)
     centres = torch.as_tensor(columns * edge, dtype=torch.float32)
     squares = shapely.box(*(columns * edge - edge / 2).T, *(columns * edge + edge / 2).T)
-    prior = torch.as_tensor(np.stack([shapely.area(shapely.intersection(squares, p)) for p in polygons]))
+    prior = torch.as_tensor(
+        np.stack([shapely.area(shapely.intersection(squares, p)) for p in polygons])
+    )
     prior = (prior / prior.sum(-1, keepdim=True)).float()
     moves, staying = None, torch.ones_like(prior)
     if source.motion == "dynamic":
@@ -161,7 +182,16 @@ def build_source_grid(
     emits, alarm, first = chances.expand(3, len(polygons))
     moves = None if moves is None else moves.unsqueeze(0)
     grid = SourceGrid(
-        centres, prior, moves, staying, reports, reports, log_reports, emits, alarm, first[None, :1].long()
+        centres,
+        prior,
+        moves,
+        staying,
+        reports,
+        reports,
+        log_reports,
+        emits,
+        alarm,
+        first[None, :1].long(),
     )
     again = log_reports[grid.no_report // 2 : -1].exp()
     again[::2] = 1 - again[::2]
@@ -205,14 +235,20 @@ def _moves(columns: np.ndarray, displacement: np.ndarray) -> Tensor:
     """Weight of each move from cell to cell, [C, C], from moves [S, 2] in cells."""
     reach = int(np.ptp(columns, axis=0).max())
     weight = np.full((2 * reach + 1, 2 * reach + 1), _RARE)
-    near = displacement[(np.abs(displacement) < reach - 1).all(-1)] if reach > 1 else displacement[:0]
+    near = (
+        displacement[(np.abs(displacement) < reach - 1).all(-1)] if reach > 1 else displacement[:0]
+    )
     whole = np.floor(near).astype(int)
     part = near - whole
     for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
         share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
-        np.add.at(weight, (whole[:, 0] + dx + reach, whole[:, 1] + dy + reach), share / len(displacement))
+        np.add.at(
+            weight, (whole[:, 0] + dx + reach, whole[:, 1] + dy + reach), share / len(displacement)
+        )
     # The source moves in any direction alike: averaged over the symmetries of a square.
-    weight = np.mean([np.rot90(each, turns) for each in (weight, weight.T) for turns in range(4)], 0)
+    weight = np.mean(
+        [np.rot90(each, turns) for each in (weight, weight.T) for turns in range(4)], 0
+    )
     offset = columns[None].astype(int) - columns[:, None].astype(int) + reach
     return torch.as_tensor(weight[offset[..., 0], offset[..., 1]], dtype=torch.float32)
 
@@ -226,18 +262,24 @@ def _renewed(centres: Tensor, moves: Tensor | None, edge: float) -> float:
 
 
 def _log_reports(covered: Tensor, source: SourceConfig, renewed: float) -> Tensor:
-    """The table ``SourceGrid.log_reports``, from the share of each cell that a footprint covers, [R*L, C].
+    """The table ``SourceGrid.log_reports``, from the share of each cell that a footprint covers,
+    [R*L, C].
 
-    A source that stays may be in the part of its cell that a footprint does not cover. So a repeated report
-    counts only as far as it may have moved: with probability ``renewed`` it is anywhere in its cell. Where it
-    stays, reports in and out of reach are independent.
+    A source that stays may be in the part of its cell that a footprint does not cover. So a
+    repeated report
+    counts only as far as it may have moved: with probability ``renewed`` it is anywhere in its
+    cell. Where it stays, reports in and out of reach are independent.
     """
     emits, miss, alarm = source.emits, source.miss, source.false_alarm
     known = 1 - miss - alarm
     reports = alarm + covered * known
     silent = 1 - reports
-    # Probabilities of silence and of a report one step before in reach; out of reach only alarms are heard.
-    was_silent, reported = emits * miss + (1 - emits) * (1 - alarm), emits * (1 - miss) + (1 - emits) * alarm
+    # Probabilities of silence and of a report one step before in reach; out of reach only alarms
+    # are heard.
+    was_silent, reported = (
+        emits * miss + (1 - emits) * (1 - alarm),
+        emits * (1 - miss) + (1 - emits) * alarm,
+    )
     both = covered * (miss * was_silent) + (1 - covered) * (1 - alarm) ** 2
     again = renewed * silent + (1 - renewed) * both / (1 - alarm - emits * covered * known)
     twice = covered * ((1 - miss) * reported) + (1 - covered) * alarm**2
@@ -248,7 +290,8 @@ def _log_reports(covered: Tensor, source: SourceConfig, renewed: float) -> Tenso
 
 
 def _one_step_before(grid: SourceGrid, source: SourceConfig, chances: Tensor) -> Tensor:
-    """Probability of a detection by the cell of the source one step before, from that by its cell, [*, C]."""
+    """Probability of a detection by the cell of the source one step before, from that by its cell,
+    [*, C]."""
     alarm = (1 - source.emits) * source.false_alarm
     if grid.moves is None:
         return source.emits * chances + alarm
@@ -263,7 +306,8 @@ def _one_step_before(grid: SourceGrid, source: SourceConfig, chances: Tensor) ->
 def _detected_shares(
     polygon: shapely.Geometry, points: Tensor, centres: np.ndarray, edge: float, radius: float
 ) -> Tensor:
-    """Share of each cell's part of the polygon in the footprint about each landing point, [L, C]."""
+    """Share of each cell's part of the polygon in the footprint about each landing point,
+    [L, C]."""
     axis = ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * edge
     sample = centres[:, None] + np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     shapely.prepare(polygon)
@@ -271,7 +315,9 @@ def _detected_shares(
     inside |= ~inside.any(-1, keepdims=True)  # a corner of the region between the samples
     weight = torch.as_tensor(inside / inside.sum(-1, keepdims=True), dtype=torch.float32)
     sample = torch.as_tensor(sample.reshape(-1, 2), dtype=torch.float32)
-    parts = [torch.cdist(part, sample) <= radius for part in points.nan_to_num(posinf=1e30).split(256)]
+    parts = [
+        torch.cdist(part, sample) <= radius for part in points.nan_to_num(posinf=1e30).split(256)
+    ]
     return torch.cat([(part.view(len(part), *weight.shape) * weight).sum(-1) for part in parts])
 
 
@@ -282,9 +328,12 @@ _LEAST = 1e-20
 
 
 def repeated(grid: SourceGrid, rows: Tensor, before: Tensor) -> Tensor:
-    """The rows, with those marked as repeated that are as ``before``, one step earlier; [*, N] each."""
+    """The rows, with those marked as repeated that are as ``before``, one step earlier; [*, N]
+    each."""
     same = (rows == before) & (rows != grid.no_report)
-    return torch.add(rows, same, alpha=grid.no_report // 2)  # takes a third of the time of ``where``
+    return torch.add(
+        rows, same, alpha=grid.no_report // 2
+    )  # takes a third of the time of ``where``
 
 
 def places(grid: SourceGrid, region: Tensor, level: Tensor | None) -> Tensor:
@@ -310,12 +359,16 @@ def report_rows(
 
 def likelihood(grid: SourceGrid, rows: Tensor, place: Tensor) -> Tensor:
     """Probability of N reports of one step by the cell of the source, [*, C]."""
-    log = embedding_bag(rows.flatten(0, -2), grid.log_reports, mode="sum")  # gathers and sums at once
+    log = embedding_bag(
+        rows.flatten(0, -2), grid.log_reports, mode="sum"
+    )  # gathers and sums at once
     match = log.exp_().view(*rows.shape[:-1], log.shape[-1])
     if grid.emits is not None:
         reported = rows % 2 == 1  # the row of no report is even
         alarms, reports = reported.sum(-1, True), (rows != grid.no_report).sum(-1, True)
-        emits, alarm = (gather_rows(each, place).unsqueeze(-1) for each in (grid.emits, grid.false_alarm))
+        emits, alarm = (
+            gather_rows(each, place).unsqueeze(-1) for each in (grid.emits, grid.false_alarm)
+        )
         silent = alarm.to(match) ** alarms * (1 - alarm).to(match) ** (reports - alarms)
         match = emits.to(match) * match + (1 - emits).to(match) * silent
     return match.add_(_LEAST)
@@ -327,7 +380,10 @@ def predict(grid: SourceGrid, belief: Tensor, place: Tensor) -> Tensor:
         return belief
     if len(grid.prior) == 1:  # the moves are probabilities
         return belief @ grid.moves[0]
-    stays, kind = belief / gather_rows(grid.staying, place), place // (len(grid.prior) // len(grid.moves))
+    stays, kind = (
+        belief / gather_rows(grid.staying, place),
+        place // (len(grid.prior) // len(grid.moves)),
+    )
     moved = stays @ grid.moves[0]
     for number in range(1, len(grid.moves)):
         moved = torch.where((kind == number).unsqueeze(-1), stays @ grid.moves[number], moved)
@@ -335,7 +391,8 @@ def predict(grid: SourceGrid, belief: Tensor, place: Tensor) -> Tensor:
 
 
 def weigh(predicted: Tensor, likely: Tensor) -> Tensor:
-    """The belief after the messages of a step, from that before them and their ``likelihood``, [*, C]."""
+    """The belief after the messages of a step, from that before them and their ``likelihood``,
+    [*, C]."""
     weighed = predicted * likely
     return weighed.div_(weighed.sum(-1, keepdim=True))
 
@@ -360,7 +417,8 @@ def detection_chance(grid: SourceGrid, belief: Tensor, place: Tensor) -> Tensor:
 
 
 def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
-    """Probability that a UAV which stays, now of report ``rows``, detects the source next, [*, N]."""
+    """Probability that a UAV which stays, now of report ``rows``, detects the source next,
+    [*, N]."""
     chance = gather_rows(grid.next_staying, rows.clamp(max=len(grid.next_staying) - 1))
     return chance.mul_(belief.unsqueeze(-2)).sum(-1)
 
@@ -385,18 +443,20 @@ def _(belief: Tensor) -> Tensor:
 
 
 class Window(NamedTuple):
-    """The latest steps, in a ring of S slots, of B beliefs of V receivers each: of each source in each world.
+    """The latest steps, in a ring of S slots, of B beliefs of V receivers each: of each source in
+    each world.
 
-    A message that comes in late changes what is known of its step; from there the filter runs again. No
-    message is later than the longest delay, so that older beliefs are final. The first receiver is the
-    server. The others, if any, are the N UAVs. Each UAV knows its own messages at once, so that the filter
-    runs for it only from where it knows more than the server.
+    A message that comes in late changes what is known of its step; from there the filter runs
+    again. No message is later than the longest delay, so that older beliefs are final. The first
+    receiver is the server. The others, if any, are the N UAVs. Each UAV knows its own messages at
+    once, so that the filter runs for it only from where it knows more than the server.
     """
 
     belief: Tensor
     """Probability of each cell after the messages of the step, [S, V, B, C]."""
     same_as_server: Tensor
-    """Whether the belief of the receiver is that of the server, and lies only there, [S, V, B] bool."""
+    """Whether the belief of the receiver is that of the server, and lies only there, [S, V, B]
+    bool."""
     report: Tensor
     """What the UAVs report in the step (``report_rows``), [S, N, B]."""
     delay: Tensor
@@ -405,8 +465,11 @@ class Window(NamedTuple):
     """The slot of the latest step, [B]."""
 
 
-def empty_window(grid: SourceGrid, longest: int, n_beliefs: int, n_agents: int, own: bool) -> Window:
-    """A window for messages that are at most ``longest`` steps late; with ``own`` also for each UAV."""
+def empty_window(
+    grid: SourceGrid, longest: int, n_beliefs: int, n_agents: int, own: bool
+) -> Window:
+    """A window for messages that are at most ``longest`` steps late; with ``own`` also for each
+    UAV."""
     device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
     belief = torch.ones(n_slots, n_viewers, n_beliefs, grid.prior.shape[-1], device=device)
     report = torch.full((n_slots, n_agents, n_beliefs), grid.no_report, device=device)
@@ -416,12 +479,15 @@ def empty_window(grid: SourceGrid, longest: int, n_beliefs: int, n_agents: int, 
 
 
 Beliefs = tuple[Tensor, Tensor]
-"""Probability of each cell after the latest step, as the server believes, [B, C], and as each of the other
-receivers does, [B, V - 1, C]."""
+"""Probability of each cell after the latest step, as the server believes, [B, C], and as each of
+the other receivers does, [B, V - 1, C]."""
 
 
-def begin_beliefs(grid: SourceGrid, window: Window, report: Tensor, place: Tensor, mask: Tensor) -> Beliefs:
-    """Begin new episodes for the beliefs of the mask [B], in place; all receivers know the first reports."""
+def begin_beliefs(
+    grid: SourceGrid, window: Window, report: Tensor, place: Tensor, mask: Tensor
+) -> Beliefs:
+    """Begin new episodes for the beliefs of the mask [B], in place; all receivers know the first
+    reports."""
     _begin(*_parts(grid, window), report, place, mask)
     return latest(window, window.slot)
 
@@ -431,8 +497,8 @@ def advance_beliefs(
 ) -> tuple[Window, Beliefs]:
     """Take one step of the beliefs ``stepped`` [B], and correct them by what arrives, in place.
 
-    ``report`` [B, N]: what the messages of this step report (``report_rows``); ``delay`` [B, N]: their delays
-    [steps], negative if they never arrive.
+    ``report`` [B, N]: what the messages of this step report (``report_rows``); ``delay`` [B, N]:
+    their delays [steps], negative if they never arrive.
     """
     slot, on_server, own = _advance(*_parts(grid, window), report, delay, place, stepped)
     return window._replace(slot=slot), (on_server, own)
@@ -446,9 +512,9 @@ def latest(window: Window, slot: Tensor) -> Beliefs:
     return held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:])
 
 
-# Custom operators, because the number of beliefs to compute depends on data, which no compiler can trace. An
-# operator takes no named tuples, so grid and window come in parts: the tensors of the grid, those of the
-# window that change, and its slot.
+# Custom operators, because the number of beliefs to compute depends on data, which no compiler can
+# trace. An operator takes no named tuples, so grid and window come in parts: the tensors of the
+# grid, those of the window that change, and its slot.
 
 _Tables = list[Tensor | None]
 _Ring = list[Tensor]
@@ -459,7 +525,9 @@ def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, _Ring, Tensor]:
 
 
 @torch.library.custom_op("damian::begin_belief", mutates_args=["ring"])
-def _begin(tables: _Tables, ring: _Ring, slot: Tensor, first: Tensor, place: Tensor, mask: Tensor) -> None:
+def _begin(
+    tables: _Tables, ring: _Ring, slot: Tensor, first: Tensor, place: Tensor, mask: Tensor
+) -> None:
     grid, window = SourceGrid._make(tables), Window._make([*ring, slot])
     (world,) = _chosen(mask)
     if not len(world):
@@ -494,7 +562,9 @@ def _advance(
     _write_step(window.delay, slot, sent_delay.T, stepped)
     slot_age = (slot - torch.arange(n_slots, device=slot.device).unsqueeze(-1)) % n_slots
     outdated = _first_outdated(grid, window, slot_age, stepped)
-    for before, row, changes, within, reports in _to_compute(grid, window, slot_age, outdated, place):
+    for before, row, changes, within, reports in _to_compute(
+        grid, window, slot_age, outdated, place
+    ):
         old = window.belief.flatten(0, 2).index_select(0, before)
         new = weigh(predict(grid, old, within), likelihood(grid, reports, within))
         _write(window.belief, row, new, changes)
@@ -510,11 +580,12 @@ def _(tables, ring, slot, sent, sent_delay, place, stepped):
 
 
 def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped: Tensor) -> Tensor:
-    """How many steps ago the first step was after which each receiver's belief is outdated, or -1, [V, B].
+    """How many steps ago the first step was after which each receiver's belief is outdated, or -1,
+    [V, B].
 
-    A UAV has the server's belief as long as it had it in the step before and the server has all that the UAV
-    has reported since; this is noted in place. ``slot_age`` [S, B] tells how long ago each slot's step was,
-    and is also the slot of the step that was so long ago.
+    A UAV has the server's belief as long as it had it in the step before and the server has all
+    that the UAV has reported since; this is noted in place. ``slot_age`` [S, B] tells how long ago
+    each slot's step was, and is also the slot of the step that was so long ago.
     """
     sent, age = window.report != grid.no_report, slot_age.unsqueeze(1)
     arrives = (sent & (window.delay == age)).amax(1)
@@ -536,14 +607,20 @@ def _to_compute(
 ) -> Iterator[tuple[Tensor, ...]]:
     """The M beliefs to compute from those of the step before, step by step, the oldest step first.
 
-    Yields the rows in the flattened ring of the beliefs before [M] and after [M], which change [M] bool,
-    their places [M], and what their receivers know of the step, as rows of ``log_reports`` [M, N].
+    Yields the rows in the flattened ring of the beliefs before [M] and after [M], which change [M]
+    bool, their places [M], and what their receivers know of the step, as rows of ``log_reports``
+    [M, N].
     """
     n_worlds, n_steps = outdated.shape[1], len(slot_age) - 1
     due = torch.arange(n_steps, device=slot_age.device).view(-1, 1, 1) <= outdated
     age, viewer, world = _chosen(due)
-    slot, earlier = (slot_age.flatten().index_select(0, each * n_worlds + world) for each in (age, age + 1))
-    receiver, agent = viewer * n_worlds + world, torch.arange(window.report.shape[1], device=slot.device)
+    slot, earlier = (
+        slot_age.flatten().index_select(0, each * n_worlds + world) for each in (age, age + 1)
+    )
+    receiver, agent = (
+        viewer * n_worlds + world,
+        torch.arange(window.report.shape[1], device=slot.device),
+    )
     at = (slot * len(agent) * n_worlds + world).unsqueeze(-1) + agent * n_worlds
     unknown = (window.delay < 0) | (window.delay > slot_age.unsqueeze(1))
     known = window.report.maximum(unknown * grid.no_report)  # no report is the last row
@@ -561,7 +638,8 @@ def _to_compute(
 
 
 def _row(window: Window, slot: Tensor, viewer: Tensor | int, world: Tensor) -> Tensor:
-    """Rows [*] of the flattened ring in which the beliefs of receivers lie; the server's where the same."""
+    """Rows [*] of the flattened ring in which the beliefs of receivers lie; the server's where the
+    same."""
     n_viewers, n_worlds = window.same_as_server.shape[1:]
     server = slot * n_viewers * n_worlds + world
     if n_viewers == 1:
@@ -574,12 +652,15 @@ def _chosen(mask: Tensor) -> tuple[Tensor, ...]:
     """Indices at which a mask is true; all of them where shapes must not depend on data."""
     if devices.data_dependent(mask.device):
         return mask.nonzero(as_tuple=True)
-    every = torch.meshgrid(*(torch.arange(n, device=mask.device) for n in mask.shape), indexing="ij")
+    every = torch.meshgrid(
+        *(torch.arange(n, device=mask.device) for n in mask.shape), indexing="ij"
+    )
     return tuple(each.flatten() for each in every)
 
 
 def _write(held: Tensor, row: Tensor, new: Tensor, mask: Tensor) -> None:
-    """Write new values [M, C] into rows [M] of the flattened ring [S, V, B, C], where a mask [M] is true."""
+    """Write new values [M, C] into rows [M] of the flattened ring [S, V, B, C], where a mask [M] is
+    true."""
     flat = held.flatten(0, 2)
     if devices.data_dependent(held.device):
         flat.numpy()[row.numpy()] = new.numpy()  # takes a third of the time of ``index_copy_``
@@ -588,6 +669,7 @@ def _write(held: Tensor, row: Tensor, new: Tensor, mask: Tensor) -> None:
 
 
 def _write_step(held: Tensor, slot: Tensor, new: Tensor, mask: Tensor) -> None:
-    """Write values [N, B] into the slots [B] of a ring [S, N, B] in place, where a mask [B] is true."""
+    """Write values [N, B] into the slots [B] of a ring [S, N, B] in place, where a mask [B] is
+    true."""
     at = slot.expand(1, *held.shape[1:])
     held.scatter_(0, at, torch.where(mask, new, held.gather(0, at)))

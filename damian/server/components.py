@@ -1,4 +1,5 @@
-"""Checks that features and reward terms, built-in or your own, have the shapes and bounds they declare."""
+"""Checks that features and reward terms, built-in or your own, have the shapes and bounds they
+declare."""
 
 from collections.abc import Mapping
 from typing import cast
@@ -23,8 +24,9 @@ _WORLDS, _ROUNDING = 16, 1e-5
 def checked_features(server: Server, messages: Messages, steps: Tensor) -> Features:
     """All features of the first messages of episodes [B, N], checked against what they declare.
 
-    Values are finite and within bounds, and a local feature follows from the UAV's own message alone. A
-    reward term of these features gives one value for each UAV. What only later messages show is not found.
+    Values are finite and within bounds, and a local feature follows from the UAV's own message
+    alone. A reward term of these features gives one value for each UAV. What only later messages
+    show is not found.
 
     Raises:
         InputError: a component does not keep what it declares; the message names it.
@@ -36,12 +38,18 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
             found |= server.features(messages, steps, [name])
             values = found[name].float()
             within = (values >= declared.low - _ROUNDING) & (values <= declared.high + _ROUNDING)
-            should = f"is not between {declared.low:g} and {declared.high:g}: scale it, or declare its bounds"
+            should = (
+                f"is not between {declared.low:g} and {declared.high:g}: scale it, or declare its "
+                "bounds"
+            )
             checks.require(bool(within.all()), key, f"{[*values[~within], 0][0]:g}", should)
             if declared.scope == "local":
                 own = _among_others(server, name, some, elapsed)
                 same = own.float().allclose(values[:_WORLDS], atol=_ROUNDING)
-                should = "changes with the messages of other UAVs: make it global, or read only the UAV's own"
+                should = (
+                    "changes with the messages of other UAVs: make it global, or read only the "
+                    "UAV's own"
+                )
                 checks.require(same, key, "local", should)
     for term in server.terms.values():
         with naming_errors(f"reward term {term.name}"):
@@ -50,7 +58,8 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
 
 
 def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) -> Tensor:
-    """A feature [B, N] of what UAVs know who know other messages of each other than these, [B, N]."""
+    """A feature [B, N] of what UAVs know who know other messages of each other than these,
+    [B, N]."""
     n = messages.time.shape[-1]
     own = torch.eye(n, dtype=torch.bool, device=steps.device).expand(len(steps), n, n)
 
@@ -60,8 +69,12 @@ def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) 
         elif field.is_floating_point():
             other = field + 1
         else:
-            other = field.roll(1, 1)  # those of another UAV of its world: landing points of one region
-        return torch.where(expand_mask(own, field.unsqueeze(1)), field.unsqueeze(1), other.unsqueeze(1))
+            other = field.roll(
+                1, 1
+            )  # those of another UAV of its world: landing points of one region
+        return torch.where(
+            expand_mask(own, field.unsqueeze(1)), field.unsqueeze(1), other.unsqueeze(1)
+        )
 
     return server.own_features(tree_map(changed_of_others, messages), steps, [name])[name]
 

@@ -1,4 +1,5 @@
-"""What the columns of an observation mean: named blocks, each with the shape that its values have."""
+"""What the columns of an observation mean: named blocks, each with the shape that its values
+have."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,8 @@ class Block:
     name: str
     """Name of the feature, or of what has been appended."""
     shape: tuple[int, ...]
-    """Shape of the values, such as (4, 5) for five values of each of four others; () for a single one."""
+    """Shape of the values, such as (4, 5) for five values of each of four others; () for a single
+    one."""
     low: float
     """Lowest possible value."""
     high: float
@@ -31,8 +33,8 @@ class Block:
     entries: tuple[str, ...] = ()
     """What each value of the last dimension is, as far as it has a name."""
     rows: bool = False
-    """Whether the first dimension lists things, those that do not exist as zeros; the last value of a row is
-    1 if it is known."""
+    """Whether the first dimension lists things, those that do not exist as zeros; the last value of
+    a row is 1 if it is known."""
 
     @property
     def width(self) -> int:
@@ -71,13 +73,21 @@ class Layout:
         """The block of this name; ``KeyError`` if there is none."""
         found = [block for block in self.blocks if block.name == name]
         if not found:
-            raise KeyError(f"{name} is not a block of this observation, which has {[b.name for b in self]}")
+            raise KeyError(
+                f"{name} is not a block of this observation, which has {[b.name for b in self]}"
+            )
         return found[0]
 
     def appended(
-        self, name: str, shape: tuple[int, ...], low: float = -math.inf, high: float = math.inf, **more
+        self,
+        name: str,
+        shape: tuple[int, ...],
+        low: float = -math.inf,
+        high: float = math.inf,
+        **more,
     ) -> "Layout":
-        """This layout with a further block behind its last column; ``more``: further fields of ``Block``."""
+        """This layout with a further block behind its last column; ``more``: further fields of
+        ``Block``."""
         return Layout((*self.blocks, Block(name, tuple(shape), low, high, self.width, **more)))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -98,7 +108,10 @@ def joined(layouts: Sequence[Layout]) -> Layout:
 
 
 def layout_at(env: EnvBase, key: NestedKey) -> Layout:
-    """The layout of an observation of an environment; a single block where it tells none of these columns."""
+    """The layout of an observation of an environment; a single block where it tells none of these
+    columns."""
     width = env.observation_spec[key].shape[-1]
     told = getattr(env, "layout", {}).get(keys.last_part(key))
-    return told if told and told.width == width else Layout().appended(keys.last_part(key), (width,))
+    return (
+        told if told and told.width == width else Layout().appended(keys.last_part(key), (width,))
+    )

@@ -23,7 +23,8 @@ class Counters(NamedTuple):
     motions: Tensor
     """Motions since each UAV last spotted the source, [*, N]."""
     news: Tensor
-    """Whether the server has not held each UAV's message before, [*, N] bool: pay an event only then."""
+    """Whether the server has not held each UAV's message before, [*, N] bool: pay an event only
+    then."""
 
 
 class RewardTerm(NamedTuple):
@@ -42,10 +43,11 @@ def reward_term(
 ) -> Callable[[Callable[..., Tensor]], RewardTerm]:
     """Decorator that makes a reward term of a function.
 
-    The function gets the features that it ``reads`` by name (built-in or ``package.module:name``), [*, N] or
-    in the shape that they declare, and ``Counters``; its keyword-only arguments are parameters that a
-    configuration may set. It returns [*, N], and must be pure, batched over * and, for ``env.compile()``,
-    free of branches on data. Its ``scope`` is ``individual`` or ``system``.
+    The function gets the features that it ``reads`` by name (built-in or ``package.module:name``),
+    [*, N] or in the shape that they declare, and ``Counters``; its keyword-only arguments are
+    parameters that a configuration may set. It returns [*, N], and must be pure, batched over *
+    and, for ``env.compile()``, free of branches on data. Its ``scope`` is ``individual`` or
+    ``system``.
 
     Examples:
         >>> # in lab.py, used as reward.custom=[{term: lab:low_battery, weight: -1, below: 0.5}]
@@ -79,12 +81,15 @@ class WeightedTerm(NamedTuple):
         value = self.term.compute(known, counters, **self.parameters)
         if value.shape != counters.motions.shape:  # it would be broadcast without a word
             shapes = f"{[*value.shape]} is not {[*counters.motions.shape]} (worlds, UAVs)"
-            raise InputError(f"reward term {self.name}: shape: {shapes}: return a value for each UAV")
+            raise InputError(
+                f"reward term {self.name}: shape: {shapes}: return a value for each UAV"
+            )
         return value.float()
 
 
 def terms_of(config: RewardConfig) -> dict[str, WeightedTerm]:
-    """The terms whose weight is not 0, by name: built-in ones, then the user's own (``reward.custom``).
+    """The terms whose weight is not 0, by name: built-in ones, then the user's own
+    (``reward.custom``).
 
     The parameters of a built-in term are the settings of their names.
     """
@@ -104,7 +109,9 @@ def terms_of(config: RewardConfig) -> dict[str, WeightedTerm]:
         checks.in_range(f"{key}.weight", weight, -1e6, 1e6)
         name = name_of(parameters, path.rpartition(":")[2], key)
         check_parameters(term.compute, parameters, path, key)
-        problem = f"is the name of another term: give it another one, as in {{term: {path}, name: other}}"
+        problem = (
+            f"is the name of another term: give it another one, as in {{term: {path}, name: other}}"
+        )
         checks.require(name not in (*BUILT_IN, *found), f"{key}.name", name, problem)
         if weight != 0:
             found[name] = WeightedTerm(name, weight * factor[term.scope], term, parameters)
@@ -133,7 +140,8 @@ def _per_motion(value: Tensor, counters: Counters) -> Tensor:
 
 
 def _straight(turn: Tensor, drift: str) -> Tensor:
-    """R4^s, from the feature ``source_drift``; it is largest at 1/2, for a UAV that flies at the source."""
+    """R4^s, from the feature ``source_drift``; it is largest at 1/2, for a UAV that flies at the
+    source."""
     if drift == "printed":
         return torch.where(turn <= 0.5, 2 * turn, 1 - turn)
     return 1 - (2 * turn - 1).abs()
@@ -161,7 +169,9 @@ _add("source_distance", "system", lambda x, counters: _per_motion(1 - x, counter
 _add("source_time", "system", lambda x, counters: 1 - x)
 _add("source_bearing", "system", lambda x, counters: 1 - x)
 _add("source_drift", "system", lambda x, counters, *, drift: _straight(x, drift))
-_add("spotting_agents", "system", lambda x, counters, *, desired_spotting: _near(x, desired_spotting))
+_add(
+    "spotting_agents", "system", lambda x, counters, *, desired_spotting: _near(x, desired_spotting)
+)
 _add("mean_distance", "system", lambda x, counters, *, desired_distance: _near(x, desired_distance))
 _add(
     "mean_distance_not_spotting",

@@ -1,7 +1,8 @@
-"""The server node computes observations, rewards and the task's status from messages (paper, section 3.2).
+"""The server node computes observations, rewards and the task's status from messages
+(paper, section 3.2).
 
-The environment calls it with the latest messages sent, ``ServerNode`` with the latest received, and the
-replay storage with those that have arrived by the time of learning.
+The environment calls it with the latest messages sent, ``ServerNode`` with the latest received, and
+the replay storage with those that have arrived by the time of learning.
 """
 
 import itertools
@@ -51,8 +52,14 @@ class ServerOutputs(NamedTuple):
 
     def entries(self, reward_terms: bool = False) -> dict[NestedKey, Tensor]:
         """The outputs by their keys in a TensorDict, ``reward_terms`` only if they are wanted."""
-        found: dict[NestedKey, Tensor] = {keys.REWARD: self.reward.unsqueeze(-1), **self.status.entries()}
-        seen = {keys.OBSERVATION: self.observation, keys.GLOBAL_OBSERVATION: self.global_observation}
+        found: dict[NestedKey, Tensor] = {
+            keys.REWARD: self.reward.unsqueeze(-1),
+            **self.status.entries(),
+        }
+        seen = {
+            keys.OBSERVATION: self.observation,
+            keys.GLOBAL_OBSERVATION: self.global_observation,
+        }
         found |= {key: value for key, value in seen.items() if value is not None}
         terms = self.terms if reward_terms else {}
         return found | {(*keys.REWARD_TERMS, name): term for name, term in terms.items()}
@@ -61,11 +68,12 @@ class ServerOutputs(NamedTuple):
 class Server:
     """Computes features, rewards and status from messages, with any leading dimensions.
 
-    In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of the episode
-    [*], ``source_over`` tells whether the source has finished its walk [*], ``coverage`` is that of an
-    earlier step of the same worlds, which saves time, and ``belief`` the probability that each source is in
-    each cell of ``grid`` [*, K, C], and ``timeline`` what is known of each UAV's stops (``ServerContext``); without
-    them, these are the first messages of the episode. Time features are divided by ``time_scale`` [s].
+    In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of
+    the episode [*], ``source_over`` tells whether the source has finished its walk [*],
+    ``coverage`` is that of an earlier step of the same worlds, which saves time, and ``belief`` the
+    probability that each source is in each cell of ``grid`` [*, K, C], and ``timeline`` what is
+    known of each UAV's stops (``ServerContext``); without them, these are the first messages of the
+    episode. Time features are divided by ``time_scale`` [s].
     """
 
     def __init__(
@@ -92,7 +100,8 @@ class Server:
         self._known_columns = Messages.request_columns(simulation.widths) if knows else None
         levels = simulation.vehicles.values.choices.get("source.level_db")
         radii = [
-            footprint_radius(replace(simulation.config.source, level_db=level)) for level in levels or ()
+            footprint_radius(replace(simulation.config.source, level_db=level))
+            for level in levels or ()
         ]
         self._radii = torch.tensor(radii) if radii else None
         makers = dict.fromkeys(make for name in self.names for make in feature_of(name).tables)
@@ -105,16 +114,21 @@ class Server:
             dt=simulation.dt,
             n_points=airspace.max_points,
             radius=simulation.radius,
-            readings={name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
+            readings={
+                name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)
+            },
             tables={make: make(simulation, observation) for make in makers},
         )
-        # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.
+        # UAVs that fly stay at a landing point for more than a step, so that coverage changes
+        # seldom.
         self.remembers_coverage = "coverage" in self.names and not simulation.vehicles.instant
 
     def _read_terms(self) -> None:
         self.terms = terms_of(self.reward)
         """The terms of the reward, by name."""
-        self.reads = [*dict.fromkeys(itertools.chain(*(each.term.reads for each in self.terms.values())))]
+        self.reads = [
+            *dict.fromkeys(itertools.chain(*(each.term.reads for each in self.terms.values())))
+        ]
         """Names of the features that they read."""
 
     def __getstate__(self) -> dict[str, Any]:
@@ -161,7 +175,8 @@ class Server:
         return known
 
     def counted(self, messages: Messages) -> Tensor:
-        """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
+        """Flat ids of the latest landing points that coverage counts, newest first,
+        [*, N, window]."""
         return messages.trail[..., : self.observation.window]
 
     def region_of(self, messages: Messages) -> Tensor:
@@ -179,10 +194,11 @@ class Server:
         observers: Collection[str] = ("actor", "critic"),
         news: Tensor | None = None,
     ) -> ServerOutputs:
-        """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and what ``observers`` observe.
+        """Rewards (paper, eq. 5-8), the end of the episode (section 4.1) and what ``observers``
+        observe.
 
-        Without ``source_over`` the source never ends. ``news``: which messages the server has not held
-        before, [*, N]; those of now if not given, as without delay and in hindsight.
+        Without ``source_over`` the source never ends. ``news``: which messages the server has not
+        held before, [*, N]; those of now if not given, as without delay and in hindsight.
         """
         seen = {observer: getattr(self.observation, observer) for observer in observers}
         names = sorted({*self.reads, *itertools.chain(*seen.values())})
@@ -198,7 +214,9 @@ class Server:
         ended = status(messages, steps, over.view(steps.shape), self.dt, self.episode)
         terms = reward(judged, counters, self.terms)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
-        actor, critic = (stack(features, seen[x]) if x in seen else None for x in ("actor", "critic"))
+        actor, critic = (
+            stack(features, seen[x]) if x in seen else None for x in ("actor", "critic")
+        )
         known = None
         if self.remembers_coverage and "coverage" in features:
             known = KnownCoverage(self.counted(messages), features["coverage"])
@@ -213,7 +231,8 @@ class Server:
         belief: Tensor | None = None,
         timeline: Tensor | None = None,
     ) -> Features:
-        """The features of these names, or all that an observation or a reward term needs (paper, Table 2)."""
+        """The features of these names, or all that an observation or a reward term needs
+        (paper, Table 2)."""
         remembered = {"coverage": coverage, "belief": belief, "timeline": timeline}
         context = self._known(messages, steps)._replace(**remembered)
         return observe(messages, context, self.names if names is None else names)
@@ -224,7 +243,9 @@ class Server:
 
     def layouts(self, features: Features) -> tuple[Layout, Layout]:
         """The layouts of the actors' and the critic's observations, from features of any worlds."""
-        return layout_of(features, self.observation.actor), layout_of(features, self.observation.critic)
+        return layout_of(features, self.observation.actor), layout_of(
+            features, self.observation.critic
+        )
 
     def observe_with_own_messages(
         self,
@@ -237,8 +258,9 @@ class Server:
     ) -> Tensor:
         """Observations of actors that know their own messages at once, [*, N, F].
 
-        ``received`` and ``sent`` are packed messages [*, N, M] as the server holds them, and as the UAVs sent
-        them last; ``timeline`` and ``own_timeline`` [*, N, slots, 3] are what follows from those that have
+        ``received`` and ``sent`` are packed messages [*, N, M] as the server holds them, and as the
+        UAVs sent them last; ``timeline`` and ``own_timeline`` [*, N, slots, 3] are what follows
+        from those that have
         arrived, and from all sent. ``belief``: that of each UAV, [*, N, K, C].
         """
         known = self.messages(_own_or_others(sent, received, 1))
@@ -254,7 +276,8 @@ class Server:
         belief: Tensor | None = None,
         timeline: Tensor | None = None,
     ) -> Tensor:
-        """Observations [*, N, F] from messages and timelines [*, N, N, ...] (receiver, sender), and beliefs."""
+        """Observations [*, N, F] from messages and timelines [*, N, N, ...] (receiver, sender), and
+        beliefs."""
         names = self.observation.actor
         return stack(self.own_features(known, steps, names, belief, timeline), names)
 
@@ -266,7 +289,8 @@ class Server:
         belief: Tensor | None = None,
         timeline: Tensor | None = None,
     ) -> Features:
-        """Features of UAVs, [*, N, ...] each, who know messages [*, N, N] and more, as in ``observe_each``."""
+        """Features of UAVs, [*, N, ...] each, who know messages [*, N, N] and more, as in
+        ``observe_each``."""
         context = self._known(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
         return observe_own(known, context._replace(belief=belief, timeline=timeline), names)
 
@@ -301,13 +325,15 @@ class Server:
         return messages.readings[..., 0, first]
 
     def scales(self, messages: Messages) -> Tensor:
-        """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
+        """Largest vertex distance of the region to which each world's landing points belong [m],
+        [*]."""
         region, scales = self.region_of(messages), self._scales
         return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)
 
 
 def _own_or_others(own: Tensor, others: Tensor, inner: int) -> Tensor:
-    """What each receiver knows of each sender, [*, N, N, ...]: of itself ``own``, of others ``others``.
+    """What each receiver knows of each sender, [*, N, N, ...]: of itself ``own``, of others
+    ``others``.
 
     Both are [*, N, ...], with ``inner`` dimensions behind the senders.
     """

@@ -1,4 +1,5 @@
-"""The ends of episodes and the success of the task, as the server knows them (paper, section 4.1)."""
+"""The ends of episodes and the success of the task, as the server knows them
+(paper, section 4.1)."""
 
 import math
 from typing import NamedTuple
@@ -21,7 +22,8 @@ class Status(NamedTuple):
     """Whether the episode has ended by its time limit, [*] bool."""
 
     def entries(self) -> dict[str, Tensor]:
-        """TorchRL's entries ``done``, ``terminated`` and ``truncated``, and ``success``, each [*, 1]."""
+        """TorchRL's entries ``done``, ``terminated`` and ``truncated``, and ``success``, each
+        [*, 1]."""
         flags = self._asdict() | {"done": self.terminated | self.truncated}
         return {name: flag.unsqueeze(-1) for name, flag in flags.items()}
 
@@ -42,7 +44,8 @@ def status(
         ended = ended | source_over
     if config.max_steps is not None:
         if config.since_detection:
-            # Times in messages are float32, so the step of the latest detection is the nearest whole number.
+            # Times in messages are float32, so the step of the latest detection is the nearest
+            # whole number.
             latest = messages.detected_time.amax((-2, -1)).clamp(min=0).double()
             steps = steps - (latest / dt).round().long()
         timed_out = steps >= config.max_steps

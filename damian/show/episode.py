@@ -1,6 +1,8 @@
-"""One flown episode as data: the truth, the messages with their delays, and what the server believed.
+"""One flown episode as data: the truth, the messages with their delays, and what the server
+believed.
 
-Films, figures and replay pages are made from it. As a file it is JSON that says itself what its columns mean.
+Films, figures and replay pages are made from it. As a file it is JSON that says itself what its
+columns mean.
 """
 
 import json
@@ -43,14 +45,16 @@ Integers = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of N UAVs over T steps, at T + 1 instants: the reset, and the end of each step."""
+    """One episode of N UAVs over T steps, at T + 1 instants: the reset, and the end of each
+    step."""
 
     about: Mapping[str, Any]
     """Where it comes from: version, policy, seed, and what else the program knows."""
     region: shapely.Polygon | shapely.MultiPolygon
     """Region in which the UAVs fly, east and north [m]."""
     origin: tuple[float, float] | None
-    """Latitude and longitude of the point (0, 0) [deg]; None for a region without a place on Earth."""
+    """Latitude and longitude of the point (0, 0) [deg]; None for a region without a place on
+    Earth."""
     landing_points: Floats
     """Points on which UAVs land, east and north [m], [P, 2]."""
     radius: float
@@ -61,29 +65,39 @@ class Episode:
     """Whether the episode ended with success."""
     time: Annotated[Floats, "time of each instant [s], [T + 1]"]
     position: Annotated[Floats, "true positions: east, north, up [m], [T + 1, N, 3]"]
-    target: Annotated[Floats, "landing points to which the UAVs fly: east, north [m], [T + 1, N, 2]"]
+    target: Annotated[
+        Floats, "landing points to which the UAVs fly: east, north [m], [T + 1, N, 2]"
+    ]
     track: Annotated[Floats, "headings, clockwise from north [rad], [T + 1, N]"]
     battery: Annotated[Floats, "battery levels [%], [T + 1, N]"]
     spotted: Annotated[Flags, "whether the UAV spots a source, [T + 1, N]"]
     source: Annotated[
         Floats | None,
-        "positions of the sources, none if the task has none: east, north [m]; null if nobody knows them, "
+        "positions of the sources, none if the task has none: east, north [m]; null if nobody "
+        "knows them, "
         "[T + 1, K, 2]",
     ]
     emits: Annotated[Flags | None, "whether each source emits; null if nobody knows it, [T + 1, K]"]
-    sent: Annotated[Flags, "whether the UAV sent a message in the step; not at the reset, [T + 1, N]"]
-    delay: Annotated[Integers, "delay of that message [steps], negative if it never arrives, [T + 1, N]"]
+    sent: Annotated[
+        Flags, "whether the UAV sent a message in the step; not at the reset, [T + 1, N]"
+    ]
+    delay: Annotated[
+        Integers, "delay of that message [steps], negative if it never arrives, [T + 1, N]"
+    ]
     believed: Annotated[Floats, "positions in the messages that the server held [m], [T + 1, N, 2]"]
     age: Annotated[Floats, "ages of these messages [s], [T + 1, N]"]
     reward: Annotated[Floats, "rewards of the step, as the server perceived them, [T + 1, N]"]
-    reward_terms: Annotated[Mapping[str, Floats], "their weighted terms by name, each [T + 1, N]"] = field(
-        default_factory=dict
-    )
+    reward_terms: Annotated[
+        Mapping[str, Floats], "their weighted terms by name, each [T + 1, N]"
+    ] = field(default_factory=dict)
     cells: Annotated[Floats | None, "centres of the belief's cells: east, north [m], [C, 2]"] = None
-    belief: Annotated[Floats | None, "probability that each source is in a cell, [T + 1, K, C]"] = None
+    belief: Annotated[Floats | None, "probability that each source is in a cell, [T + 1, K, C]"] = (
+        None
+    )
     requests: Annotated[
         Floats | None,
-        "latest requests: east, north [m], 1 while it is open; null if there are none, [T + 1, M, 3]",
+        "latest requests: east, north [m], 1 while it is open; null if there are none, [T + 1, M, "
+        "3]",
     ] = None
 
     @property
@@ -135,7 +149,8 @@ class Episode:
 
     @cached_property
     def squares(self) -> NDArray[np.object_]:
-        """What of each of the belief's square cells lies in the region, [C] polygons or several of them."""
+        """What of each of the belief's square cells lies in the region, [C] polygons or several of
+        them."""
         if self.cells is None:
             return np.zeros(0, object)
         gaps = np.diff(np.unique(self.cells[:, 0].round(3)))
@@ -152,7 +167,8 @@ class Episode:
         write_atomically(path, json.dumps(self.document(), separators=(",", ":")))
 
     def document(self) -> dict[str, Any]:
-        """What a file holds of the episode, with numbers of ``DIGITS`` significant digits, times of more."""
+        """What a file holds of the episode, with numbers of ``DIGITS`` significant digits, times of
+        more."""
         return {
             "schema": SCHEMA,
             "version": VERSION,
@@ -180,12 +196,23 @@ class Episode:
             fixed["origin"] = found["origin"] and tuple(found["origin"])
             fixed["landing_points"] = np.asarray(found["landing_points"], float)
             return cls(**fixed, **columns)
-        except (AttributeError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
+        except (
+            AttributeError,
+            LookupError,
+            TypeError,
+            ValueError,
+            RecursionError,
+            ShapelyError,
+        ) as error:
             problem = f"no {error}" if isinstance(error, KeyError) else one_line(str(error))
-            raise InputError(f"{path}: it is not an episode of version {VERSION}: {problem}") from error
+            raise InputError(
+                f"{path}: it is not an episode of version {VERSION}: {problem}"
+            ) from error
 
 
-COLUMNS = {f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")}  # type: ignore[union-attr]
+COLUMNS = {
+    f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")
+}  # type: ignore[union-attr]
 """What each column means, by its name."""
 
 OUTPUTS = (keys.STATE, keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY)
@@ -207,21 +234,26 @@ def record(rollout: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> li
 
 
 def at_instant(outputs: TensorDictBase) -> TensorDictBase:
-    """What an episode needs of an environment's outputs after a step, or at the reset, without a reward."""
+    """What an episode needs of an environment's outputs after a step, or at the reset, without a
+    reward."""
     sent = cast(Tensor, outputs[keys.MESSAGE_SENT])
     reward = outputs.get(keys.REWARD, torch.zeros_like(sent, dtype=torch.float32)[..., None])
     return outputs.select(*OUTPUTS, strict=False).set(keys.REWARD, reward)
 
 
 def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> Episode:
-    """The episode of one world from ``at_instant`` of the reset and of each step, stacked, [T + 1]."""
+    """The episode of one world from ``at_instant`` of the reset and of each step, stacked,
+    [T + 1]."""
     message, vehicles = cast(Tensor, instants[keys.MESSAGE]), env.simulation.vehicles
     state, n_drawn = cast(Tensor, instants[keys.STATE]), len(vehicles.values.choices)
     truth = Truth.unpack(state, env.simulation.widths, n_drawn)
     sent = cast(Tensor, instants[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on
     delay = instants.get(keys.DELAY, torch.zeros_like(sent[..., None], dtype=torch.long))
-    own, held = env.server.messages(message), env.server.messages(instants.get(keys.RECEIVED, message))
+    own, held = (
+        env.server.messages(message),
+        env.server.messages(instants.get(keys.RECEIVED, message)),
+    )
     dt = env.scenario.clock.dt
     time = torch.arange(len(sent), dtype=torch.float64) * dt
     belief, grid = instants.get(keys.BELIEF, None), env.server.grid
@@ -251,7 +283,9 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         "belief": belief,
         "requests": truth.requests if env.simulation.widths.requests else None,
     }
-    arrays: dict[str, Any] = {name: x if x is None else np.asarray(x) for name, x in columns.items()}
+    arrays: dict[str, Any] = {
+        name: x if x is None else np.asarray(x) for name, x in columns.items()
+    }
     return Episode(
         about={**about, "region": over.name, "damian": damian.__version__},
         region=over.polygon,
@@ -260,18 +294,23 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         radius=footprint_radius(replace(source, level_db=level) if level else source),
         instant=vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
-        reward_terms={name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()},
+        reward_terms={
+            name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()
+        },
         **arrays,
     )
 
 
 def _drawn(env: UavEnv, drawn: Tensor) -> dict[str, Any]:
-    """What was drawn for the episode, [1, D], by key, and its wind: speed [m/s], direction [deg]."""
+    """What was drawn for the episode, [1, D], by key, and its wind: speed [m/s], direction
+    [deg]."""
     values, about = env.simulation.vehicles.values, {}
     if values.choices:
         about["drawn"] = dict(zip(values.choices, drawn[0].tolist(), strict=True))
     if env.simulation.vehicles.is_windy:
-        about["wind"] = [float(values.get(f"wind.{name}", drawn)) for name in ("speed", "direction")]
+        about["wind"] = [
+            float(values.get(f"wind.{name}", drawn)) for name in ("speed", "direction")
+        ]
     return about
 
 

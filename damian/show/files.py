@@ -16,7 +16,9 @@ from damian.show.replay_page import save_page
 def check_films(formats: Collection[str]) -> None:
     """Refuse a film that no program here can write."""
     films = "mp4" not in formats or FFMpegWriter.isAvailable()
-    checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
+    checks.require(
+        films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif"
+    )
 
 
 def save_episode(
@@ -24,7 +26,8 @@ def save_episode(
 ) -> None:
     """Write an episode to ``file`` with the end ``.json``, and beside it all formats.
 
-    ``views`` are those of its films (gif, mp4), which tell the UAVs that are ``shown`` from the others.
+    ``views`` are those of its films (gif, mp4), which tell the UAVs that are ``shown`` from the
+    others.
     """
     episode.save(file.with_suffix(".json"))
     if "png" in formats:
@@ -35,7 +38,9 @@ def save_episode(
         save_geojson(episode, file.with_suffix(".geojson"))
     films = [kind for kind in formats if kind in ("gif", "mp4")]
     for kind, view in product(films, views):
-        save_film(episode, file.with_name(f"{file.name}{'_3d' * (view == '3d')}.{kind}"), view, shown)
+        save_film(
+            episode, file.with_name(f"{file.name}{'_3d' * (view == '3d')}.{kind}"), view, shown
+        )
 
 
 def summary(name: str, episode: Episode) -> str:

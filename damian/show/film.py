@@ -44,7 +44,10 @@ def save_film(episode: Episode, path: Path, view: str = "2d", shown: Collection[
                 writer.grab_frame()
         return
     pictures = (Image.fromarray(film.frame(step)) for step in steps)
-    kept = {"method": Image.Quantize.MAXCOVERAGE, "dither": Image.Dither.NONE}  # not the mean of like colours
+    kept = {
+        "method": Image.Quantize.MAXCOVERAGE,
+        "dither": Image.Dither.NONE,
+    }  # not the mean of like colours
     first, *others = [each.quantize(**kept) for each in pictures]  # a third of the size
     times = [1000 // STEPS_PER_SECOND] * episode.n_steps + [1000 * LAST_STEPS // STEPS_PER_SECOND]
     content = io.BytesIO()
@@ -53,7 +56,8 @@ def save_film(episode: Episode, path: Path, view: str = "2d", shown: Collection[
 
 
 def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
-    """Write the picture of the instant at which the server was most mistaken about where the UAVs were."""
+    """Write the picture of the instant at which the server was most mistaken about where the UAVs
+    were."""
     error = np.linalg.norm(episode.true - episode.believed, axis=-1).sum(-1)
     film = Film(episode, shown=shown)
     film.draw(int(np.flatnonzero(error == error.max())[-1]))
@@ -63,7 +67,8 @@ def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> N
 class Film:
     """Draws the instants of an episode into one figure; ``2d``: from above, ``3d``: in space.
 
-    ``shown`` are the IDs of the UAVs to tell apart; if there are none, all of up to six, or three of more.
+    ``shown`` are the IDs of the UAVs to tell apart; if there are none, all of up to six, or three
+    of more.
     """
 
     def __init__(self, episode: Episode, view: str = "2d", shown: Collection[str] = ()) -> None:
@@ -77,21 +82,32 @@ class Film:
             FigureCanvasAgg(self.figure)
 
             def axes(*place: float, projection: str | None = None) -> Any:
-                return self.figure.add_axes(tuple(np.divide(place, size * 2)), projection=projection)
+                return self.figure.add_axes(
+                    tuple(np.divide(place, size * 2)), projection=projection
+                )
 
             if view == "3d":
                 room = np.array([5.1, height])
-                corner = (0.15, low) + room / 2 - WIDTH  # of axes that are so large that they cut nothing
+                corner = (
+                    (0.15, low) + room / 2 - WIDTH
+                )  # of axes that are so large that they cut nothing
                 self.map = axes(*corner, 2 * WIDTH, 2 * WIDTH, projection="3d")
                 self.view: MapView | SpaceView = SpaceView(self.map, episode, DPI * room)
-                self.figure.text(0.65 / size[0], (low - 0.2) / size[1], self.view.scale, color="0.4")
+                self.figure.text(
+                    0.65 / size[0], (low - 0.2) / size[1], self.view.scale, color="0.4"
+                )
             else:
                 self.map = axes(0.65, low, 4.5, height)
                 self.view = MapView(self.map, episode)
             self.charts = [axes(5.55, low + up * height, 1.45, 0.19 * height) for up in (0.33, 0)]
             self.lanes = axes(0.65, 0.5, 6.35, rows)
             top = (5.35 / size[0], (low + height + 0.1) / size[1])
-            style = {"loc": "upper left", "bbox_to_anchor": top, "frameon": False, "labelspacing": 0.3}
+            style = {
+                "loc": "upper left",
+                "bbox_to_anchor": top,
+                "frameon": False,
+                "labelspacing": 0.3,
+            }
             self.figure.legend(handles=legend_marks(episode, len(self.chosen)), **style)
             self._draw_charts()
             draw_messages(self.lanes, episode, self.colours)
@@ -122,11 +138,16 @@ class Film:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def _draw_charts(self) -> None:
-        """Draw over time the return so far, and the ages of messages, or the batteries if they are used."""
+        """Draw over time the return so far, and the ages of messages, or the batteries if they are
+        used."""
         episode = self.episode
         used = not np.allclose(episode.battery, episode.battery[:1])
-        title, values = ("battery [%]", episode.battery) if used else ("age of information [s]", episode.age)
-        self.charts[0].plot(episode.time, episode.reward.mean(-1).cumsum(), color=INK, linewidth=1.3)
+        title, values = (
+            ("battery [%]", episode.battery) if used else ("age of information [s]", episode.age)
+        )
+        self.charts[0].plot(
+            episode.time, episode.reward.mean(-1).cumsum(), color=INK, linewidth=1.3
+        )
         if len(self.chosen) < episode.n_agents:  # lines of many UAVs would hide each other
             title = f"{title.replace(' of information', '')}, grey: all UAVs"
             step, ends = None if used else "post", (values.min(-1), values.max(-1))
@@ -145,7 +166,9 @@ class Film:
         drawn = []
         for axis in (self.lanes, *self.charts):
             end = axis.get_xlim()[1]
-            drawn.append(axis.axvspan(time, end, facecolor="white", alpha=0.65, linewidth=0, zorder=8))
+            drawn.append(
+                axis.axvspan(time, end, facecolor="white", alpha=0.65, linewidth=0, zorder=8)
+            )
             drawn.append(axis.axvline(time, color=INK, linewidth=0.9, zorder=9))
         return drawn
 

@@ -1,4 +1,5 @@
-"""One instant of an episode, as every picture of it shows it: on the map, in space, and as GeoJSON."""
+"""One instant of an episode, as every picture of it shows it: on the map, in space, and as
+GeoJSON."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -10,7 +11,8 @@ from damian.common.plotting import COLOURS, UAV_COLOURS
 from damian.show.episode import LIKELY, Episode, Floats
 
 TRAIL, SOME = 8, 3
-"""Number of steps whose path is drawn behind a UAV, and of UAVs of many to tell apart if none is chosen."""
+"""Number of steps whose path is drawn behind a UAV, and of UAVs of many to tell apart if none is
+chosen."""
 INK, OTHER = "#222222", "#95928b"
 """Colours of texts, and of the UAVs that are not told apart."""
 
@@ -21,7 +23,8 @@ class Uav:
 
     id: str
     chosen: bool
-    """Whether the picture tells it apart: by its name, its colour, its path and what is believed of it."""
+    """Whether the picture tells it apart: by its name, its colour, its path and what is believed of
+    it."""
     colour: str
     ink: str
     """The colour of its texts, which is dark."""
@@ -47,15 +50,18 @@ class Frame:
     """Time since the reset [s]."""
     uavs: list[Uav]
     sources: list[tuple[Floats, bool]]
-    """Place of each source, east, north [m], [2], and whether it emits; none if nobody knows them."""
+    """Place of each source, east, north [m], [2], and whether it emits; none if nobody knows
+    them."""
     requests: Floats
     """Places of open requests, east, north [m], [M, 2]."""
     cells: list[tuple[Any, float]]
-    """Where a source may well be: polygons or several of them, with the probability that any is there."""
+    """Where a source may well be: polygons or several of them, with the probability that any is
+    there."""
 
 
 def chosen_of(episode: Episode, shown: Collection[str] = ()) -> list[int]:
-    """Numbers of the UAVs that a picture tells apart: those with these IDs, else all of few, some of many."""
+    """Numbers of the UAVs that a picture tells apart: those with these IDs, else all of few, some
+    of many."""
     found = [uav for uav, name in enumerate(episode.ids) if name in shown]
     return found or [*range(episode.n_agents if episode.n_agents <= len(COLOURS) else SOME)]
 
@@ -63,7 +69,10 @@ def chosen_of(episode: Episode, shown: Collection[str] = ()) -> list[int]:
 def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None) -> Frame:
     """An episode after ``step`` steps, with the numbers of the UAVs to tell apart, or all."""
     begin = max(step - TRAIL, 0)
-    rank = {uav: place for place, uav in enumerate(range(episode.n_agents) if chosen is None else chosen)}
+    rank = {
+        uav: place
+        for place, uav in enumerate(range(episode.n_agents) if chosen is None else chosen)
+    }
     known, emits, asked = episode.source, episode.emits, episode.requests
     belief = [] if episode.belief is None else 1 - (1 - episode.belief[step]).prod(0)
     uavs = [
@@ -84,9 +93,13 @@ def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None)
     return Frame(
         time=float(episode.time[step]),
         uavs=uavs,
-        sources=[] if known is None or emits is None else [*zip(known[step], emits[step], strict=True)],
+        sources=[]
+        if known is None or emits is None
+        else [*zip(known[step], emits[step], strict=True)],
         requests=np.zeros((0, 2)) if asked is None else asked[step][asked[step][:, 2] > 0, :2],
-        cells=[(area, float(p)) for area, p in zip(episode.squares, belief, strict=True) if p > LIKELY],
+        cells=[
+            (area, float(p)) for area, p in zip(episode.squares, belief, strict=True) if p > LIKELY
+        ],
     )
 
 

@@ -24,18 +24,21 @@ _CORNERS = 16
 
 def save_geojson(episode: Episode, path: Path) -> None:
     """Write an episode as GeoJSON, with what is true and believed at its last instant."""
-    write_atomically(path, json.dumps(feature_collection(episode, episode.n_steps), separators=(",", ":")))
+    write_atomically(
+        path, json.dumps(feature_collection(episode, episode.n_steps), separators=(",", ":"))
+    )
 
 
 def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     """An episode up to an instant as a FeatureCollection.
 
-    The property ``kind`` of a feature says what it is: ``region`` (with its ``name``), ``landing points``,
-    ``track`` (of a UAV, with ``times`` [s] of its points, ``times_utc`` if known, and ``altitudes_m`` above
-    the ground; in coordinates they would be above the ellipsoid), ``source track`` (if it is known),
-    ``footprint`` and ``coverage`` (what its footprints have covered) of a UAV, ``believed position`` (with
-    ``age_s``), and ``belief`` (a cell, with the ``probability`` that any source is in it). Across the
-    antimeridian, longitudes go beyond 180.
+    The property ``kind`` of a feature says what it is: ``region`` (with its ``name``), ``landing
+    points``, ``track`` (of a UAV, with ``times`` [s] of its points, ``times_utc`` if known, and
+    ``altitudes_m`` above the ground; in coordinates they would be above the ellipsoid), ``source
+    track`` (if it is known), ``footprint`` and ``coverage`` (what its footprints have covered) of a
+    UAV, ``believed position`` (with ``age_s``), and ``belief``
+    (a cell, with the ``probability`` that any source is in it). Across the antimeridian, longitudes
+    go beyond 180.
     """
     origin = origin_of(episode)
     features = [
@@ -48,7 +51,9 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
 def origin_of(episode: Episode) -> tuple[float, float]:
     """Latitude and longitude of the point (0, 0) of an episode [deg]."""
     if episode.origin is None:
-        problem = "its region has no latitude and longitude; fly over region=llanbedr, fir or geojson"
+        problem = (
+            "its region has no latitude and longitude; fly over region=llanbedr, fir or geojson"
+        )
         raise InputError(f"geojson: {problem}")
     return episode.origin
 
@@ -58,11 +63,18 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
     yield episode.region, {"kind": "region", "name": episode.about.get("region")}
     yield shapely.MultiPoint(episode.landing_points), {"kind": "landing points"}
     frame, times = frame_of(episode, step), {"times": episode.time[: step + 1].tolist()}
-    if isinstance(began := episode.about.get("began"), str):  # a journal's, whose clock is the calendar's
+    if isinstance(
+        began := episode.about.get("began"), str
+    ):  # a journal's, whose clock is the calendar's
         begin = datetime.fromisoformat(began)
-        times["times_utc"] = [(begin + timedelta(seconds=time)).isoformat() for time in times["times"]]
+        times["times_utc"] = [
+            (begin + timedelta(seconds=time)).isoformat() for time in times["times"]
+        ]
     for number, uav in enumerate(frame.uavs):
-        path, label = episode.true[: step + 1, number], {"uav": number, "name": episode.names[number]}
+        path, label = (
+            episode.true[: step + 1, number],
+            {"uav": number, "name": episode.names[number]},
+        )
         up = {"altitudes_m": episode.position[: step + 1, number, 2].round(2).tolist()}
         places: Any = shapely.points(path)
         footprints: Any = shapely.buffer(places, episode.radius, quad_segs=_CORNERS)
@@ -91,4 +103,6 @@ def on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
         longitude = origin[1] + wrap_longitude(longitude - origin[1])
         return np.column_stack([longitude, latitude]).round(DIGITS)
 
-    return json.loads(shapely.to_geojson(shapely.orient_polygons(shapely.transform(geometry, degrees))))
+    return json.loads(
+        shapely.to_geojson(shapely.orient_polygons(shapely.transform(geometry, degrees)))
+    )

@@ -35,7 +35,9 @@ def save_page(episodes: Sequence[Episode], path: Path) -> None:
 def page(episodes: Sequence[Episode]) -> str:
     """The text of a page that plays episodes."""
     shared, names = titles(episodes)
-    shown = [{"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)]
+    shown = [
+        {"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)
+    ]
     replay = {"colours": UAV_COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}
     modules = {  # as data URLs, by the names by which they import each other
         "libraries" if file.name == _LIBRARIES else f"page/{file.stem}": (
@@ -53,7 +55,8 @@ def page(episodes: Sequence[Episode]) -> str:
 
 
 def titles(episodes: Sequence[Episode]) -> tuple[str, list[str]]:
-    """The settings that all episodes share, and those that tell each from the others; one has all of them."""
+    """The settings that all episodes share, and those that tell each from the others; one has all
+    of them."""
     settings = [_settings(episode) for episode in episodes]
     if len(settings) == 1:
         return "", [" ".join(settings[0]) or "episode"]
@@ -79,7 +82,9 @@ def _text(name: str) -> str:
 
 def _title(parts: Sequence[str]) -> str:
     """The page's title as HTML; lone surrogates, which JSON may hold, have no other form."""
-    return html.escape(" | ".join(filter(None, parts))).encode("ascii", "xmlcharrefreplace").decode()
+    return (
+        html.escape(" | ".join(filter(None, parts))).encode("ascii", "xmlcharrefreplace").decode()
+    )
 
 
 def _in_script(values: Any) -> str:

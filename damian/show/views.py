@@ -30,7 +30,9 @@ _BLOWS = Path([[0.0, 1.0], [0.0, -1.0], [-0.4, -0.4], [0.0, -1.0], [0.4, -0.4]],
 """Arrow of a wind from the north."""
 DART = Path([[0.0, 1.0], [0.62, -0.8], [0.0, -0.42], [-0.62, -0.8], [0.0, 1.0]])
 """Outline of a UAV that flies to the north."""
-_BOLT = Path([[0.2, 1.0], [-0.6, -0.15], [-0.05, -0.15], [-0.2, -1.0], [0.6, 0.15], [0.05, 0.15], [0.2, 1.0]])
+_BOLT = Path(
+    [[0.2, 1.0], [-0.6, -0.15], [-0.05, -0.15], [-0.2, -1.0], [0.6, 0.15], [0.05, 0.15], [0.2, 1.0]]
+)
 _CHARGES: dict[str, Any] = {"marker": _BOLT, "color": "#b8860b", "markersize": 9, "zorder": 1.2}
 """Mark of a place where UAVs charge."""
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
@@ -38,7 +40,8 @@ _ZONE = {"facecolor": "white", "edgecolor": _EDGE, "linewidth": 0.6, "hatch": "/
 _CORNERS = 48
 """Corners of a footprint in space."""
 _SMALL, _HIGHEST = 8.0, 0.35
-"""Size of the mark of one of many [points], and share of the region's size to which heights are enlarged."""
+"""Size of the mark of one of many [points], and share of the region's size to which heights are
+enlarged."""
 _HALO = [withStroke(linewidth=1.8, foreground="white")]
 _NAME = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points", "path_effects": _HALO}
 _AROUND = np.array([(1, 0.5), (1, -0.5), (-1, 0.5), (-1, -0.5), (0, 1), (0, -1), (1, 1), (-1, -1)])
@@ -64,7 +67,9 @@ class MapView:
         lands = [shapely.get_coordinates(part.exterior) for part in _polygons(episode.region)]
         self._areas(lands, facecolor=_LAND, edgecolor=_EDGE, linewidth=1.2, zorder=0)
         self._areas(_zones(episode), zorder=0.6, **_ZONE)
-        axis.plot(*episode.landing_points.T, *self.height, ".", color=_POINT, markersize=2, zorder=1)
+        axis.plot(
+            *episode.landing_points.T, *self.height, ".", color=_POINT, markersize=2, zorder=1
+        )
         axis.plot(*_chargers(episode), *self.height, linestyle="", **_CHARGES)
         (west, south), (east, north) = limits(episode)
         axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
@@ -87,7 +92,9 @@ class MapView:
         others = [uav for uav in frame.uavs if not uav.chosen]
         if others:  # small, and the denser their footprints, the darker
             shades = [to_rgba(OTHER, 0.3 if uav.spots else 0.09) for uav in others]
-            drawn.append(self._areas(list(map(self._print, others)), facecolor=shades, lw=0, zorder=1.5))
+            drawn.append(
+                self._areas(list(map(self._print, others)), facecolor=shades, lw=0, zorder=1.5)
+            )
             drawn += self._marks_of_others(others)
         for uav in frame.uavs:
             drawn += self._uav(uav) if uav.chosen else []
@@ -95,7 +102,9 @@ class MapView:
 
     def _plot(self, place: Floats, marker: str, fill: str, color: str, **style: Any) -> list[Any]:
         """Mark a place on the ground, [2]."""
-        return self.axis.plot(*place, *self.height, marker, color=color, markerfacecolor=fill, **style)
+        return self.axis.plot(
+            *place, *self.height, marker, color=color, markerfacecolor=fill, **style
+        )
 
     def _print(self, uav: Uav) -> Floats:
         """Corners of a footprint, [C, 2]."""
@@ -109,7 +118,9 @@ class MapView:
         parts = list(np.stack([uav.path[:-1], uav.path[1:]], 1))
         if parts:
             fading = np.linspace(0.1, 0.7, len(parts))
-            drawn.append(self._ways(parts, colors=uav.colour, alpha=fading, linewidths=1.6, **self.trail))
+            drawn.append(
+                self._ways(parts, colors=uav.colour, alpha=fading, linewidths=1.6, **self.trail)
+            )
         drawn += self._mark_of(uav)
         if uav.age > 0:
             ring = {"markersize": 12, "markeredgewidth": 1.5, "zorder": 4}
@@ -122,7 +133,9 @@ class MapView:
         axis.apply_aspect()
         uavs = [uav for uav in frame.uavs if uav.chosen]
         named = [(uav, uav.path[-1], _short(uav.id)) for uav in uavs]
-        named += [(uav, uav.believed, f"{_short(uav.id)}, {uav.age:g} s") for uav in uavs if uav.age > 0]
+        named += [
+            (uav, uav.believed, f"{_short(uav.id)}, {uav.age:g} s") for uav in uavs if uav.age > 0
+        ]
         shown = np.array([self._seen(place) for _, place, _ in named])
         points = axis.transData.transform(shown) * 72 / axis.figure.dpi
         covered = [np.stack([points - 5, points + 5], 1)]
@@ -130,15 +143,30 @@ class MapView:
         for (uav, _, text), anchor, place in zip(named, shown, points, strict=True):
             half = np.array([2.4 * len(text), 4.0])
             middles = place + np.concatenate([_AROUND * (half + near) for near in (5, 13, 24)])
-            middles = middles.clip(half, np.multiply(axis.figure.bbox.size, 72 / axis.figure.dpi) - half)
+            middles = middles.clip(
+                half, np.multiply(axis.figure.bbox.size, 72 / axis.figure.dpi) - half
+            )
             boxes = np.stack([middles - half, middles + half], 1)
             low, high = np.concatenate(covered).transpose(1, 0, 2)
             common = np.minimum(boxes[:, None, 1], high) - np.maximum(boxes[:, None, 0], low)
             best = int(common.clip(0).prod(-1).sum(-1).round().argmin())
             covered.append(boxes[best : best + 1])
-            line = {"arrowstyle": "-", "color": uav.ink, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 3}
-            style: dict[str, Any] = {"color": uav.ink, "arrowprops": line, "ha": "center", "va": "center"}
-            drawn.append(axis.annotate(text, tuple(anchor), tuple(middles[best] - place), **style, **_NAME))
+            line = {
+                "arrowstyle": "-",
+                "color": uav.ink,
+                "linewidth": 0.5,
+                "shrinkA": 0,
+                "shrinkB": 3,
+            }
+            style: dict[str, Any] = {
+                "color": uav.ink,
+                "arrowprops": line,
+                "ha": "center",
+                "va": "center",
+            }
+            drawn.append(
+                axis.annotate(text, tuple(anchor), tuple(middles[best] - place), **style, **_NAME)
+            )
         return drawn
 
     def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
@@ -150,11 +178,14 @@ class MapView:
     def _marks_of_others(self, uavs: list[Uav]) -> list[Any]:
         places = np.transpose([uav.path[-1, :2] for uav in uavs])
         marks = self.axis.scatter(*places, s=_SMALL**2, color=OTHER, zorder=3.5)
-        marks.set_paths([DART.transformed(Affine2D().rotate(-uav.heading).scale(0.5)) for uav in uavs])
+        marks.set_paths(
+            [DART.transformed(Affine2D().rotate(-uav.heading).scale(0.5)) for uav in uavs]
+        )
         return [marks]
 
     def _mark_of(self, uav: Uav) -> list[Any]:
-        """A dart that points where the UAV flies, and a line to where the server believes it to be."""
+        """A dart that points where the UAV flies, and a line to where the server believes it to
+        be."""
         true, dart = uav.path[-1, :2], DART.transformed(Affine2D().rotate(-uav.heading))
         style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
         drawn = self.axis.plot(*true, marker=dart, color=uav.colour, **style)
@@ -168,7 +199,8 @@ class MapView:
 
 
 class SpaceView(MapView):
-    """The region and the space above it, which turns slowly; ``room`` is what it may fill [px], [2]."""
+    """The region and the space above it, which turns slowly; ``room`` is what it may fill [px],
+    [2]."""
 
     height, fill = (0.0,), (0.12, 0.35)
     source: ClassVar = {"markersize": 12, "zorder": 5}
@@ -177,9 +209,14 @@ class SpaceView(MapView):
     def __init__(self, axis: Any, episode: Episode, room: Floats) -> None:
         super().__init__(axis, episode)
         self._dt = _step_of(episode)
-        axis.computed_zorder = False  # the middle of the large ground says nothing about what it hides
+        axis.computed_zorder = (
+            False  # the middle of the large ground says nothing about what it hides
+        )
         (west, south), (east, north) = limits(episode)
-        size, highest = np.array([east - west, north - south]), float(episode.position[..., 2].max())
+        size, highest = (
+            np.array([east - west, north - south]),
+            float(episode.position[..., 2].max()),
+        )
         height = 1.1 * max(highest, 0.001 * size.max())
         times = max(1, round(float(f"{_HIGHEST * size.max() / height:.1g}"))) if highest else 1
         axis.set(xlim=(west, east), ylim=(south, north), zlim=(0, height), proj_type="ortho")
@@ -187,7 +224,9 @@ class SpaceView(MapView):
         ground = shapely.get_coordinates(episode.region.buffer(self.radius)).T
         corners = np.hstack([[*ground, np.full(ground.shape[1], up)] for up in (0, height)])
         self._fit(corners, np.array([*size, times * height]) / size.max(), room)
-        heights = f", heights {f'{times} times as large' if times > 1 else 'to scale'}" if highest else ""
+        heights = (
+            f", heights {f'{times} times as large' if times > 1 else 'to scale'}" if highest else ""
+        )
         self.scale = f"{size[0]:.0f} m x {size[1]:.0f} m{heights}"
 
     def draw(self, frame: Frame) -> list[Any]:
@@ -199,13 +238,16 @@ class SpaceView(MapView):
         self.axis.view_init(elev=34, azim=-65 + TURN * steps)
 
     def _fit(self, corners: Floats, shape: Floats, room: Floats) -> None:
-        """Draw a box of this shape so large that these corners in it, [3, C], are always in the room."""
+        """Draw a box of this shape so large that these corners in it, [3, C], are always in the
+        room."""
         axis, far = self.axis, []
         axis.set_box_aspect(shape)
         axis.apply_aspect()
         for angle in range(0, 360, 4):
             self._turn(angle / TURN)
-            seen = np.transpose(proj_transform(corners[0], corners[1], corners[2], axis.get_proj())[:2])
+            seen = np.transpose(
+                proj_transform(corners[0], corners[1], corners[2], axis.get_proj())[:2]
+            )
             far.append(np.abs(axis.transData.transform(seen) - np.mean(axis.bbox, 0)).max(0))
         axis.set_box_aspect(shape, zoom=float((room / 2 / np.max(far, 0)).min()))
 
@@ -228,11 +270,14 @@ class SpaceView(MapView):
         return drawn + self.axis.plot(x, y, z, "o", color=uav.colour, **style)
 
     def _seen(self, place: Floats) -> Floats:
-        return np.array(proj_transform(place[0], place[1], place[2:].sum(), self.axis.get_proj())[:2])
+        return np.array(
+            proj_transform(place[0], place[1], place[2:].sum(), self.axis.get_proj())[:2]
+        )
 
 
 def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> None:
-    """Draw a row for each of these UAVs, in its colour, with its messages over the time of sending."""
+    """Draw a row for each of these UAVs, in its colour, with its messages over the time of
+    sending."""
     dt = _step_of(episode)
     for row, (uav, colour) in enumerate(colours.items()):
         sent = np.flatnonzero(episode.sent[:, uav])
@@ -242,11 +287,17 @@ def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> N
         ends = np.stack([begin, begin + np.maximum(delay, 0) * dt], -1)[late]
         lines = [[(a, row), (b, row)] for a, b in ends]
         axis.add_collection(LineCollection(lines, colors=colour, linewidths=2.2, alpha=0.55))
-        axis.plot(at_once, np.full(len(at_once), row), ".", color=colour, markersize=3, clip_on=False)
+        axis.plot(
+            at_once, np.full(len(at_once), row), ".", color=colour, markersize=3, clip_on=False
+        )
         axis.plot(ends[:, 1], np.full(len(ends), row), ">", color=colour, markersize=3.5)
-        axis.plot(begin[lost], np.full(lost.sum(), row), "x", color=INK, markersize=4.5, clip_on=False)
+        axis.plot(
+            begin[lost], np.full(lost.sum(), row), "x", color=INK, markersize=4.5, clip_on=False
+        )
     size = min(8.0, 50 * height_of_rows(len(colours)) / len(colours))
-    axis.set_yticks(range(len(colours)), [_short(episode.names[uav]) for uav in colours], fontsize=size)
+    axis.set_yticks(
+        range(len(colours)), [_short(episode.names[uav]) for uav in colours], fontsize=size
+    )
     axis.spines["left"].set_visible(False)
     axis.tick_params(left=False)
     axis.set(ylim=(len(colours) - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
@@ -265,7 +316,12 @@ def legend_marks(episode: Episode, n_chosen: int | None = None) -> list[Any]:
     others = episode.n_agents - (n_chosen or episode.n_agents)
     marks: list[Any] = [
         _mark("UAV, true", marker=DART, markersize=9),
-        _mark("UAV, as the server\nbelieves, with age", marker="o", markerfacecolor="none", markersize=9),
+        _mark(
+            "UAV, as the server\nbelieves, with age",
+            marker="o",
+            markerfacecolor="none",
+            markersize=9,
+        ),
     ]
     if others:
         marks.insert(1, _mark(f"{others} other UAVs", color=OTHER, marker=DART, markersize=_SMALL))
@@ -283,13 +339,20 @@ def legend_marks(episode: Episode, n_chosen: int | None = None) -> list[Any]:
         blows = MarkerStyle(_BLOWS, transform=Affine2D().rotate_deg(-direction))
         marks.append(_mark(f"wind, {speed:.2g} m/s", marker=blows, color=INK, markersize=14))
     if episode.belief is not None:
-        marks += [Patch(label=f"source, chance {p:g}", fc=HEAT(_NORM(p)), ec=_EDGE) for p in (0.1, 0.001)]
+        marks += [
+            Patch(label=f"source, chance {p:g}", fc=HEAT(_NORM(p)), ec=_EDGE) for p in (0.1, 0.001)
+        ]
     return marks
 
 
 def _polygons(area: Any) -> list[shapely.Polygon]:
-    """The polygons of a geometry; where a cell touches a border, it may have lines or points too."""
-    return [part for part in shapely.get_parts(area) if part.geom_type == "Polygon" and not part.is_empty]
+    """The polygons of a geometry; where a cell touches a border, it may have lines or points
+    too."""
+    return [
+        part
+        for part in shapely.get_parts(area)
+        if part.geom_type == "Polygon" and not part.is_empty
+    ]
 
 
 def _zones(episode: Episode) -> list[Floats]:

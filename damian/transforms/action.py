@@ -1,4 +1,5 @@
-"""A transform that delays actions (paper, section 3.3), and what transforms that remember actions share."""
+"""A transform that delays actions (paper, section 3.3), and what transforms that remember actions
+share."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -17,7 +18,8 @@ from damian.transforms.entries import Entries, existing, sibling_key, spec_rows
 
 
 class ActionSpecs(NamedTuple):
-    """Actions in the shape of their spec, [*rows, ...]; a row is a world, or an agent of a world."""
+    """Actions in the shape of their spec, [*rows, ...]; a row is a world, or an agent of a
+    world."""
 
     rows: torch.Size
     """Batch size of the actions' TensorDict, as the specs give it."""
@@ -26,20 +28,24 @@ class ActionSpecs(NamedTuple):
     low: Tensor
     """Lower bound of each number of an action, [*rows, ...] float32."""
     width: Tensor
-    """Upper minus lower bound, [*rows, ...] float32; 1 without bounds, with one value only, or one-hot."""
+    """Upper minus lower bound, [*rows, ...] float32; 1 without bounds, with one value only, or
+    one-hot."""
     bounded: bool
     """Whether (action - low) / width lies in [0, 1] for every number of an action."""
 
 
 def _range(spec: TensorSpec) -> tuple[Tensor, Tensor]:
-    """Lowest and highest values of each number of an action, in the shape and type of the actions."""
+    """Lowest and highest values of each number of an action, in the shape and type of the
+    actions."""
     if isinstance(spec, MultiCategorical):  # before Categorical, which is its base class
         low, high = 0, spec.nvec - 1
     elif isinstance(spec, Categorical):
         low, high = 0, spec.n - 1
     else:
         low, high = spec.space.low, spec.space.high  # type: ignore[union-attr]
-    low, high = (torch.as_tensor(each, dtype=spec.dtype, device=spec.device) for each in (low, high))
+    low, high = (
+        torch.as_tensor(each, dtype=spec.dtype, device=spec.device) for each in (low, high)
+    )
     return low.expand(spec.shape), high.expand(spec.shape)
 
 
@@ -51,7 +57,9 @@ def _default_action(space: tuple[Tensor, Tensor], default: Any) -> Tensor:
     value = torch.as_tensor(default, dtype=low.dtype, device=low.device).expand(low.shape)
     if not bool(((value >= low) & (value <= high)).all()):
         bounds = f"{low.min().item() + 0} and {high.max().item() + 0}"
-        raise InputError(f"default: {default} is not a legal default action, which lies between {bounds}")
+        raise InputError(
+            f"default: {default} is not a legal default action, which lies between {bounds}"
+        )
     return value
 
 
@@ -78,7 +86,9 @@ class ActionTransform(StatefulTransform):
         spec, rows = specs[self.action_key], spec_rows(specs, self.action_key)
         if isinstance(spec, OneHot):
             indices = spec.to_categorical_spec()
-            initial = indices.to_one_hot(_default_action(_range(indices), self.default)).to(spec.dtype)
+            initial = indices.to_one_hot(_default_action(_range(indices), self.default)).to(
+                spec.dtype
+            )
             low = torch.zeros_like(initial, dtype=torch.float32)
             return ActionSpecs(rows, initial, low, torch.ones_like(low), True)
         space = _range(spec)
@@ -86,30 +96,34 @@ class ActionTransform(StatefulTransform):
         width = high - low
         bounded = isinstance(spec, Categorical | Bounded) & width.isfinite()
         low, width = torch.where(bounded, low, 0), torch.where(bounded & (width > 0), width, 1)
-        return ActionSpecs(rows, _default_action(space, self.default), low, width, bool(bounded.all()))
+        return ActionSpecs(
+            rows, _default_action(space, self.default), low, width, bool(bounded.all())
+        )
 
 
 class ActionDelay(ActionTransform):
     """Delays actions: the environment executes the action that the policy chose some steps ago.
 
-    Until the first action of an episode arrives, the environment executes a default action. In a step in
-    which no newer action arrives, it executes the same action again. The TensorDict keeps the chosen action.
-    With delay 0 the rollout is the same, bit for bit, as without the transform.
+    Until the first action of an episode arrives, the environment executes a default action. In a
+    step in which no newer action arrives, it executes the same action again. The TensorDict keeps
+    the chosen action. With delay 0 the rollout is the same, bit for bit, as without the transform.
 
-    A worked timeline, with a delay of 3 steps: the action a0, chosen at t = 0, is executed in the step that
-    begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
+    A worked timeline, with a delay of 3 steps: the action a0, chosen at t = 0, is executed in the
+    step that begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
 
     Args:
-        delay, dt, context_keys, seed: as in ``ObservationDelay``; the policy's input and the outputs of a
-            reset must have the entries that the law reads.
+        delay, dt, context_keys, seed: as in ``ObservationDelay``; the policy's input and the
+            outputs of a reset must have the entries that the law reads.
         action_key: key of the action. A bare name for another key means an entry beside it.
-        default: action that is executed until the first one arrives: a number, or values in the shape of an
-            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
+        default: action that is executed until the first one arrives: a number, or values in the
+            shape of an action; an index for discrete and one-hot actions. If not given, the legal
+            value nearest to 0.
         loss: probability that an action never arrives.
-        sent_key: key of a flag in the policy's input, [...] bool: which actions are sent; if not given, all.
-        valid_key: key of a flag that is written for the environment, [...] bool: true if the action is
-            executed for the first time, or is the default. A ``ParallelEnv`` passes it on only if its specs
-            name it.
+        sent_key: key of a flag in the policy's input, [...] bool: which actions are sent; if not
+            given, all.
+        valid_key: key of a flag that is written for the environment, [...] bool: true if the action
+            is executed for the first time, or is the default. A ``ParallelEnv`` passes it on only
+            if its specs name it.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))
@@ -133,8 +147,12 @@ class ActionDelay(ActionTransform):
         self.out_keys_inv = self.in_keys_inv
         self.sampler = sampler_of(delay, dt, loss)
         self.line = DelayLine(self.sampler, "generation")
-        self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
-        self.contexts = ContextReader(self.sampler, context_keys, dt, self.action_key, before_step=True)
+        self.sent_key, self.valid_key = (
+            sibling_key(self.action_key, key) for key in (sent_key, valid_key)
+        )
+        self.contexts = ContextReader(
+            self.sampler, context_keys, dt, self.action_key, before_step=True
+        )
         self.action_keys = existing([self.action_key, self.sent_key, *self.contexts.keys.values()])
 
     @property

@@ -1,4 +1,5 @@
-"""The base class of transforms with memory, the order in which they must stand, and how seeds reach them."""
+"""The base class of transforms with memory, the order in which they must stand, and how seeds reach
+them."""
 
 import itertools
 import multiprocessing
@@ -45,38 +46,46 @@ Change = tuple[Memory, Entries]
 
 
 class Correction(NamedTuple):
-    """How the entries that a transform has changed are corrected in stored steps (``BackupdateStorage``)."""
+    """How the entries that a transform has changed are corrected in stored steps
+    (``BackupdateStorage``)."""
 
     correct: Callable[[Entries, TensorDictBase, Tensor], Entries]
-    """Pure function of the entries after the steps as they are known by now, the stored steps [T, B], and the
-    number of earlier steps in each episode [T, B]: the entries as the transform would have written them."""
+    """Pure function of the entries after the steps as they are known by now, the stored steps
+    [T, B], and the
+    number of earlier steps in each episode [T, B]: the entries as the transform would have written
+    them."""
     lookback: int = 0
     """Number of earlier steps on which the entries after a step depend."""
     paid: Callable[[TensorDictBase, Tensor], Tensor] | None = None
-    """Only of late rewards: whether the reward of each step [T, B] has been paid by the last step."""
+    """Only of late rewards: whether the reward of each step [T, B] has been paid by the last
+    step."""
     delay_key: NestedKey | None = None
     """Only of late rewards: key of the delay of each reward [steps]."""
 
 
 class StatefulTransform(Transform):
-    """Base class of transforms that remember earlier steps of each world, or of each agent of each world.
+    """Base class of transforms that remember earlier steps of each world, or of each agent of each
+    world.
 
     The memory has M rows: one for each element of the innermost TensorDict of a nested key, such as
-    ``("agents", "observation")``; for an entry at the root, one for each world. It is allocated at the first
-    reset and kept in buffers, which ``state_dict`` saves by reference: clone them before the next step, as
-    some are written in place.
+    ``("agents", "observation")``; for an entry at the root, one for each world. It is allocated at
+    the first reset and kept in buffers, which ``state_dict`` saves by reference: clone them before
+    the next step, as some are written in place.
 
-    An agent whose own flag ``done`` falls in the middle of an episode has joined it again, and begins anew.
+    An agent whose own flag ``done`` falls in the middle of an episode has joined it again, and
+    begins anew.
 
-    A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before the
-    environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform; ``DelayedEnv``
-    calls them for several, which compile into one graph. No gradient flows through the memory.
+    A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action``
+    (before the environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one
+    transform; ``DelayedEnv`` calls them for several, which compile into one graph. No gradient
+    flows through the memory.
 
     Args:
         in_keys, in_keys_inv: keys of entries, and of actions, that the transform changes or sends.
-        out_keys, out_keys_inv: keys of the entries that it writes, and under which the policy writes actions.
-        seed: of all draws, until ``damian.set_seed`` gives another; if not given, it is drawn from torch's
-            global generator at the first reset.
+        out_keys, out_keys_inv: keys of the entries that it writes, and under which the policy
+            writes actions.
+        seed: of all draws, until ``damian.set_seed`` gives another; if not given, it is drawn from
+            torch's global generator at the first reset.
     """
 
     stage: str = "delay"
@@ -84,11 +93,13 @@ class StatefulTransform(Transform):
     flushes_at_end: bool = False
     """Whether it delivers what is still in transit in the last step of an episode."""
     is_of_rewards: bool = False
-    """Whether it changes rewards; that of the step in which an agent joins again is of its new life."""
+    """Whether it changes rewards; that of the step in which an agent joins again is of its new
+    life."""
     action_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
-    """Keys of the entries that are passed to ``on_reset`` and ``on_step``; see ``required_keys``."""
+    """Keys of the entries that are passed to ``on_reset`` and ``on_step``; see
+    ``required_keys``."""
     sent_key: NestedKey | None = None
     """Key of the flag that says which rows send a message in this step; None if all do."""
     _rows: torch.Size | None = None
@@ -113,11 +124,13 @@ class StatefulTransform(Transform):
     # Pure functions, for subclasses.
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        """Begin new episodes in the rows of the mask [M], given the outputs ``step_keys`` of the reset."""
+        """Begin new episodes in the rows of the mask [M], given the outputs ``step_keys`` of the
+        reset."""
         return memory, {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        """Change the inputs ``action_keys`` of a step on their way from the policy to the environment."""
+        """Change the inputs ``action_keys`` of a step on their way from the policy to the
+        environment."""
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
@@ -127,7 +140,8 @@ class StatefulTransform(Transform):
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
         """How stored entries are corrected where this transform changed any of ``keys``; else None.
 
-        ``keys``: entries that are computed again from late messages, without ``"next"``, and the rewards.
+        ``keys``: entries that are computed again from late messages, without ``"next"``, and the
+        rewards.
         """
         return None
 
@@ -171,8 +185,8 @@ class StatefulTransform(Transform):
         inner = tensordict.get(path, None) if path else tensordict
         if inner is not None:
             return inner.batch_size
-        # No entry of the group is in the outputs. The specs lack leading dimensions of a batch that is chosen
-        # at a reset (``batch_locked`` is false, as in TorchRL's ``PendulumEnv``).
+        # No entry of the group is in the outputs. The specs lack leading dimensions of a batch that
+        # is chosen at a reset (``batch_locked`` is false, as in TorchRL's ``PendulumEnv``).
         kinds = (self.env.full_action_spec, self.env.full_reward_spec)
         inner_specs = next(specs[path] for specs in kinds if path in specs.keys(True))
         return torch.Size((*tensordict.batch_size, *inner_specs.shape[len(self.env.batch_size) :]))
@@ -219,7 +233,9 @@ class StatefulTransform(Transform):
 
     # TorchRL's hooks.
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         mask = reset_rows(tensordict, self.row_key, self.rows) if self.has_memory else None
         if mask is None and self.has_memory and self.find_rows(tensordict_reset) != self.rows:
             self.clear_memory()  # the number of worlds may be chosen at a reset
@@ -235,14 +251,19 @@ class StatefulTransform(Transform):
         """Allocate the memory, given the outputs of the first reset."""
         container = cast(EnvBase, self.container)
         check_order(all_transforms(container))
-        require_keys(type(self).__name__, self.in_keys_inv, self.env.full_action_spec.keys(True, True))
+        require_keys(
+            type(self).__name__, self.in_keys_inv, self.env.full_action_spec.keys(True, True)
+        )
         _ = container.output_spec  # checks all other keys
         self._rows = self.find_rows(outputs)
-        with torch.inference_mode(False):  # else the buffers could be written only in inference mode
+        with torch.inference_mode(
+            False
+        ):  # else the buffers could be written only in inference mode
             self.set_memory(self.init_memory(outputs))
 
     def _change_at_reset(self, outputs: TensorDictBase, mask: Tensor | None) -> Change:
-        """Begin new episodes in the rows of the mask [M], or in all, given the outputs of the reset."""
+        """Begin new episodes in the rows of the mask [M], or in all, given the outputs of the
+        reset."""
         memory = self.memory
         if mask is None:
             device = next((value.device for value in memory.values()), None)
@@ -277,7 +298,8 @@ class StatefulTransform(Transform):
 
     @cached_property
     def _own_done_key(self) -> NestedKey | None:
-        """Key of the flag of each agent that its episode has ended; None if only worlds have one."""
+        """Key of the flag of each agent that its episode has ended; None if only worlds have
+        one."""
         path = path_of(self.row_key)
         return (*path, DONE) if path and (*path, DONE) in self.env.done_keys else None
 
@@ -290,7 +312,8 @@ class StatefulTransform(Transform):
         return (ended & ~after.get(key)).reshape(-1)
 
     def _begin_again(self, change: Change, entries: Entries, rows: Tensor) -> Change:
-        """A change after which these rows [M] hold what they send in this step as their first message."""
+        """A change after which these rows [M] hold what they send in this step as their first
+        message."""
         memory, first = self.on_reset(change[0], entries, rows)
         merged = dict(change[1])
         for key, new in first.items():
@@ -301,7 +324,8 @@ class StatefulTransform(Transform):
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
     ) -> Change:
-        """Undo a change in the worlds that do not step: ``before`` has their entries, or else ``after``.
+        """Undo a change in the worlds that do not step: ``before`` has their entries, or else
+        ``after``.
 
         Buffers that a step writes in place are right already, as ``on_step`` knows who has stepped.
         """
@@ -313,10 +337,14 @@ class StatefulTransform(Transform):
         for key, new in change[1].items():
             # A later transform that widens an entry restores it itself.
             found = (td.get(key, None) for td in (before, after))
-            same_shape = (value for value in found if value is not None and value.shape == new.shape)
+            same_shape = (
+                value for value in found if value is not None and value.shape == new.shape
+            )
             old = next(same_shape, torch.zeros_like(new))
             new_rows, old_rows = self.to_rows(new), self.to_rows(old)
-            merged[key] = self.from_rows(torch.where(expand_mask(rows, new_rows), new_rows, old_rows))
+            merged[key] = self.from_rows(
+                torch.where(expand_mask(rows, new_rows), new_rows, old_rows)
+            )
         return memory, merged
 
     def _reset_on_native_autoreset(
@@ -339,7 +367,9 @@ class StatefulTransform(Transform):
         require_keys(name, self.required_keys, present)
         taken = next((key for key in self.created_keys if key in present), None)
         if taken is not None:
-            raise InputError(f"{name}: {taken} is already an entry of the environment: choose another name")
+            raise InputError(
+                f"{name}: {taken} is already an entry of the environment: choose another name"
+            )
         return super().transform_output_spec(output_spec)
 
     @property
@@ -366,13 +396,15 @@ class StatefulTransform(Transform):
         name = type(self).__name__
         raise RuntimeError(
             f"{name} remembers earlier steps, so it works only in an environment, after a reset: "
-            f"TransformedEnv(env, {name}(...)); for stored steps: examples/transforms/late_replay_buffer.py"
+            f"TransformedEnv(env, {name}(...)); for stored steps: "
+            "examples/transforms/late_replay_buffer.py"
         )
 
     # Copies and checkpoints.
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy has memory of its own: what was sent to a worker process would share the sender's."""
+        """A copy has memory of its own: what was sent to a worker process would share the
+        sender's."""
         super().__setstate__(state)
         self._buffers = {
             name: value.clone() if value is not None and value.is_shared() else value
@@ -393,12 +425,16 @@ class StatefulTransform(Transform):
         self.leave_episode()
 
     def forget_specs(self) -> None:
-        """Forget what has been read from the environment's specs, which ``cached_property`` keeps."""
-        for name in [n for n in self.__dict__ if isinstance(getattr(type(self), n, None), cached_property)]:
+        """Forget what has been read from the environment's specs, which ``cached_property``
+        keeps."""
+        for name in [
+            n for n in self.__dict__ if isinstance(getattr(type(self), n, None), cached_property)
+        ]:
             del self.__dict__[name]
 
     def leave_episode(self) -> None:
-        """Let ``load_state_dict`` replace the whole memory, because the worlds are replaced, too."""
+        """Let ``load_state_dict`` replace the whole memory, because the worlds are replaced,
+        too."""
         self._in_episode = False
 
     def get_extra_state(self) -> Tensor | None:
@@ -412,19 +448,25 @@ class StatefulTransform(Transform):
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        """Load the memory. A state without entries of this transform makes the next reset the first.
+        """Load the memory. A state without entries of this transform makes the next reset the
+        first.
 
-        A state does not tell where the environment's worlds are, so an episode that the environment is in
-        goes on with its own messages, as TorchRL's collectors need it: right after a reset, the random
-        streams are loaded; later, nothing.
+        A state does not tell where the environment's worlds are, so an episode that the environment
+        is in goes on with its own messages, as TorchRL's collectors need it: right after a reset,
+        the random streams are loaded; later, nothing.
         """
         first, errors = self._first if self._in_episode else None, args[-1]
         if self._in_episode and first is None:
-            text = "in the middle of an episode no state is loaded: load it before a reset or right after one"
+            text = (
+                "in the middle of an episode no state is loaded: load it before a reset or right "
+                "after one"
+            )
             warnings.warn(f"{type(self).__name__}: {text}", stacklevel=2)
             return
         inner = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
-        saved: Memory = {k: v.detach() for k, v in inner.items() if "." not in k and k != "_extra_state"}
+        saved: Memory = {
+            k: v.detach() for k, v in inner.items() if "." not in k and k != "_extra_state"
+        }
         own = self.memory
         self.clear_memory()
         self.set_memory({k: own.get(k, v).clone() for k, v in saved.items()})
@@ -442,12 +484,14 @@ class StatefulTransform(Transform):
         self.clear_memory()
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Set a seed for each world, [B] integers: a world's draws then do not depend on the other worlds."""
+        """Set a seed for each world, [B] integers: a world's draws then do not depend on the other
+        worlds."""
         self._seed, self._world_seeds = None, seeds.to(torch.long)
         self.clear_memory()
 
     def streams(self, batch: torch.Size, device: torch.device, sampler: Sampler) -> Tensor:
-        """A random stream (a key of the counter-based generator) for each row, [M] int64, 0 if none draws."""
+        """A random stream (a key of the counter-based generator) for each row, [M] int64, 0 if none
+        draws."""
         n_worlds = batch.numel()
         n_agents = self.rows.numel() // n_worlds
         if sampler.constant_delay is not None:
@@ -456,7 +500,9 @@ class StatefulTransform(Transform):
             worlds = self._world_seeds.to(device)
         else:
             seed = self._seed
-            if seed is None:  # worker processes with the same state of torch's generator get different ones
+            if (
+                seed is None
+            ):  # worker processes with the same state of torch's generator get different ones
                 process = multiprocessing.current_process().name
                 seed = int(torch.randint(2**62, ())) ^ counter_rng.number_of(process)
             worlds = counter_rng.world_seeds(seed, n_worlds, device)
@@ -467,7 +513,9 @@ class StatefulTransform(Transform):
         place = next((i for i, other in enumerate(alike) if other is self), 0)
         number = counter_rng.number_of(f"{type(self).__name__} {keys[0]} {keys[1]} {place}")
         name = torch.tensor(number, device=device)
-        streams = counter_rng.bits64(worlds.view(-1, 1), name, torch.arange(n_agents, device=device))
+        streams = counter_rng.bits64(
+            worlds.view(-1, 1), name, torch.arange(n_agents, device=device)
+        )
         return streams_for(sampler, streams.flatten(), n_agents)
 
 
@@ -475,10 +523,11 @@ class StatefulTransform(Transform):
 
 
 def check_order(transforms: Sequence[Transform]) -> None:
-    """Refuse an order, as outputs pass the transforms, in which one undoes or misses what another does.
+    """Refuse an order, as outputs pass the transforms, in which one undoes or misses what another
+    does.
 
-    Raises ``InputError`` if a transform reads what one of an earlier stage changes after it, or if rewards in
-    transit would be lost at an end of the episode.
+    Raises ``InputError`` if a transform reads what one of an earlier stage changes after it, or if
+    rewards in transit would be lost at an end of the episode.
     """
     for first, second in itertools.combinations(transforms, 2):
         problem, limits = None, isinstance(second, StepCounter) and second.max_steps is not None
@@ -492,7 +541,9 @@ def check_order(transforms: Sequence[Transform]) -> None:
             problem = "what is in transit at the end of an episode would be lost"
         if problem:
             names = type(first).__name__, type(second).__name__
-            raise InputError(f"order of transforms: {names[0]} must come after {names[1]}: {problem}")
+            raise InputError(
+                f"order of transforms: {names[0]} must come after {names[1]}: {problem}"
+            )
 
 
 def leaf_transforms(transform: Transform | None) -> list[Any]:
@@ -505,7 +556,8 @@ def leaf_transforms(transform: Transform | None) -> list[Any]:
 
 
 def all_transforms(env: EnvBase | None) -> list[Transform]:
-    """All transforms of an environment and of those within it, in the order in which outputs pass them."""
+    """All transforms of an environment and of those within it, in the order in which outputs pass
+    them."""
     if not isinstance(env, TransformedEnv):
         return []
     return [*all_transforms(env.base_env), *leaf_transforms(env.transform)]
@@ -515,11 +567,12 @@ def all_transforms(env: EnvBase | None) -> list[Transform]:
 
 
 def set_seed(env: EnvBase, seed: int) -> int | None:
-    """Seed an environment and the transforms of damian within it; returns the next seed, as TorchRL does.
+    """Seed an environment and the transforms of damian within it; returns the next seed, as TorchRL
+    does.
 
-    TorchRL's ``env.set_seed`` does not reach transforms, nor does this function reach worker processes. The
-    seed holds from the next reset on, and right after a reset of all worlds at once. An environment of
-    ``make_env`` needs only its own ``env.set_seed``.
+    TorchRL's ``env.set_seed`` does not reach transforms, nor does this function reach worker
+    processes. The seed holds from the next reset on, and right after a reset of all worlds at once.
+    An environment of ``make_env`` needs only its own ``env.set_seed``.
     """
     for transform in all_transforms(env):
         if isinstance(transform, StatefulTransform):

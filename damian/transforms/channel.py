@@ -26,43 +26,48 @@ from damian.transforms.entries import (
 
 
 class Channel(StatefulTransform):
-    """Lets the agents of a group send messages to each other, which arrive some steps later or are lost.
+    """Lets the agents of a group send messages to each other, which arrive some steps later or are
+    lost.
 
-    In each step an agent sends an entry of its own (``in_key``), or what its policy chooses (``action_key``).
-    Each receiver holds, of each sender, the message that was generated last of those that have arrived, and
-    observes it, its age, and whether any has arrived in this episode. An agent knows its own message at once.
-    The outputs of a reset are sent like those of a step; a chosen message exists from the first step on. No
-    gradient flows through the channel.
+    In each step an agent sends an entry of its own (``in_key``), or what its policy chooses
+    (``action_key``). Each receiver holds, of each sender, the message that was generated last of
+    those that have arrived, and observes it, its age, and whether any has arrived in this episode.
+    An agent knows its own message at once. The outputs of a reset are sent like those of a step; a
+    chosen message exists from the first step on. No gradient flows through the channel.
 
-    A ``DelayLine`` delays only the time at which a message was generated, on every link [M]; the latest K
-    messages of each of the S senders lie in a ring (``contents`` [K, S, ...]), and what is held in ``held``
-    [M, ...]. The memory also has the ``sender`` of each link, and a ``link`` of each sender.
+    A ``DelayLine`` delays only the time at which a message was generated, on every link [M]; the
+    latest K messages of each of the S senders lie in a ring (``contents`` [K, S, ...]), and what is
+    held in ``held`` [M, ...]. The memory also has the ``sender`` of each link, and a ``link`` of
+    each sender.
 
-    A worked timeline, with a delay of 3 steps: the messages of the reset, t = 0, arrive at t = 3, and those
-    of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds their messages of
-    t = 0, of age 3.
+    A worked timeline, with a delay of 3 steps: the messages of the reset, t = 0, arrive at t = 3,
+    and those of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds
+    their messages of t = 0, of age 3.
 
     Args:
-        delay, dt, seed: as in ``ObservationDelay``, but drawn for each receiver and message; or an N x N
-            nested list of delays, ``delay[receiver][sender]``, whose diagonal is not used. With a
-            ``position_key``, a law may read ``position`` and ``receiver_position``.
-        in_key: key of the entry [*B, N, ...] of a group of agents that every agent sends; if neither this nor
-            ``action_key`` is given, ``("agents", "observation")``. A bare name for another key means an entry
-            beside it.
-        out_key: key under which the received entries are written, [*B, N, N, ...] (receiver, sender).
-        loss: probability that a message does not reach a receiver, or an N x N nested list of it, 1 where a
-            receiver never hears a sender.
+        delay, dt, seed: as in ``ObservationDelay``, but drawn for each receiver and message; or an
+            N x N nested list of delays, ``delay[receiver][sender]``, whose diagonal is not used.
+            With a ``position_key``, a law may read ``position`` and ``receiver_position``.
+        in_key: key of the entry [*B, N, ...] of a group of agents that every agent sends; if
+            neither this nor ``action_key`` is given, ``("agents", "observation")``. A bare name for
+            another key means an entry beside it.
+        out_key: key under which the received entries are written, [*B, N, N, ...]
+            (receiver, sender).
+        loss: probability that a message does not reach a receiver, or an N x N nested list of it, 1
+            where a receiver never hears a sender.
         comm_range: an agent hears only agents within this distance [m] when they send.
-        position_key: key of an entry [*B, N, ...] whose first two numbers are the agent's position [m].
+        position_key: key of an entry [*B, N, ...] whose first two numbers are the agent's position
+            [m].
         sent_key: key of a flag [*B, N] bool: does the agent send in this step.
-        action_key: key of an action [*B, N, message_size] in [-1, 1], which the transform adds to the specs.
+        action_key: key of an action [*B, N, message_size] in [-1, 1], which the transform adds to
+            the specs.
         message_size: how many numbers ``action_key`` has.
         known_at_reset: everyone knows everyone's first message, whatever the delay and the links.
-        age_key: key for the age of the held messages [steps], [*B, N, N] float; before one has arrived,
-            steps since the reset; or None.
+        age_key: key for the age of the held messages [steps], [*B, N, N] float; before one has
+            arrived, steps since the reset; or None.
         mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; or None.
-        delay_key: key for the delays of the messages sent in this step [steps], [*B, N, N] long (receiver,
-            sender), -1 if they never arrive; or None. An actor must not observe it.
+        delay_key: key for the delays of the messages sent in this step [steps], [*B, N, N] long
+            (receiver, sender), -1 if they never arrive; or None. An actor must not observe it.
 
     Examples:
         >>> env = VmasEnv("navigation", num_envs=32, n_agents=3)
@@ -91,10 +96,15 @@ class Channel(StatefulTransform):
     ) -> None:
         if action_key is not None:
             checks.whole("message_size", message_size, 1, unit="numbers")
-            should = "does not go with in_key or known_at_reset: at a reset no message has been chosen yet"
+            should = (
+                "does not go with in_key or known_at_reset: at a reset no message has been chosen "
+                "yet"
+            )
             checks.require(in_key is None and not known_at_reset, "action_key", action_key, should)
         placed = position_key is not None
-        checks.require(comm_range is None or placed, "comm_range", comm_range, "needs a position_key")
+        checks.require(
+            comm_range is None or placed, "comm_range", comm_range, "needs a position_key"
+        )
         sent = None if action_key is not None else in_key or ("agents", "observation")
         super().__init__(sent, seed=seed)
         self.action_key = None if action_key is None else unravel_key(action_key)
@@ -161,7 +171,9 @@ class Channel(StatefulTransform):
             after = self._hold(after, mask)
             after |= {"delay": torch.zeros_like(after["delay"])} if self.delay_key else {}
         merged = {
-            name: new if new is begun[name] else torch.where(expand_mask(mask, new), new, begun[name])
+            name: new
+            if new is begun[name]
+            else torch.where(expand_mask(mask, new), new, begun[name])
             for name, new in after.items()
         }
         return memory | merged, self._outputs(memory | merged)
@@ -181,7 +193,8 @@ class Channel(StatefulTransform):
         return memory, self._outputs(memory)
 
     def _content(self, entries: Entries, device: torch.device) -> Tensor:
-        """What the agents send at a reset, [B * N, ...]; zeros for an action that is not chosen yet."""
+        """What the agents send at a reset, [B * N, ...]; zeros for an action that is not chosen
+        yet."""
         if self.message_size:
             return torch.zeros(self.agents.numel(), self.message_size, device=device)
         return as_rows(entries[self.in_keys[0]], self.agents)
@@ -206,9 +219,12 @@ class Channel(StatefulTransform):
         return active & entries[self.sent_key].reshape(-1, 1, n).expand(-1, n, n).reshape(-1)
 
     def _send(self, memory: Memory, entries: Entries, wanted: Tensor) -> Memory:
-        """Send what was written last over the wanted links [M], and deliver what arrives in this step."""
+        """Send what was written last over the wanted links [M], and deliver what arrives in this
+        step."""
         n = self.agents[-1]
-        position = as_rows(entries[self.position_key], self.agents)[:, :2] if self.position_key else None
+        position = (
+            as_rows(entries[self.position_key], self.agents)[:, :2] if self.position_key else None
+        )
         sent = wanted & memory["hears"]
         if self.comm_range is not None:
             place = cast(Tensor, position).view(-1, n, 2)
@@ -224,7 +240,9 @@ class Channel(StatefulTransform):
         n, sender = self.agents[-1], memory["sender"]
         receiver = torch.arange(len(sender), device=sender.device) // n
         places = {"position": sender, "receiver_position": receiver}
-        read = {} if position is None else {k: position.index_select(0, v) for k, v in places.items()}
+        read = (
+            {} if position is None else {k: position.index_select(0, v) for k, v in places.items()}
+        )
         n_sending = sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n)
         time = (memory["clock"] - memory["reset_at"]) * self.dt
         uniform = counter_rng.uniform(memory["streams"], memory["clock"] + 1)
@@ -233,10 +251,17 @@ class Channel(StatefulTransform):
     def _outputs(self, memory: Memory) -> Entries:
         """What the agents hold, with ages and flags; each agent holds its own message at once."""
         n, shape = self.agents[-1], (*self.agents, self.agents[-1])
-        time, now = ((memory[name] - memory["reset_at"]).view(-1, n) for name in ("generated_at", "clock"))
-        agents, senders = torch.arange(len(now), device=now.device), torch.arange(n, device=now.device)
+        time, now = (
+            (memory[name] - memory["reset_at"]).view(-1, n) for name in ("generated_at", "clock")
+        )
+        agents, senders = (
+            torch.arange(len(now), device=now.device),
+            torch.arange(n, device=now.device),
+        )
         is_own = (agents % n).unsqueeze(-1) == senders
-        own_time = now.masked_fill(now == 1, 0) if self.action_key else now  # nothing is chosen at a reset
+        own_time = (
+            now.masked_fill(now == 1, 0) if self.action_key else now
+        )  # nothing is chosen at a reset
         time = torch.where(is_own, own_time, time)
         newest = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
         own = memory["contents"].flatten(0, 1).index_select(0, newest)
@@ -273,7 +298,9 @@ class Channel(StatefulTransform):
             add_spec(observation_spec, self.out_keys[0], (*pairs, self.message_size))
         else:
             sent = observation_spec[self.in_keys[0]]
-            add_spec(observation_spec, self.out_keys[0], (*pairs, *sent.shape[len(agents) :]), sent.dtype)
+            add_spec(
+                observation_spec, self.out_keys[0], (*pairs, *sent.shape[len(agents) :]), sent.dtype
+            )
         add_spec(observation_spec, self.age_key, pairs)
         add_spec(observation_spec, self.mask_key, pairs, torch.bool)
         add_spec(observation_spec, self.delay_key, pairs, torch.long)

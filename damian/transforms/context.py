@@ -1,4 +1,5 @@
-"""The context of delayed messages, for delay laws that see who sends, from where, when, and how many do."""
+"""The context of delayed messages, for delay laws that see who sends, from where, when, and how
+many do."""
 
 from collections.abc import Mapping
 from typing import cast
@@ -14,12 +15,14 @@ from damian.transforms.entries import Entries, as_rows, sibling_key
 
 
 class ContextReader:
-    """Builds the context of the messages that a transform delays; does nothing if their law sees none.
+    """Builds the context of the messages that a transform delays; does nothing if their law sees
+    none.
 
     The transform's memory must hold ``streams``, ``state``, ``clock`` and ``reset_at``, as in
-    ``DelayLine``. ``context_keys`` are those of the entries that the law gets, by name; a bare name means an
-    entry beside ``beside``. ``before_step``: the messages are sent before the environment steps, as actions
-    are.
+    ``DelayLine``. ``context_keys`` are those of the entries that the law gets, by name; a bare name
+    means an
+    entry beside ``beside``. ``before_step``: the messages are sent before the environment steps, as
+    actions are.
     """
 
     def __init__(
@@ -30,7 +33,11 @@ class ContextReader:
         beside: NestedKey,
         before_step: bool = False,
     ) -> None:
-        self._sees_context, self._dt, self._since_clock = sampler.sees_context, dt, 0 if before_step else 1
+        self._sees_context, self._dt, self._since_clock = (
+            sampler.sees_context,
+            dt,
+            0 if before_step else 1,
+        )
         self.keys: dict[str, NestedKey] = {}
         """Keys of the entries that the law gets, by name."""
         known = dict(context_keys or {}) if sampler.sees_context else {}
@@ -41,14 +48,18 @@ class ContextReader:
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(key)))
 
     def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:
-        """Add what the contexts need to the memory of the transform, M rows of the shape ``rows``."""
+        """Add what the contexts need to the memory of the transform, M rows of the shape
+        ``rows``."""
         if not self._sees_context:
             return memory
         n_agents = rows.numel() // tensordict.batch_size.numel()
         return memory | {"agents": torch.arange(n_agents, device=memory["streams"].device)}
 
-    def read(self, memory: Memory, entries: Entries, sent: Tensor | None, rows: torch.Size) -> Context:
-        """The context of the messages ``sent`` [M] (None: all) in this step; None if the law sees none."""
+    def read(
+        self, memory: Memory, entries: Entries, sent: Tensor | None, rows: torch.Size
+    ) -> Context:
+        """The context of the messages ``sent`` [M] (None: all) in this step; None if the law sees
+        none."""
         if not self._sees_context:
             return None
         agents, streams = memory["agents"], memory["streams"]

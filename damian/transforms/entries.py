@@ -44,7 +44,8 @@ def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Ent
 
 
 def sibling_key(key: NestedKey, name: NestedKey | None) -> NestedKey | None:
-    """The key of the bare ``name`` beside the entry ``key``; a nested key, or None, is returned as it is."""
+    """The key of the bare ``name`` beside the entry ``key``; a nested key, or None, is returned as
+    it is."""
     if name is None or not isinstance(name, str) or isinstance(key, str):
         return name
     return (*key[:-1], name)
@@ -56,7 +57,10 @@ def existing(keys: Iterable[NestedKey | None]) -> list[NestedKey]:
 
 
 def add_spec(
-    specs: Composite, key: NestedKey | None, shape: Sequence[int], dtype: torch.dtype = torch.float32
+    specs: Composite,
+    key: NestedKey | None,
+    shape: Sequence[int],
+    dtype: torch.dtype = torch.float32,
 ) -> None:
     """Add the spec of an entry without bounds; nothing if the key is None."""
     if key is not None:
@@ -70,27 +74,34 @@ def require_keys(transform: str, keys: Sequence[NestedKey], present: Iterable[Ne
     missing = next((key for key in keys if key not in known), None)
     if missing is not None:
         raise InputError(
-            f"{transform}: {missing} is not among the keys of the environment: {listed(map(str, known))}"
+            f"{transform}: {missing} is not among the keys of the environment: "
+            f"{listed(map(str, known))}"
         )
 
 
 def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[NestedKey]:
-    """The keys among ``present`` of the flags of this name that apply to an entry, the outermost first.
+    """The keys among ``present`` of the flags of this name that apply to an entry, the outermost
+    first.
 
-    These are the flags in the TensorDict of the entry and in those around it; if there are none, all flags
-    within the innermost TensorDict around the entry that contains any: TorchRL aggregates flags in this way.
+    These are the flags in the TensorDict of the entry and in those around it; if there are none,
+    all flags within the innermost TensorDict around the entry that contains any: TorchRL aggregates
+    flags in this way.
     """
     path = path_of(key)
     flags = [flag for flag in present if last_part(flag) == name]
     around = [flag for flag in flags if path[: len(path_of(flag))] == path_of(flag)]
     if around:
         return sorted(around, key=lambda flag: len(path_of(flag)))
-    within = ([f for f in flags if path_of(f)[:depth] == path[:depth]] for depth in range(len(path), -1, -1))
+    within = (
+        [f for f in flags if path_of(f)[:depth] == path[:depth]]
+        for depth in range(len(path), -1, -1)
+    )
     return next((found for found in within if found), [])
 
 
 def reset_rows(tensordict: TensorDictBase, key: NestedKey, rows: torch.Size) -> Tensor | None:
-    """The rows that are reset, [M] bool, by the outermost flag ``_reset``; None if there is none."""
+    """The rows that are reset, [M] bool, by the outermost flag ``_reset``; None if there is
+    none."""
     keys = flag_keys("_reset", key, list(tensordict.keys(True, True)))
     if not keys:
         return None
@@ -99,7 +110,8 @@ def reset_rows(tensordict: TensorDictBase, key: NestedKey, rows: torch.Size) -> 
 
 
 def any_flag(flags: Sequence[Tensor], rows: torch.Size) -> Tensor:
-    """Whether any of some flags of worlds [*B, 1], or of their agents [*B, N, 1], is true for a row, [M]."""
+    """Whether any of some flags of worlds [*B, 1], or of their agents [*B, N, 1], is true for a
+    row, [M]."""
     found = torch.zeros(rows, dtype=torch.bool, device=flags[0].device)
     for flag in flags:
         shape = flag.shape[:-1]

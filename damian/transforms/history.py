@@ -17,25 +17,29 @@ from damian.transforms.entries import Entries, add_spec, existing, sibling_key
 
 
 class ActionHistory(ActionTransform):
-    """Lets an agent observe its own latest actions, which make a delayed environment Markovian again.
+    """Lets an agent observe its own latest actions, which make a delayed environment Markovian
+    again.
 
-    It records actions as the policy chose them, so it must come after transforms that delay or hold actions.
+    It records actions as the policy chose them, so it must come after transforms that delay or hold
+    actions.
     The latest action comes last. Sources: Katsikopoulos and Engelbrecht (2003); paper, section 3.3.
 
     Args:
         steps: number of actions.
         action_key: key of the action.
-        out_key: key of the history, [..., steps * A] float32. A bare name, here and below, means an entry
-            beside the action.
-        append_to: key of an entry to which the history is appended in its own type, instead of ``out_key``.
-        codes: vectors that represent discrete actions, [n_actions, A]; if not given, actions are scaled to
-            [0, 1].
+        out_key: key of the history, [..., steps * A] float32. A bare name, here and below, means an
+            entry beside the action.
+        append_to: key of an entry to which the history is appended in its own type, instead of
+            ``out_key``.
+        codes: vectors that represent discrete actions, [n_actions, A]; if not given, actions are
+            scaled to [0, 1].
         default: action that fills the history at first, as in ``ActionDelay``.
-        recorded_key: key of a flag in the policy's input, [...] bool: which actions are recorded; if not
-            given, all.
-        age_key: key of the age of the observation [steps], [..., 1], as ``ObservationDelay`` writes it.
-            Actions that the observation reflects already are then replaced by the default.
-        reflected_after: an observation reflects an action that was chosen at least this many steps before.
+        recorded_key: key of a flag in the policy's input, [...] bool: which actions are recorded;
+            if not given, all.
+        age_key: key of the age of the observation [steps], [..., 1], as ``ObservationDelay`` writes
+            it. Actions that the observation reflects already are then replaced by the default.
+        reflected_after: an observation reflects an action that was chosen at least this many steps
+            before.
 
     Examples:
         >>> history = ActionHistory(2, append_to="observation")
@@ -78,7 +82,9 @@ class ActionHistory(ActionTransform):
         first = self._encode(scale, initial).repeat(1, self.steps)
         memory = scale | {"first": first, "recent": first}
         if self.age_key:  # steps since each recorded action was chosen
-            memory["since"] = torch.zeros(len(first), self.steps, dtype=torch.long, device=first.device)
+            memory["since"] = torch.zeros(
+                len(first), self.steps, dtype=torch.long, device=first.device
+            )
         return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
@@ -97,20 +103,27 @@ class ActionHistory(ActionTransform):
             unchanged["since"] = older
         if self.recorded_key is not None:
             recorded = entries[self.recorded_key].reshape(-1, 1)
-            changed = {name: torch.where(recorded, new, unchanged[name]) for name, new in changed.items()}
+            changed = {
+                name: torch.where(recorded, new, unchanged[name]) for name, new in changed.items()
+            }
         return memory | changed, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         recent, key = memory["recent"], self.out_keys[0]
         if self.age_key:
-            # An observation of this age was generated ``since - age`` steps after the action was chosen.
+            # An observation of this age was generated ``since - age`` steps after the action was
+            # chosen.
             since_chosen = memory["since"] - entries[self.age_key].reshape(-1, 1)
             not_reflected = since_chosen < self.reflected_after
             width = recent.shape[-1] // self.steps
-            recent = torch.where(not_reflected.repeat_interleave(width, -1), recent, memory["first"])
+            recent = torch.where(
+                not_reflected.repeat_interleave(width, -1), recent, memory["first"]
+            )
         history = self.from_rows(recent)
         if key not in entries:
-            return memory, {key: history.clone()}  # others may change it in place, but not the memory
+            return memory, {
+                key: history.clone()
+            }  # others may change it in place, but not the memory
         return memory, {key: torch.cat([entries[key], history.to(entries[key].dtype)], -1)}
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
@@ -121,7 +134,9 @@ class ActionHistory(ActionTransform):
 
         def keep_actions(entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
             key = appended[0]
-            return entries | {key: torch.cat([entries[key], steps[key][..., entries[key].shape[-1] :]], -1)}
+            return entries | {
+                key: torch.cat([entries[key], steps[key][..., entries[key].shape[-1] :]], -1)
+            }
 
         return Correction(keep_actions)
 
@@ -141,13 +156,16 @@ class ActionHistory(ActionTransform):
             return observation_spec
         old = observation_spec[key]
         flat = old.dtype.is_floating_point and len(old.shape) == len(rows) + 1
-        should = "is not a vector of floats, so no actions can be appended to it; use out_key instead"
+        should = (
+            "is not a vector of floats, so no actions can be appended to it; use out_key instead"
+        )
         checks.require(flat, "append_to", key, should)
         observation_spec[key] = self._appended(old, width)
         return observation_spec
 
     def _appended(self, old: TensorSpec, width: int) -> TensorSpec:
-        """The spec ``old`` with ``width`` more columns for the history; bounded if all of them are."""
+        """The spec ``old`` with ``width`` more columns for the history; bounded if all of them
+        are."""
         shape = torch.Size((*old.shape[:-1], old.shape[-1] + width))
         if not isinstance(old, Bounded) or (self.codes is None and not self.actions.bounded):
             return Unbounded(shape, dtype=old.dtype, device=old.device)

@@ -17,17 +17,18 @@ from damian.transforms.entries import Entries, existing, select_entries
 class SampleAndHold(StatefulTransform):
     """Samples entries at the ticks of a slow clock, and holds them in between (paper, section 3.6).
 
-    The clock ticks every ``period`` steps, and at every reset. Between two ticks, the entries ``in_keys``
-    keep the values of the last tick, and the environment executes the actions ``in_keys_inv`` of the last
-    tick again.
+    The clock ticks every ``period`` steps, and at every reset. Between two ticks, the entries
+    ``in_keys`` keep the values of the last tick, and the environment executes the actions
+    ``in_keys_inv`` of the last tick again.
 
-    A worked timeline, with a period of 3 steps: the clock ticks at t = 0, 3 and 6. The observation of t = 0
-    is shown at t = 0, 1 and 2, and that of t = 3 at t = 3, 4 and 5. The action chosen at t = 0 is executed in
-    the steps that begin at t = 0, 1 and 2, whatever is chosen at t = 1 and 2.
+    A worked timeline, with a period of 3 steps: the clock ticks at t = 0, 3 and 6. The observation
+    of t = 0 is shown at t = 0, 1 and 2, and that of t = 3 at t = 3, 4 and 5. The action chosen at t
+    = 0 is executed in the steps that begin at t = 0, 1 and 2, whatever is chosen at t = 1 and 2.
 
     Args:
         period: time between two ticks: steps (``4``), or a time (``"2s"``).
-        in_keys, in_keys_inv: keys of the entries that are sampled and held, and of the actions that are held.
+        in_keys, in_keys_inv: keys of the entries that are sampled and held, and of the actions that
+            are held.
         ready_key: key of a flag, [...] bool, that is set to false between two ticks; or None.
         dt: length of a step [s], for a period given as a time.
 
@@ -57,7 +58,9 @@ class SampleAndHold(StatefulTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         first = select_entries(tensordict, self.in_keys)
         device = next((value.device for value in first.values()), self.env.device)
-        memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}  # since a tick
+        memory = {
+            "elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
+        }  # since a tick
         memory |= {f"held_{i}": self.to_rows(value) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
         for i, key in enumerate(self.in_keys_inv):
@@ -69,7 +72,9 @@ class SampleAndHold(StatefulTransform):
         return self._hold(memory, entries, self.in_keys, "held", mask)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        return self._hold(memory, entries, self.in_keys_inv, "action_at_tick", memory["elapsed"] == 0)
+        return self._hold(
+            memory, entries, self.in_keys_inv, "action_at_tick", memory["elapsed"] == 0
+        )
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed = memory["elapsed"] + 1
@@ -82,7 +87,12 @@ class SampleAndHold(StatefulTransform):
         return memory, held
 
     def _hold(
-        self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, sampled: Tensor
+        self,
+        memory: Memory,
+        entries: Entries,
+        keys: Sequence[NestedKey],
+        name: str,
+        sampled: Tensor,
     ) -> Change:
         """Sample the entries where the mask [M] is true, and output the held values everywhere."""
         outputs: Entries = {}
@@ -102,7 +112,10 @@ class SampleAndHold(StatefulTransform):
         def hold_again(entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
             elapsed = count + 1
             index = torch.arange(len(count), device=count.device).unsqueeze(-1)
-            tick, world = index - elapsed % self.period, torch.arange(count.shape[1], device=count.device)
+            tick, world = (
+                index - elapsed % self.period,
+                torch.arange(count.shape[1], device=count.device),
+            )
             # Nothing is late at a reset: what was held until the first tick after it stays.
             stays, corrected = (elapsed < self.period) | (tick < 0), dict(entries)
             for key in map(next_key, held):

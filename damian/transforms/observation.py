@@ -13,35 +13,46 @@ from damian.delays.laws import sampler_of
 from damian.delays.line import ORDERS, DelayLine, Delivery
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
-from damian.transforms.entries import Entries, add_spec, existing, select_entries, sibling_key, spec_rows
+from damian.transforms.entries import (
+    Entries,
+    add_spec,
+    existing,
+    select_entries,
+    sibling_key,
+    spec_rows,
+)
 
 
 class ObservationDelay(StatefulTransform):
-    """Delays observations: replaces the current observation by the latest one received, and writes its age.
+    """Delays observations: replaces the current observation by the latest one received, and writes
+    its age.
 
-    In each step, the entries ``in_keys`` of a world (or agent) are sent together as one message. The receiver
-    holds a message until another one arrives. After a reset it holds the first message of the episode, which
-    has no delay. With delay 0 the rollout is the same, bit for bit, as without the transform.
+    In each step, the entries ``in_keys`` of a world (or agent) are sent together as one message.
+    The receiver holds a message until another one arrives. After a reset it holds the first message
+    of the episode, which has no delay. With delay 0 the rollout is the same, bit for bit, as
+    without the transform.
 
-    A worked timeline, with a delay of 3 steps: the reset, t = 0, shows observation 0, of age 0. Observation 1
-    is sent at t = 1 and arrives at t = 4. So t = 1, 2 and 3 show observation 0 again, of ages 1, 2 and 3, and
-    t = 4 shows observation 1, of age 3.
+    A worked timeline, with a delay of 3 steps: the reset, t = 0, shows observation 0, of age 0.
+    Observation 1 is sent at t = 1 and arrives at t = 4. So t = 1, 2 and 3 show observation 0 again,
+    of ages 1, 2 and 3, and t = 4 shows observation 1, of age 3.
 
     Args:
         delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), a function of a
-            ``MessageContext``, or a ``Sampler``. A delay is drawn for each world, each agent (under a nested
-            key) and each step.
-        in_keys: keys of the entries that are sent together, or one key. A bare name for another key means an
-            entry beside the first one.
+            ``MessageContext``, or a ``Sampler``. A delay is drawn for each world, each agent
+            (under a nested key) and each step.
+        in_keys: keys of the entries that are sent together, or one key. A bare name for another key
+            means an entry beside the first one.
         out_keys: keys under which the received entries are written; if not given, ``in_keys``.
         loss: probability that a message is lost.
-        order: ``generation``: the receiver holds the message that was generated last, so that the age grows
+        order: ``generation``: the receiver holds the message that was generated last, so that the
+            age grows
             by at most one per step. ``arrival``: it holds the message that arrived last.
         dt: length of a step [s], for delays given as times.
         age_key: key for the age of the held message [steps], [..., 1] float; or None.
-        delay_key: key for the delay of the message sent in this step [steps], [..., 1] long, -1 if it never
-            arrives; or None. An actor must not observe it; back-updating needs it.
-        sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
+        delay_key: key for the delay of the message sent in this step [steps], [..., 1] long, -1 if
+            it never arrives; or None. An actor must not observe it; back-updating needs it.
+        sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given,
+            all do.
         context_keys: keys of the entries that the law may read, by name (``ContextSampler``).
         seed: as in ``StatefulTransform``.
 

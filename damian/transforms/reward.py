@@ -18,34 +18,43 @@ from damian.delays.line import slot_rows
 from damian.keys import next_key
 from damian.transforms.base import Change, Correction, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
-from damian.transforms.entries import Entries, add_spec, any_flag, existing, flag_keys, sibling_key, spec_rows
+from damian.transforms.entries import (
+    Entries,
+    add_spec,
+    any_flag,
+    existing,
+    flag_keys,
+    sibling_key,
+    spec_rows,
+)
 
 
 class RewardDelay(StatefulTransform):
     """Delays rewards: each reward is received some steps after it was earned.
 
-    Rewards that are received in the same step are added up. In the last step of an episode, all rewards in
-    transit are received, so that none is lost. Hence the transform must come after every transform that ends
-    episodes, such as ``StepCounter(max_steps=100)``. With delay 0 the rollout is the same, bit for bit, as
-    without it.
+    Rewards that are received in the same step are added up. In the last step of an episode, all
+    rewards in transit are received, so that none is lost. Hence the transform must come after every
+    transform that ends episodes, such as ``StepCounter(max_steps=100)``. With delay 0 the rollout
+    is the same, bit for bit, as without it.
 
-    A worked timeline, with a delay of 3 steps: the reward r1 of the first step is earned at t = 1 and
-    received at t = 4; the steps before receive 0. If the episode ends at t = 5, that step receives r2 + r3 +
-    r4 + r5.
+    A worked timeline, with a delay of 3 steps: the reward r1 of the first step is earned at t = 1
+    and received at t = 4; the steps before receive 0. If the episode ends at t = 5, that step
+    receives r2 + r3 + r4 + r5.
 
-    Rewards in transit lie in a ring of K slots (``past``); ``due`` [K, M] is the time at which those in a
-    slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a reset and at the end of
-    an episode: whatever is in transit then is never received. So a step writes one slot of each row, in
-    place.
+    Rewards in transit lie in a ring of K slots (``past``); ``due`` [K, M] is the time at which
+    those in a slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a
+    reset and at the end of
+    an episode: whatever is in transit then is never received. So a step writes one slot of each
+    row, in place.
 
     Args:
         delay, dt, context_keys, seed: as in ``ObservationDelay``; the law must lose nothing.
         reward_key: key of the reward.
-        delay_key: key for the delay of the reward earned in this step [steps], [..., 1] long, 0 after a
-            reset. A bare name, here and below, means an entry beside the reward. An actor must not observe
-            either.
-        earned_key: key for the reward earned in this step, whenever it is received; 0 after a reset.
-            Back-updating needs it if no messages tell the reward.
+        delay_key: key for the delay of the reward earned in this step [steps], [..., 1] long, 0
+            after a reset. A bare name, here and below, means an entry beside the reward. An actor
+            must not observe either.
+        earned_key: key for the reward earned in this step, whenever it is received; 0 after a
+            reset. Back-updating needs it if no messages tell the reward.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(Uniform(0, 4)))
@@ -68,7 +77,9 @@ class RewardDelay(StatefulTransform):
     ) -> None:
         super().__init__(reward_key, reward_key, seed=seed)
         self.reward_key: NestedKey = self.in_keys[0]
-        self.delay_key, self.earned_key = (sibling_key(self.reward_key, k) for k in (delay_key, earned_key))
+        self.delay_key, self.earned_key = (
+            sibling_key(self.reward_key, k) for k in (delay_key, earned_key)
+        )
         self.out_keys = [self.reward_key, *existing([self.delay_key, self.earned_key])]
         self.sampler = sampler_of(delay, dt)
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
@@ -119,21 +130,26 @@ class RewardDelay(StatefulTransform):
             ended = any_flag(done, self.rows)
             past = memory["past"]
             late = torch.where(expand_mask(memory["due"] > memory["time"], past), past, 0)
-            # In double precision, so that the order of the sum, which depends on the batch, does not matter.
+            # In double precision, so that the order of the sum, which depends on the batch, does
+            # not matter.
             precise = torch.float64 if past.is_floating_point() else past.dtype
             in_transit = late.sum(0, dtype=precise).to(past.dtype)
             received = torch.where(expand_mask(ended, received), received + in_transit, received)
             memory["time"] = memory["time"] + self.n_slots * ended
         return memory, {self.reward_key: self.from_rows(received)} | self._told(delay, reward)
 
-    def _send(self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None) -> Tensor:
-        """The slots [K, M, ...] with rewards [M, ...] that arrive after delays [M], in rows that step."""
+    def _send(
+        self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None
+    ) -> Tensor:
+        """The slots [K, M, ...] with rewards [M, ...] that arrive after delays [M], in rows that
+        step."""
         past, arrival = memory["past"], memory["time"] + delay
         flat, due = past.flatten(0, 1), memory["due"].view(-1)
         row = slot_rows((memory["slot"] + delay) % self.n_slots)
         there, old = flat.index_select(0, row), due.index_select(0, row)
         added = torch.where(expand_mask(old == arrival, there), there, 0) + reward
-        # ``old`` is never later; a compiler that sees that it is read before writes the new times in place.
+        # ``old`` is never later; a compiler that sees that it is read before writes the new times
+        # in place.
         arrival = torch.maximum(arrival, old)
         if stepped is not None:
             added = torch.where(expand_mask(stepped, there), added, there)
@@ -143,7 +159,8 @@ class RewardDelay(StatefulTransform):
         return past
 
     def _told(self, delay: Tensor, earned: Tensor) -> Entries:
-        """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards [M, ...]."""
+        """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards
+        [M, ...]."""
         entries: Entries = {}
         if self.delay_key is not None:
             entries[self.delay_key] = self.from_rows(delay.unsqueeze(-1).clone())
@@ -160,7 +177,9 @@ class RewardDelay(StatefulTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         rewards = self.env.full_reward_spec
         earned = rewards[self.reward_key]
-        add_spec(observation_spec, self.delay_key, (*spec_rows(rewards, self.reward_key), 1), torch.long)
+        add_spec(
+            observation_spec, self.delay_key, (*spec_rows(rewards, self.reward_key), 1), torch.long
+        )
         add_spec(observation_spec, self.earned_key, earned.shape, earned.dtype)
         return observation_spec
 
@@ -169,7 +188,9 @@ class RewardDelay(StatefulTransform):
         if self.reward_key not in keys:
             return None
         if self.delay_key is None:
-            raise InputError("RewardDelay: back-updating needs each delay: give it delay_key='reward_delay'")
+            raise InputError(
+                "RewardDelay: back-updating needs each delay: give it delay_key='reward_delay'"
+            )
         return Correction(self._credit, paid=self._paid, delay_key=self.delay_key)
 
     def _credit(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
@@ -181,14 +202,18 @@ class RewardDelay(StatefulTransform):
             )
         earned = entries[key] if key in entries else cast(Tensor, steps[earned_key])
         paid = self._paid(steps, count).squeeze(-1)
-        return entries | {key: torch.where(expand_mask(paid, earned), earned, torch.zeros_like(earned))}
+        return entries | {
+            key: torch.where(expand_mask(paid, earned), earned, torch.zeros_like(earned))
+        }
 
     def _paid(self, steps: TensorDictBase, count: Tensor) -> Tensor:
-        """Whether the reward of each step has been paid by the last step, in the shape of the delays."""
+        """Whether the reward of each step has been paid by the last step, in the shape of the
+        delays."""
         delay = cast(Tensor, steps[next_key(cast(NestedKey, self.delay_key))])
         begins = expand_mask(count == 0, delay).expand_as(delay)
         step = expand_mask(torch.arange(len(delay), device=delay.device), delay).expand(delay.shape)
-        # The last step before a reset pays what is still in transit, if the environment was done there.
+        # The last step before a reset pays what is still in transit, if the environment was done
+        # there.
         last = torch.cat([next_true(begins)[1:], torch.full_like(step[:1], len(step))]) - 1
         done = expand_mask(steps[keys.RESET_AFTER].squeeze(-1), delay).expand_as(step)
         return (step + delay <= last) | done.gather(0, last)
@@ -203,8 +228,8 @@ def _zero_rewards(transform: StatefulTransform) -> Tensor:
 class CumulativeReward(StatefulTransform):
     """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
-    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode; gamma is in
-    (0, 1]. Sums of integers are float32.
+    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode; gamma
+    is in (0, 1]. Sums of integers are float32.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), CumulativeReward(5, gamma=0.9))
@@ -222,7 +247,9 @@ class CumulativeReward(StatefulTransform):
         self.step_keys, self.n_slots, self.gamma = self.in_keys, steps, gamma
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        return {"past": _zero_rewards(self).unsqueeze(1).repeat_interleave(self.n_slots, 1)}  # [M, K, ...]
+        return {
+            "past": _zero_rewards(self).unsqueeze(1).repeat_interleave(self.n_slots, 1)
+        }  # [M, K, ...]
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         return {"past": memory["past"].masked_fill(expand_mask(mask, memory["past"]), 0)}, {}
@@ -250,7 +277,9 @@ class CumulativeReward(StatefulTransform):
         key = next_key(self.reward_key)
         reward = entries[key]
         before = torch.cat([reward.new_zeros(self.n_slots - 1, *reward.shape[1:]), reward])
-        past = before.unfold(0, self.n_slots, 1).movedim(-1, 0).flip(0)  # [K, T, B, ...], the newest first
+        past = (
+            before.unfold(0, self.n_slots, 1).movedim(-1, 0).flip(0)
+        )  # [K, T, B, ...], the newest first
         age = torch.arange(self.n_slots, device=count.device).view(-1, 1, 1)
         past = past.masked_fill(expand_mask(age > count, past), 0)
         return entries | {key: discounted_sum(past, self.gamma)}
@@ -261,6 +290,7 @@ def discounted_sum(past: Tensor, gamma: float) -> Tensor:
     dtype = torch.promote_types(past.dtype, torch.float32)
     ages = torch.arange(len(past), dtype=torch.float64, device=past.device)
     weights = (gamma**ages).to(dtype)
-    # In double precision, so that the order of the sum, which depends on the batch, does not matter.
+    # In double precision, so that the order of the sum, which depends on the batch, does not
+    # matter.
     weighted = weights.view(-1, *[1] * (past.dim() - 1)) * past
     return weighted.sum(0, dtype=torch.float64).to(dtype)

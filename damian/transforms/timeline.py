@@ -18,47 +18,58 @@ _NEVER = 2**31
 
 
 def told_slots(facts: Tensor, ages: Tensor, slots: int) -> tuple[Tensor, Tensor]:
-    """Facts [*, S, D] by their ages [*, S] in steps: slot k holds that of age k, [*, K, D]; zeros if none has.
+    """Facts [*, S, D] by their ages [*, S] in steps: slot k holds that of age k, [*, K, D]; zeros
+    if none has.
 
-    Also which slots a fact tells of, [*, K] bool. Ages below 0, or of ``slots`` or more, are left out.
+    Also which slots a fact tells of, [*, K] bool. Ages below 0, or of ``slots`` or more, are left
+    out.
     """
     slot = torch.where((ages < 0) | (ages >= slots), slots, ages)  # the last one is left out
     table = facts.new_zeros(*slot.shape[:-1], slots + 1, facts.shape[-1])
     table = table.scatter(-2, slot.unsqueeze(-1).expand_as(facts), facts)
-    told = torch.zeros(table.shape[:-1], dtype=torch.bool, device=slot.device).scatter(-1, slot, True)
+    told = torch.zeros(table.shape[:-1], dtype=torch.bool, device=slot.device).scatter(
+        -1, slot, True
+    )
     return table[..., :slots, :], told[..., :slots]
 
 
 class ObservationTimeline(StatefulTransform):
     """Writes what is known of the latest steps, ordered by when it was true.
 
-    It comes after ``ObservationDelay(..., delay_key=...)`` or ``Channel(..., delay_key=...)``, which draw the
-    delays. Slot k holds what was true k steps ago, followed by 1, once a message that tells it has arrived;
-    until then, and before the reset, it holds zeros. A message tells what was true when it was generated, and
-    with ``ages`` also what was true before; two messages about one step agree. What it holds depends on nothing else, whenever
-    and in whichever order messages arrive, so that one policy can serve every delay. ``received`` and ``age``
-    alone do not show overtaken messages, nor the second one to arrive in a step.
+    It comes after ``ObservationDelay(..., delay_key=...)`` or ``Channel(..., delay_key=...)``,
+    which draw the delays. Slot k holds what was true k steps ago, followed by 1, once a message
+    that tells it has arrived; until then, and before the reset, it holds zeros. A message tells
+    what was true when it was generated, and with ``ages`` also what was true before; two messages
+    about one step agree. What it holds depends on nothing else, whenever and in whichever order
+    messages arrive, so that one policy can serve every delay. ``received`` and ``age`` alone do not
+    show overtaken messages, nor the second one to arrive in a step.
 
-    A worked timeline, with 4 slots: the message of t = 1 arrives at t = 4 and is overtaken by that of t = 2,
-    which arrives at t = 3, and the one of t = 3 is lost. At t = 3 the slots, of t = 3, 2, 1 and 0, hold
-    (-, 2, -, 0), as the message of the reset, t = 0, is known at once. At t = 4 they hold (-, -, 2, 1).
+    A worked timeline, with 4 slots: the message of t = 1 arrives at t = 4 and is overtaken by that
+    of t = 2, which arrives at t = 3, and the one of t = 3 is lost. At t = 3 the slots, of t = 3, 2,
+    1 and 0, hold (-, 2, -, 0), as the message of the reset, t = 0, is known at once. At t = 4 they
+    hold (-, -, 2, 1).
 
     Args:
         slots: number of latest steps, K.
         message_key: key of the message of a step, [..., D].
-        out_key: key of the timeline, [..., K, D + 1] float32, or float64 as the messages; with ``group``
-            [..., N, K, D + 1]. A bare name, here and below, means an entry beside the message.
-        delay_key: key of the delay of the message sent in this step [steps], [..., 1], or with ``group``
-            [..., N] by receiver and sender; -1 if it never arrives. None if messages are not delayed.
-        sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
-        position_key: key of the observer's own position, [..., P], which it knows at once. Messages are then
-            places relative to the observer (D is a multiple of P), and each slot moves them into its present
-            frame, by its displacement since. Several rows of messages in order may belong to one observer.
-        encode: function from messages [..., M] to the D numbers to keep; if not given, these are the message.
-            With ``ages``, to the S facts that a message tells, [..., S, D].
-        ages: function from messages [..., M] to the ages of these facts when the message is generated
-            [steps], [..., S] long; -1 for none.
-        group: every agent gets the messages of all agents: its own first, then those of the agents after it.
+        out_key: key of the timeline, [..., K, D + 1] float32, or float64 as the messages; with
+            ``group`` [..., N, K, D + 1]. A bare name, here and below, means an entry beside the
+            message.
+        delay_key: key of the delay of the message sent in this step [steps], [..., 1], or with
+            ``group`` [..., N] by receiver and sender; -1 if it never arrives. None if messages are
+            not delayed.
+        sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given,
+            all do.
+        position_key: key of the observer's own position, [..., P], which it knows at once. Messages
+            are then places relative to the observer (D is a multiple of P), and each slot moves
+            them into its present frame, by its displacement since. Several rows of messages in
+            order may belong to one observer.
+        encode: function from messages [..., M] to the D numbers to keep; if not given, these are
+            the message. With ``ages``, to the S facts that a message tells, [..., S, D].
+        ages: function from messages [..., M] to the ages of these facts when the message is
+            generated [steps], [..., S] long; -1 for none.
+        group: every agent gets the messages of all agents: its own first, then those of the agents
+            after it.
         own: whether an agent knows its own messages as soon as they are sent.
 
     Examples:
@@ -104,10 +115,15 @@ class ObservationTimeline(StatefulTransform):
         return {name: value.repeat_interleave(self.slots, 1) for name, value in blank.items()}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        empty = {name: torch.full_like(old, _NEVER * (name == "due")) for name, old in memory.items()}
+        empty = {
+            name: torch.full_like(old, _NEVER * (name == "due")) for name, old in memory.items()
+        }
         first = self._sent(entries.__getitem__)
         begun = self._added(empty, first | {"sent": torch.ones_like(first["sent"])})
-        memory = {name: torch.where(expand_mask(mask, new), new, memory[name]) for name, new in begun.items()}
+        memory = {
+            name: torch.where(expand_mask(mask, new), new, memory[name])
+            for name, new in begun.items()
+        }
         return memory, self._written(memory)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
@@ -115,10 +131,12 @@ class ObservationTimeline(StatefulTransform):
         return memory, self._written(memory)
 
     def _sent(self, entry: Callable[[NestedKey], Tensor]) -> dict[str, Tensor]:
-        """The messages of a step, or of many, by the names of the memory; ``entry`` returns an entry.
+        """The messages of a step, or of many, by the names of the memory; ``entry`` returns an
+        entry.
 
-        ``kept`` [..., D], or [..., S, D] with their ``ages`` [..., S]; the steps until they are ``due`` at
-        each of R receivers [..., R]; whether one was ``sent`` [...]; the ``position`` of the observer [..., P].
+        ``kept`` [..., D], or [..., S, D] with their ``ages`` [..., S]; the steps until they are
+        ``due`` at each of R receivers [..., R]; whether one was ``sent`` [...]; the ``position`` of
+        the observer [..., P].
         """
         message = entry(self.row_key)
         kept, sent = self.encoded(message), torch.ones_like(message[..., 0], dtype=torch.bool)
@@ -127,17 +145,26 @@ class ObservationTimeline(StatefulTransform):
         due = torch.zeros_like(sent, dtype=torch.long).unsqueeze(-1)
         if self.delay_key is not None:
             delay = entry(self.delay_key)
-            delay = delay.transpose(-1, -2) if delay.shape[-1] > 1 else delay  # by sender and receiver
+            delay = (
+                delay.transpose(-1, -2) if delay.shape[-1] > 1 else delay
+            )  # by sender and receiver
             due = torch.where(delay >= 0, delay, _NEVER)
         found = {"kept": kept, "due": due, "sent": sent}
         if self.ages is not None:
             found["ages"] = self.ages(message)
-        return found if self.position_key is None else found | {"position": entry(self.position_key)}
+        return (
+            found if self.position_key is None else found | {"position": entry(self.position_key)}
+        )
 
     def _by_row(self, sent: dict[str, Tensor]) -> Memory:
-        """The messages of ``_sent`` by rows, [M, ...] each; several rows in order may share a position."""
+        """The messages of ``_sent`` by rows, [M, ...] each; several rows in order may share a
+        position."""
         n_rows, lead = sent["sent"].numel(), sent["sent"].dim()
-        rows = {n: each.reshape(n_rows, *each.shape[lead:]) for n, each in sent.items() if n != "position"}
+        rows = {
+            n: each.reshape(n_rows, *each.shape[lead:])
+            for n, each in sent.items()
+            if n != "position"
+        }
         if "position" in sent:
             position = sent["position"].reshape(-1, sent["position"].shape[-1])
             rows["position"] = position.repeat_interleave(n_rows // len(position), 0)
@@ -149,10 +176,14 @@ class ObservationTimeline(StatefulTransform):
         newest["due"] = torch.where(newest["sent"].unsqueeze(-1), newest["due"], _NEVER)
         if self.ages is None:
             return {
-                name: torch.cat([new.unsqueeze(1), older[name][:, :-1]], 1) for name, new in newest.items()
+                name: torch.cat([new.unsqueeze(1), older[name][:, :-1]], 1)
+                for name, new in newest.items()
             }
         never = torch.full_like(older["due"][:, :1], _NEVER)
-        blank = {"due": never, **{name: torch.zeros_like(memory[name][:, :1]) for name in ("kept", "sent")}}
+        blank = {
+            "due": never,
+            **{name: torch.zeros_like(memory[name][:, :1]) for name in ("kept", "sent")},
+        }
         older = {name: torch.cat([blank[name], old[:, :-1]], 1) for name, old in older.items()}
         facts, told = told_slots(newest["kept"], newest["ages"], self.slots)
         told = told & newest["sent"].unsqueeze(-1)
@@ -171,7 +202,8 @@ class ObservationTimeline(StatefulTransform):
     def _timeline(self, slots: Memory, arrived: Tensor) -> Tensor:
         """The timelines of M rows, [M, K, D + 1] or, with those of N agents each, [M, N, K, D + 1].
 
-        From ``slots`` in the shapes of the memory, whose messages have ``arrived`` [M, K, R] at receivers.
+        From ``slots`` in the shapes of the memory, whose messages have ``arrived`` [M, K, R] at
+        receivers.
         """
         kept = slots["kept"]
         if "position" in slots:
@@ -185,7 +217,9 @@ class ObservationTimeline(StatefulTransform):
         def for_receivers(rows: Tensor) -> Tensor:
             return rows.unflatten(0, (-1, n))[:, sender]  # [worlds, N, N, K, ...]
 
-        known = arrived.unflatten(0, (-1, n)).movedim(-1, 1)[:, receiver, sender]  # [worlds, N, N, K]
+        known = arrived.unflatten(0, (-1, n)).movedim(-1, 1)[
+            :, receiver, sender
+        ]  # [worlds, N, N, K]
         if self.own:
             known = known | ((agent == 0).unsqueeze(-1) & for_receivers(slots["sent"]))
         known = known.unsqueeze(-1)
@@ -193,7 +227,8 @@ class ObservationTimeline(StatefulTransform):
         return found if self.group else found.squeeze(1)
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
-        """Writes the timeline again if it is among ``keys``, with all that has arrived by the latest step.
+        """Writes the timeline again if it is among ``keys``, with all that has arrived by the
+        latest step.
 
         With ``ages``, what computes it again does so from the one before (``known_in_hindsight``).
         """
@@ -201,7 +236,9 @@ class ObservationTimeline(StatefulTransform):
         return Correction(self._corrected, self.slots) if wanted else None
 
     def _corrected(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
-        after, first = (self._sent(lambda key, at=at: steps[at(key)]) for at in (next_key, lambda key: key))
+        after, first = (
+            self._sent(lambda key, at=at: steps[at(key)]) for at in (next_key, lambda key: key)
+        )
         first["sent"] = torch.ones_like(first["sent"])
         step, slots, arrived = torch.arange(len(steps), device=count.device), [], []
         for k in range(self.slots):  # a slot of all steps and worlds at once
@@ -219,12 +256,19 @@ class ObservationTimeline(StatefulTransform):
             arrived.append((due & slot["sent"].unsqueeze(-1)).reshape(-1, due.shape[-1]))
         stacked = {name: torch.stack([slot[name] for slot in slots], 1) for name in after}
         found = self._timeline(stacked, torch.stack(arrived, 1))
-        return entries | {next_key(self.out_keys[0]): found.view(*after["sent"].shape, *found.shape[1:])}
+        return entries | {
+            next_key(self.out_keys[0]): found.view(*after["sent"].shape, *found.shape[1:])
+        }
 
     def noted_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """The memory with an agent's message [M] that arrives in the next step, ``lag`` >= 1 steps late."""
+        """The memory with an agent's message [M] that arrives in the next step, ``lag`` >= 1 steps
+        late."""
         facts = self.encoded(message).view(1, -1, memory["kept"].shape[-1])
-        ages = torch.zeros(1, 1, dtype=torch.long) if self.ages is None else self.ages(message).view(1, -1)
+        ages = (
+            torch.zeros(1, 1, dtype=torch.long)
+            if self.ages is None
+            else self.ages(message).view(1, -1)
+        )
         # Slots are of the step before the next one.
         kept, told = told_slots(facts, torch.where(ages < 0, -1, ages + lag - 1), self.slots)
         memory = {name: value.clone() for name, value in memory.items()}

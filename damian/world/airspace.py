@@ -1,4 +1,5 @@
-"""Operative regions as padded tensors, with a test for inside a polygon and a search for landing points."""
+"""Operative regions as padded tensors, with a test for inside a polygon and a search for landing
+points."""
 
 import math
 from typing import NamedTuple
@@ -14,7 +15,12 @@ from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.world.config import RegionConfig
 from damian.world.paths import Detours, detours
-from damian.world.regions.polygon import RESOLUTION, Floats, landing_lattice, largest_vertex_distance
+from damian.world.regions.polygon import (
+    RESOLUTION,
+    Floats,
+    landing_lattice,
+    largest_vertex_distance,
+)
 from damian.world.regions.region import Region
 
 _ID_BITS = 24
@@ -23,14 +29,17 @@ _NEVER = torch.iinfo(torch.int64).max
 _MOST_CELLS = 2048
 """Most columns, and rows, of the cells of a region."""
 _SLOTS = 2**18
-"""Distances computed at once, which bounds the memory: a few arrays of 2 MB, to stay in a CPU's cache."""
+"""Distances computed at once, which bounds the memory: a few arrays of 2 MB, to stay in a CPU's
+cache."""
 
 
 class Cells(NamedTuple):
-    """The landing points that may be nearest to a place, by the cell in which it lies: C in all, U used."""
+    """The landing points that may be nearest to a place, by the cell in which it lies: C in all, U
+    used."""
 
     point: Tensor
-    """Ids of landing points within their region, W for each used cell, -1 after the last, [U, W] int32."""
+    """Ids of landing points within their region, W for each used cell, -1 after the last, [U, W]
+    int32."""
     row: Tensor
     """Row of each cell among these, [C] int32; 0 for cells that are not used."""
     first: Tensor
@@ -49,11 +58,13 @@ class Airspace(NamedTuple):
     A landing point's *flat id* is ``region * L + point``; padded points lie infinitely far away.
 
     Attributes:
-        points, exact_points: landing points, [R, L, 2] metres east and north of the local origin of their
-            region, in single and in double precision; the nearest ones are found by the latter.
+        points, exact_points: landing points, [R, L, 2] metres east and north of the local origin of
+            their region, in single and in double precision; the nearest ones are found by the
+            latter.
         cells: those that may be nearest to a place.
         n_points: number of real landing points, [R].
-        edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres, double precision.
+        edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres, double
+        precision.
         scale: largest distance between two vertices, [R] metres; features divide distances by it.
         offset: place of the local origin in the coordinates of the settings, [R, 2] metres.
         detours: ways between landing points that are not straight; None if all are.
@@ -75,18 +86,22 @@ class Airspace(NamedTuple):
         return self.points.shape[1]
 
     def way(self, origin: Tensor, goal: Tensor) -> Tensor:
-        """Places on the ways between landing points, flat ids [*], from end to end, [*, W, 2] metres."""
+        """Places on the ways between landing points, flat ids [*], from end to end, [*, W, 2]
+        metres."""
         points = self.points.flatten(0, 1)
         if self.detours is not None:
             return self.detours.way(origin, goal, points)
         return torch.stack([gather_rows(points, origin), gather_rows(points, goal)], -2)
 
     def length(self, origin: Tensor, goal: Tensor) -> Tensor:
-        """Lengths of the ways between landing points, flat ids [*], in m [*]; infinite if there is none."""
+        """Lengths of the ways between landing points, flat ids [*], in m [*]; infinite if there is
+        none."""
         points = self.points.flatten(0, 1)
         if self.detours is not None:
             return self.detours.length(origin, goal, points)
-        return torch.linalg.vector_norm(gather_rows(points, goal) - gather_rows(points, origin), dim=-1)
+        return torch.linalg.vector_norm(
+            gather_rows(points, goal) - gather_rows(points, origin), dim=-1
+        )
 
     def nearest(self, places: Floats, region: int) -> Tensor:
         """The landing points nearest to places [P, 2] m, as ids within their region, [P]."""
@@ -99,8 +114,8 @@ def build_airspace(
 ) -> Airspace:
     """Lay the lattice of landing points over each region, as the settings of regions say.
 
-    ``longest`` is the longest action [m]; landing points more than twice as far apart are not connected in a
-    region that is not convex.
+    ``longest`` is the longest action [m]; landing points more than twice as far apart are not
+    connected in a region that is not convex.
     """
     step, degrees, n_points = config.lattice_step, config.lattice_angle, config.n_landing_points
     lattices = [landing_lattice(r.polygon, step, degrees, n_points) for r in regions]
@@ -115,7 +130,9 @@ def build_airspace(
         n_points=torch.tensor([len(lattice) for lattice in lattices]),
         # A padded edge has zero length, so the inside test never counts it.
         edges=_padded([_edges(region.polygon) for region in regions], 0.0),
-        scale=torch.tensor([largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32),
+        scale=torch.tensor(
+            [largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32
+        ),
         offset=torch.tensor([r.offset for r in regions], dtype=torch.float32),
         regions=tuple(regions),
         detours=detours([region.polygon for region in regions], lattices, 2 * longest + step),
@@ -133,11 +150,12 @@ def inside(edges: Tensor, target: Tensor) -> Tensor:
 
 
 def nearest_points(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: int) -> Tensor:
-    """The ``n`` landing points nearest to each target [M, 2] m in its region [M], nearest first, [M, n].
+    """The ``n`` landing points nearest to each target [M, 2] m in its region [M], nearest first,
+    [M, n].
 
-    The nearest one is that at the smallest distance in whole centimetres and, of several, the one with the
-    lowest id, so that ties do not depend on rounding errors. Ids are within the region; -1 if there are fewer
-    than n.
+    The nearest one is that at the smallest distance in whole centimetres and, of several, the one
+    with the lowest id, so that ties do not depend on rounding errors. Ids are within the region; -1
+    if there are fewer than n.
     """
     at_once = max(_SLOTS // cells.point.shape[1], 1)
     parts = zip(region.split(at_once), target.split(at_once), strict=True)
@@ -150,7 +168,9 @@ def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: in
         gather_rows(t, region) for t in (cells.corner, cells.side, cells.shape, cells.first)
     )
     column, row = ((target - corner) / side).long().clamp(min=0).minimum(shape - 1).unbind(-1)
-    point = gather_rows(cells.point, gather_rows(cells.row, first + row * shape[:, 0] + column)).long()
+    point = gather_rows(
+        cells.point, gather_rows(cells.row, first + row * shape[:, 0] + column)
+    ).long()
     flat = point.clamp(min=0) + (region * points.shape[1]).unsqueeze(-1)
     east, north = (gather_rows(points.flatten(0, 1), flat) - target.unsqueeze(1)).unbind(-1)
     # Half a centimetre is rounded up: the small term is far above rounding errors.
@@ -163,15 +183,18 @@ def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: in
 def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], n: int) -> Cells:
     """List the landing points that may be among the n nearest ones of any place in each cell.
 
-    The n points nearest to a cell's centre are at most half a diagonal farther from any place in the cell, so
-    the n nearest ones of that place are at most two halves farther from the centre than the n-th of these.
+    The n points nearest to a cell's centre are at most half a diagonal farther from any place in
+    the cell, so the n nearest ones of that place are at most two halves farther from the centre
+    than the n-th of these.
     """
     tables, rows_of_cells, shapes, corners, sides = [], [], [], [], []
     n_used = 0
     for lattice, polygon in zip(lattices, polygons, strict=True):
         west, south, east, north = polygon.bounds
         # The second term bounds the number of cells of a long and narrow polygon.
-        side = max(math.sqrt(polygon.area / len(lattice)), max(east - west, north - south) / _MOST_CELLS)
+        side = max(
+            math.sqrt(polygon.area / len(lattice)), max(east - west, north - south) / _MOST_CELLS
+        )
         half = side * math.sqrt(0.5) + RESOLUTION
         columns, rows = (int(length / side) + 1 for length in (east - west, north - south))
         row, column = np.divmod(np.arange(columns * rows), columns)
@@ -195,8 +218,11 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
     return Cells(*map(torch.as_tensor, tables))
 
 
-def _within_reach(lattice: Floats, place: Floats, n: int, side: float, farther: float) -> NDArray[np.int64]:
-    """Pairs, [2, P]: for each place the n nearest points, and those farther by up to ``farther``."""
+def _within_reach(
+    lattice: Floats, place: Floats, n: int, side: float, farther: float
+) -> NDArray[np.int64]:
+    """Pairs, [2, P]: for each place the n nearest points, and those farther by up to
+    ``farther``."""
     tree, targets = shapely.STRtree(np.asarray(shapely.points(lattice))), shapely.points(place)
     reach = np.full(len(place), side * math.sqrt(n / math.pi))
     while True:

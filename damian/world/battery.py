@@ -1,4 +1,5 @@
-"""Battery model (paper, section 3.2): drain of a flight and gain of charging, in percent of the capacity.
+"""Battery model (paper, section 3.2): drain of a flight and gain of charging, in percent of the
+capacity.
 
 The cruise power is proportional to the speed, so the drain of any part of a cruise is exactly
 proportional to its length, whatever the time step and the speed profile.
@@ -40,7 +41,8 @@ def cruise_drain(distance: Tensor, battery: AnyBattery) -> Tensor:
 
 
 def cruise_range(level: Tensor, battery: AnyBattery) -> Tensor:
-    """Longest cruise on a battery level, the inverse of ``cruise_drain``: [*] percent to [*] metres."""
+    """Longest cruise on a battery level, the inverse of ``cruise_drain``: [*] percent to [*]
+    metres."""
     return times(level, 3600 * battery.reference_speed / _full_power_drain(battery))
 
 
@@ -50,7 +52,8 @@ def vertical_drain(seconds: Tensor, battery: AnyBattery) -> Tensor:
 
 
 def flight_drain(vertical: Tensor, distance: Tensor, battery: AnyBattery) -> Tensor:
-    """Battery drain of a takeoff, cruise and landing: [*] seconds (of the takeoff) and metres to percent."""
+    """Battery drain of a takeoff, cruise and landing: [*] seconds (of the takeoff) and metres to
+    percent."""
     return vertical_drain(2 * vertical, battery) + cruise_drain(distance, battery)
 
 
@@ -64,7 +67,8 @@ def used_so_far(
 
 
 def charge_gain(seconds: Tensor, battery: AnyBattery) -> Tensor:
-    """Battery level gained by charging: [*] seconds to [*] percent; not clipped at a full battery."""
+    """Battery level gained by charging: [*] seconds to [*] percent; not clipped at a full
+    battery."""
     return times(seconds, 100 / (3600 * battery.capacity_kwh / battery.charging_power_kw))
 
 

@@ -23,7 +23,8 @@ RANDOMISED += ("source.level_db", "source.miss", "source.false_alarm", "delay.lo
 class RegionConfig(Settings):
     """Region, landing points and start positions (paper, section 3.2).
 
-    A place is [x, y] in metres, east and north in the coordinates of the vertices, or from the centroid of a
+    A place is [x, y] in metres, east and north in the coordinates of the vertices, or from the
+    centroid of a
     region from a file, which also takes {lat: 53.1, lon: -4.5} in degrees.
     """
 
@@ -31,69 +32,105 @@ class RegionConfig(Settings):
 
     kind: str = setting(
         "random",
-        "Origin: random, vertices, fir (Eurocontrol table), geojson, or your own package.module:function.",
+        "Origin: random, vertices, fir (Eurocontrol table), geojson, or your own "
+        "package.module:function.",
         choices=("random", "vertices", "fir", "geojson"),
         paths=True,
     )
-    min_area: float = setting(100000.0, "Smallest area of a random one.", unit="m^2", above=0, kinds=RANDOM)
-    max_area: float = setting(200000.0, "Largest area of a random one.", unit="m^2", above=0, kinds=RANDOM)
-    pool: int = setting(1, "Number of random regions, drawn once per seed.", low=1, high=10_000, kinds=RANDOM)
+    min_area: float = setting(
+        100000.0, "Smallest area of a random one.", unit="m^2", above=0, kinds=RANDOM
+    )
+    max_area: float = setting(
+        200000.0, "Largest area of a random one.", unit="m^2", above=0, kinds=RANDOM
+    )
+    pool: int = setting(
+        1, "Number of random regions, drawn once per seed.", low=1, high=10_000, kinds=RANDOM
+    )
     vertices: list = setting([], "Polygon corners, [x, y] each.", unit="m", kinds=("vertices",))
     path: str = setting(
-        "", "File, such as park.geojson, .kml, .gpkg, .shp, .plan (fir: damian:fir.csv).", kinds=FILES
+        "",
+        "File, such as park.geojson, .kml, .gpkg, .shp, .plan (fir: damian:fir.csv).",
+        kinds=FILES,
     )
     id: str = setting("", "Airspace ID of the region in the FIR table.", kinds=("fir",))
-    index: Any = setting(None, "Index of the feature in the file, from 0, or a list to unite.", kinds=GEOJSON)
+    index: Any = setting(
+        None, "Index of the feature in the file, from 0, or a list to unite.", kinds=GEOJSON
+    )
     where: Any = setting(
         None, "Property of the feature, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
     zones: Any = setting(
         [],
-        "No-fly zones: a list of the corners of each (places, as those of a source), a map, or the number of "
+        "No-fly zones: a list of the corners of each (places, as those of a source), a map, or the "
+        "number of "
         "random ones.",
     )
     zone_area: float = setting(2500.0, "Area of a random zone.", unit="m^2", above=0)
     zone_margin: float = setting(0.0, "Distance that UAVs keep from zones.", unit="m", low=0)
-    lattice_step: float = setting(30.0, "Distance between landing points of a row.", unit="m", above=0)
-    lattice_angle: float = setting(45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90)
+    lattice_step: float = setting(
+        30.0, "Distance between landing points of a row.", unit="m", above=0
+    )
+    lattice_angle: float = setting(
+        45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90
+    )
     n_landing_points: int | None = setting(
-        None, "Number of landing points kept, those nearest to the centroid; all if not given.", low=1
+        None,
+        "Number of landing points kept, those nearest to the centroid; all if not given.",
+        low=1,
     )
     initial_conditions: int = setting(
-        1024, "Number of UAV starts and source walks drawn per seed, over all regions.", low=1, high=10**6
+        1024,
+        "Number of UAV starts and source walks drawn per seed, over all regions.",
+        low=1,
+        high=10**6,
     )
     start_positions: list | None = setting(
         None, "One place per UAV, [x, y] in metres or {lat: 53.1, lon: -4.5}; drawn if not given."
     )
     start_together: bool = setting(False, "Whether all UAVs start on the same landing point.")
-    options: Any = setting(None, "Settings of a region of your own, as a mapping.", kinds=("vertices",))
+    options: Any = setting(
+        None, "Settings of a region of your own, as a mapping.", kinds=("vertices",)
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.initial_conditions", self.initial_conditions, self.pool)
-        for name in {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}.get(self.kind, []):
-            self.refuse(not getattr(self, name), name, f"is missing: region.kind={self.kind} needs it")
+        for name in {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}.get(
+            self.kind, []
+        ):
+            self.refuse(
+                not getattr(self, name), name, f"is missing: region.kind={self.kind} needs it"
+            )
         problem = "means nothing without a region of your own (region.kind=package.module:function)"
         self.refuse(self.options is not None and ":" not in self.kind, "options", problem)
         indices = self.index if isinstance(self.index, list) else [self.index]
-        good = indices == [None] or (indices and all(type(each) is int and each >= 0 for each in indices))
-        self.refuse(not good, "index", "is not a feature's number, counted from 0, or a list of numbers")
+        good = indices == [None] or (
+            indices and all(type(each) is int and each >= 0 for each in indices)
+        )
+        self.refuse(
+            not good, "index", "is not a feature's number, counted from 0, or a list of numbers"
+        )
         texts = self.where if isinstance(self.where, list) else [self.where]
         fits = texts and all(isinstance(each, str) and re.search(".[:=]", each) for each in texts)
         good = texts == [None] or fits
-        problem = "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
+        problem = (
+            "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
+        )
         self.refuse(not good, "where", problem)
         both = self.index is not None and self.where is not None
         self.refuse(both, "where", "and region.index both choose; give one of them")
         zones, drawn = self.zones, checks.is_number(self.zones)
         wrong = zones % 1 or not 0 <= zones <= 100 if drawn else not isinstance(zones, list | str)
-        problem = "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100"
+        problem = (
+            "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100"
+        )
         self.refuse(wrong, "zones", problem)
         for zone in zones if isinstance(zones, list) else []:
             good = isinstance(zone, list) and len(zone) > 2
             problem = (
-                "has a zone that is not a list of three or more corners: region.zones=[[[0,0],[50,0],[0,50]]]"
+                "has a zone that is not a list of three or more corners: "
+                "region.zones=[[[0,0],[50,0],[0,50]]]"
             )
             self.refuse(not good, "zones", problem)
             for place in zone:
@@ -116,7 +153,9 @@ class MotionConfig(Settings):
         choices=("instant", "polynomial"),
         paths=True,
     )
-    degree: int = setting(5, "Degree of the time law of each phase.", choices=(3, 5, 7), kinds=POLYNOMIAL)
+    degree: int = setting(
+        5, "Degree of the time law of each phase.", choices=(3, 5, 7), kinds=POLYNOMIAL
+    )
     max_speed: float = setting(
         5.0, "Largest speed through the air.", unit="m/s", low=1e-3, kinds=POLYNOMIAL, each=True
     )
@@ -124,15 +163,28 @@ class MotionConfig(Settings):
         2.0, "Acceleration limit.", unit="m/s^2", low=1e-3, kinds=POLYNOMIAL, each=True
     )
     min_ground_speed: float = setting(
-        1.0, "A flight that wind would make slower is not flown.", unit="m/s", above=0, kinds=POLYNOMIAL
+        1.0,
+        "A flight that wind would make slower is not flown.",
+        unit="m/s",
+        above=0,
+        kinds=POLYNOMIAL,
     )
-    sensing_time: float = setting(0.0, "Time that a landed UAV senses before it chooses.", unit="s", low=0)
+    sensing_time: float = setting(
+        0.0, "Time that a landed UAV senses before it chooses.", unit="s", low=0
+    )
     min_level: float = setting(1.0, "Flight level of the first UAV.", unit="m", above=0)
     max_level: float = setting(
-        20.0, "Highest flight level; UAVs that fly instantly share levels if need be.", unit="m", above=0
+        20.0,
+        "Highest flight level; UAVs that fly instantly share levels if need be.",
+        unit="m",
+        above=0,
     )
-    level_separation: float = setting(0.5, "Vertical distance between two flight levels.", unit="m", above=0)
-    options: Any = setting(None, "Settings of a motion model of your own, as a mapping.", kinds=POLYNOMIAL)
+    level_separation: float = setting(
+        0.5, "Vertical distance between two flight levels.", unit="m", above=0
+    )
+    options: Any = setting(
+        None, "Settings of a motion model of your own, as a mapping.", kinds=POLYNOMIAL
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,11 +220,17 @@ class SourceConfig(Settings):
 
     count: int = setting(1, "Number of sources.", low=1, high=32)
     each: list[Any] = setting(
-        [], "What differs of each source, as {level_db: 130, motion: dynamic}; all are alike if empty."
+        [],
+        "What differs of each source, as {level_db: 130, motion: dynamic}; all are alike if empty.",
     )
-    level_db: float = setting(140.0, "Sound level at 1 m, re 1e-12 W/m^2.", unit="dB", low=-300, high=300)
+    level_db: float = setting(
+        140.0, "Sound level at 1 m, re 1e-12 W/m^2.", unit="dB", low=-300, high=300
+    )
     microphone_db: float = constant(
-        105.0, "Lowest level that is heard; only its distance from ``level_db`` counts.", unit="dB", low=0
+        105.0,
+        "Lowest level that is heard; only its distance from ``level_db`` counts.",
+        unit="dB",
+        low=0,
     )
     motion: str = setting("static", "Whether the source walks.", choices=("static", "dynamic"))
     emission: str = setting(
@@ -182,12 +240,18 @@ class SourceConfig(Settings):
     )
     miss: float = setting(0.0, "Probability that a UAV in reach does not detect it.", low=0, high=1)
     false_alarm: float = setting(
-        0.0, "Probability that a listening UAV which is out of reach reports a detection.", low=0, high=1
+        0.0,
+        "Probability that a listening UAV which is out of reach reports a detection.",
+        low=0,
+        high=1,
     )
-    emission_probability: float = setting(0.5, "Probability that it is on, if not constant.", low=0, high=1)
+    emission_probability: float = setting(
+        0.5, "Probability that it is on, if not constant.", low=0, high=1
+    )
     after_walk: str = setting(
         "loop",
-        "After the last stop: go straight back and make the same round again (loop), or stay silent (stop).",
+        "After the last stop: go straight back and make the same round again (loop), or stay "
+        "silent (stop).",
         choices=("loop", "stop"),
         kinds=DYNAMIC,
     )
@@ -196,13 +260,23 @@ class SourceConfig(Settings):
     )
     n_hotspots: int = setting(10, "Number of hotspots of a walk.", low=1, high=1000, kinds=DYNAMIC)
     min_stops: int = setting(3, "Fewest inner points around a hotspot.", low=1, kinds=DYNAMIC)
-    max_stops: int = setting(7, "Most inner points around a hotspot.", low=1, high=1000, kinds=DYNAMIC)
+    max_stops: int = setting(
+        7, "Most inner points around a hotspot.", low=1, high=1000, kinds=DYNAMIC
+    )
     local_distance: float = setting(
-        50.0, "Largest distance of an inner point from its hotspot.", unit="m", above=0, kinds=DYNAMIC
+        50.0,
+        "Largest distance of an inner point from its hotspot.",
+        unit="m",
+        above=0,
+        kinds=DYNAMIC,
     )
     speed: float = setting(20.0, "Largest speed to a hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
-    acceleration: float = setting(2.5, "Acceleration to a hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC)
-    local_speed: float = setting(1.7, "Largest speed around a hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
+    acceleration: float = setting(
+        2.5, "Acceleration to a hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC
+    )
+    local_speed: float = setting(
+        1.7, "Largest speed around a hotspot.", unit="m/s", above=0, kinds=DYNAMIC
+    )
     local_acceleration: float = setting(
         1.1, "Acceleration around a hotspot.", unit="m/s^2", above=0, kinds=DYNAMIC
     )
@@ -226,11 +300,21 @@ class SourceConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         wrong = self.each and len(self.each) != self.count
-        self.refuse(wrong, "each", f"is not one mapping for each of the source.count={self.count} sources")
+        self.refuse(
+            wrong, "each", f"is not one mapping for each of the source.count={self.count} sources"
+        )
         for each in self.each:
-            wrong = not isinstance(each, Mapping) or not {*each} <= {*rules(SourceConfig)} - {"count", "each"}
-            self.refuse(wrong, "each", "has something else than settings of a source: {level_db: 130}")
-        heard, least = self.microphone_db < self.level_db, f"microphone_db={self.microphone_db:g} dB"
+            wrong = not isinstance(each, Mapping) or not {*each} <= {*rules(SourceConfig)} - {
+                "count",
+                "each",
+            }
+            self.refuse(
+                wrong, "each", "has something else than settings of a source: {level_db: 130}"
+            )
+        heard, least = (
+            self.microphone_db < self.level_db,
+            f"microphone_db={self.microphone_db:g} dB",
+        )
         self.refuse(not heard, "level_db", f"is not above {least}: not heard even at 1 m")
         static = self.motion != "dynamic"
         problem = "needs source.motion=dynamic: a static source does not walk"
@@ -249,7 +333,11 @@ class RequestConfig(Settings):
     section: ClassVar[str] = "requests"
 
     rate: float = setting(
-        0.0, "Mean number that appears in a minute (a Poisson process).", unit="1/min", low=0, high=6000
+        0.0,
+        "Mean number that appears in a minute (a Poisson process).",
+        unit="1/min",
+        low=0,
+        high=6000,
     )
     most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
     range: float | None = setting(
@@ -286,12 +374,18 @@ class BatteryConfig(Settings):
         each=True,
     )
     reference_speed: float = setting(
-        20.0, "Cruise speed at which the engine takes its full power.", unit="m/s", above=0, kinds=CHARGING
+        20.0,
+        "Cruise speed at which the engine takes its full power.",
+        unit="m/s",
+        above=0,
+        kinds=CHARGING,
     )
     capacity_kwh: float = setting(
         9.0, "Energy of a full battery.", unit="kWh", low=1e-6, kinds=CHARGING, each=True
     )
-    efficiency: float = setting(12.0, "Factor that divides the consumption.", above=0, kinds=CHARGING)
+    efficiency: float = setting(
+        12.0, "Factor that divides the consumption.", above=0, kinds=CHARGING
+    )
     charging_power_kw: float = setting(
         4.0, "Power of a charging UAV.", unit="kW", above=0, kinds=CHARGING, each=True
     )
@@ -299,7 +393,9 @@ class BatteryConfig(Settings):
         5.0, "Observed levels are multiples of this.", unit="%", above=0, high=100, kinds=CHARGING
     )
     charging_points: list | None = setting(
-        None, "Places as source.position near which UAVs charge; anywhere if not given.", kinds=CHARGING
+        None,
+        "Places as source.position near which UAVs charge; anywhere if not given.",
+        kinds=CHARGING,
     )
 
     @property
@@ -327,7 +423,9 @@ class ActionConfig(Settings):
         "discrete (every distance with every heading), or continuous (up to the largest distance).",
         choices=("discrete", "continuous"),
     )
-    distances: list[float] = setting([0.0, 50.0, 100.0, 150.0, 200.0], "Distances; 0 holds.", unit="m", low=0)
+    distances: list[float] = setting(
+        [0.0, 50.0, 100.0, 150.0, 200.0], "Distances; 0 holds.", unit="m", low=0
+    )
     headings: list[float] = setting(
         [-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0],
         "Headings of discrete actions, clockwise from north.",
@@ -364,18 +462,23 @@ class WorldConfig(Settings):
     actions: ActionConfig = setting(ActionConfig)
     randomise: dict[str, Any] = setting(
         {},
-        "Settings that are drawn for each world and episode, such as {wind.speed: [0, 6]}: from a range, or "
+        "Settings that are drawn for each world and episode, such as {wind.speed: [0, 6]}: from a "
+        "range, or "
         "from a list of more than two values; [6] is always 6.",
     )
     sensors: list[Any] = setting(
-        [], "Sensors of your own: package.module:name, or {sensor: package.module:name, parameter: ...}."
+        [],
+        "Sensors of your own: package.module:name, or "
+        "{sensor: package.module:name, parameter: ...}.",
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         starts = self.region.start_positions
         wrong = starts is not None and len(starts) != self.agents
-        self.refuse(wrong, "region.start_positions", f"is not one place for each of the {self.agents} UAVs")
+        self.refuse(
+            wrong, "region.start_positions", f"is not one place for each of the {self.agents} UAVs"
+        )
         for section in (self.motion, self.battery):
             for name, rule in rules(type(section)).items():
                 values = getattr(section, name)
@@ -401,17 +504,23 @@ class WorldConfig(Settings):
         """Refuse what cannot be drawn; each value must be one that the setting may have."""
         for key, values in self.randomise.items():
             own = f"randomise.{key}"
-            checks.require(key in RANDOMISED, own, values, f"cannot be drawn, only {', '.join(RANDOMISED)}")
+            checks.require(
+                key in RANDOMISED, own, values, f"cannot be drawn, only {', '.join(RANDOMISED)}"
+            )
             good = isinstance(values, list) and 1 <= len(values) <= 8
             checks.require(good, own, values, "is not a range or a list of at most 8 values")
             section, _, name = key.partition(".")
             given = getattr(getattr(self, section), name)
             problem = (
-                f"draws one value for all UAVs, but {key}={given} has one for each: leave one of them out"
+                f"draws one value for all UAVs, but {key}={given} has one for each: leave one of "
+                "them out"
             )
             checks.require(not isinstance(given, list), own, values, problem)
             apart = section == "source" and any(name in each for each in self.source.each)
-            problem = f"draws one value for all sources, but source.each tells {name}: leave one of them out"
+            problem = (
+                f"draws one value for all sources, but source.each tells {name}: leave one of them "
+                "out"
+            )
             checks.require(not apart, own, values, problem)
             for value in values:
                 replace(getattr(self, section), **{name: value})

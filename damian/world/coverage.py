@@ -1,8 +1,11 @@
-"""Coverage: the share of a UAV's footprint that is new, lies in the region and belongs to no other UAV.
+"""Coverage: the share of a UAV's footprint that is new, lies in the region and belongs to no other
+UAV.
 
-A footprint is always sampled at the same ``64 * words`` points, so that a part of it is a bit mask. Masks of
-two kinds are tabulated once: the samples outside the polygon, for each landing point, and the samples inside
-a second disc, for each offset of two discs. A step combines them with OR and counts bits.
+A footprint is always sampled at the same ``64 * words`` points, so that a part of it is a bit mask.
+Masks of
+two kinds are tabulated once: the samples outside the polygon, for each landing point, and the
+samples inside a second disc, for each offset of two discs. A step combines them with OR and counts
+bits.
 """
 
 import functools
@@ -21,7 +24,8 @@ from damian.common.tensors import gather_rows
 _GRID = 321
 """Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact."""
 _CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**18, 2**24
-"""Words and table rows computed at once: 2 MiB on a CPU; 128 MiB on a GPU and in compiled graphs."""
+"""Words and table rows computed at once: 2 MiB on a CPU; 128 MiB on a GPU and in compiled
+graphs."""
 _POINTS_AT_ONCE = 1024
 """Landing points whose samples are tested at once, which bounds the memory: arrays of 16 MiB."""
 
@@ -29,9 +33,10 @@ _POINTS_AT_ONCE = 1024
 class FootprintTables(NamedTuple):
     """Bit masks of a sampled footprint; a bit of 1 marks a sample that does not count.
 
-    ``masks`` is ``[G * G + P, words]`` int64, for G offsets per axis and P landing points. Row ``x * G + y``:
-    samples of a disc in a second disc, whose centre is ``(x - G // 2, y - G // 2)`` cells further (east,
-    north); 0 on the border. Row ``G * G + p``: samples of the disc at landing point p outside its polygon.
+    ``masks`` is ``[G * G + P, words]`` int64, for G offsets per axis and P landing points. Row ``x
+    * G + y``: samples of a disc in a second disc, whose centre is ``(x - G // 2, y - G // 2)``
+    cells further (east, north); 0 on the border. Row ``G * G + p``: samples of the disc at landing
+    point p outside its polygon.
     """
 
     masks: Tensor
@@ -44,11 +49,12 @@ def build_tables(
     radius: float,
     words: int = 16,
 ) -> FootprintTables:
-    """Tabulate the masks of all landing points [R, L, 2] in polygons, for a ``radius`` of footprints [m].
+    """Tabulate the masks of all landing points [R, L, 2] in polygons, for a ``radius`` of
+    footprints [m].
 
-    With 16 words, over random polygons and up to 5 other discs, the error of one footprint's area is 0.2 %
-    (rms) of pi R^2, and below 0.9 % in 3000 random placements; the worst placement that a search has found
-    gives 1.1 %. Points of NaN are padding, where nothing counts as covered.
+    With 16 words, over random polygons and up to 5 other discs, the error of one footprint's area
+    is 0.2 % (rms) of pi R^2, and below 0.9 % in 3000 random placements; the worst placement that a
+    search has found gives 1.1 %. Points of NaN are padding, where nothing counts as covered.
     """
     offsets = radius * _unit_disc_samples(64 * words)
     outside = [_outside(*pair, offsets) for pair in zip(polygons, points, strict=True)]
@@ -57,29 +63,35 @@ def build_tables(
 
 
 def tables_of_all(
-    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon], points: np.ndarray, radii: Sequence[float]
+    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],
+    points: np.ndarray,
+    radii: Sequence[float],
 ) -> FootprintTables:
     """The tables of several radii: the landing points of each follow as if they were further ones.
 
     Their positions are to be given in the unit of the first radius: times this one, over their own.
     """
     first, *others = [build_tables(polygons, points, radius) for radius in radii]
-    return first._replace(masks=torch.cat([first.masks, *(each.masks[_GRID**2 :] for each in others)]))
+    return first._replace(
+        masks=torch.cat([first.masks, *(each.masks[_GRID**2 :] for each in others)])
+    )
 
 
 def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
     """Coverage c_a in [0, 1], ``[*, N]``: mean share of each UAV's last n footprints that counts.
 
-    The part of the footprint at ``positions[..., i, k, :]`` (index 0 newest) counts that lies inside the
-    polygon, in the footprint of no other UAV at the same index k, and in no older footprint of UAV i itself.
-    Shares are fractions of pi R^2 (paper, Table 2). ``point_ids`` ``[*, N, n]`` are the landing points of the
-    ``positions`` ``[*, N, n, 2]`` [m].
+    The part of the footprint at ``positions[..., i, k, :]`` (index 0 newest) counts that lies
+    inside the polygon, in the footprint of no other UAV at the same index k, and in no older
+    footprint of UAV i itself. Shares are fractions of pi R^2 (paper, Table 2). ``point_ids``
+    ``[*, N, n]`` are the landing points of the ``positions`` ``[*, N, n, 2]`` [m].
     """
     lead, (n_uavs, n_last) = point_ids.shape[:-2], point_ids.shape[-2:]
     cells = (positions * tables.cells_per_metre).reshape(-1, n_uavs, n_last, 2)
     # Windows that slide over the UAVs: i, i + 1, i + 2, ... (modulo N), without index tensors.
     fleets = torch.cat([cells, cells[:, :-1]], 1).unfold(1, n_uavs, 1)
-    return _share_of_first(tables, point_ids.reshape(-1, n_uavs, n_last), fleets).reshape(*lead, n_uavs)
+    return _share_of_first(tables, point_ids.reshape(-1, n_uavs, n_last), fleets).reshape(
+        *lead, n_uavs
+    )
 
 
 class KnownCoverage(NamedTuple):
@@ -91,8 +103,11 @@ class KnownCoverage(NamedTuple):
     """Their coverage, ``[*, N]``; negative where it is not known."""
 
 
-def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, known: KnownCoverage) -> Tensor:
-    """As ``covered_share``, from all ``points`` [m], but computed only for worlds that have changed."""
+def updated_share(
+    tables: FootprintTables, point_ids: Tensor, points: Tensor, known: KnownCoverage
+) -> Tensor:
+    """As ``covered_share``, from all ``points`` [m], but computed only for worlds that have
+    changed."""
     changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
     n_uavs, n_last = point_ids.shape[-2:]
     ids, share = point_ids.reshape(-1, n_uavs, n_last), known.share.reshape(-1, n_uavs)
@@ -101,7 +116,12 @@ def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, kn
 
 @torch.library.custom_op("damian::update_share", mutates_args=())
 def _update_share(
-    masks: Tensor, cells_per_metre: float, ids: Tensor, points: Tensor, share: Tensor, changed: Tensor
+    masks: Tensor,
+    cells_per_metre: float,
+    ids: Tensor,
+    points: Tensor,
+    share: Tensor,
+    changed: Tensor,
 ) -> Tensor:
     """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``."""
     updated, worlds = share.clone(), changed.nonzero().squeeze(-1)
@@ -118,19 +138,25 @@ def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need on
 
 
 def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
-    """The diagonal of ``covered_share`` of what each UAV knows, ``[*, N, N, ...]`` (receiver, sender)."""
+    """The diagonal of ``covered_share`` of what each UAV knows, ``[*, N, N, ...]``
+    (receiver, sender)."""
     lead, (n_uavs, n_last) = point_ids.shape[:-3], point_ids.shape[-2:]
     uav = torch.arange(n_uavs, device=point_ids.device)
     # The receiver i itself, then i + 1, i + 2, ... (modulo N).
     known = (uav.unsqueeze(-1) * n_uavs + (uav.unsqueeze(-1) + uav) % n_uavs).flatten()
     own = point_ids.reshape(-1, n_uavs**2, n_last).index_select(1, uav * (n_uavs + 1))
-    cells = (positions * tables.cells_per_metre).reshape(-1, n_uavs**2, n_last, 2).index_select(1, known)
+    cells = (
+        (positions * tables.cells_per_metre)
+        .reshape(-1, n_uavs**2, n_last, 2)
+        .index_select(1, known)
+    )
     fleets = cells.view(-1, n_uavs, n_uavs, n_last, 2).movedim(2, -1)
     return _share_of_first(tables, own, fleets).reshape(*lead, n_uavs)
 
 
 def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleets: Tensor) -> Tensor:
-    """Coverage of the first UAV of each fleet, ``[b, N]``, from positions in cells, ``[b, N, n, 2, N]``."""
+    """Coverage of the first UAV of each fleet, ``[b, N]``, from positions in cells,
+    ``[b, N, n, 2, N]``."""
     n_uavs, n_last = point_ids.shape[1:]
     words_per_world = n_uavs * n_last * (n_uavs + n_last - 1 + tables.masks.shape[-1])
     large = point_ids.device.type != "cpu" or torch.compiler.is_compiling()
@@ -145,9 +171,10 @@ def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleets: Tensor) 
 
 
 def _overlap_rows(fleet: Tensor) -> Tensor:
-    """Table rows of the discs that may overlap a footprint of the first UAV, ``[b, N, n, N + n - 2]``."""
-    # First the other UAVs at the same index, then the UAV itself at later ones; a window that slides over the
-    # indices leaves out all other pairs, without index tensors.
+    """Table rows of the discs that may overlap a footprint of the first UAV,
+    ``[b, N, n, N + n - 2]``."""
+    # First the other UAVs at the same index, then the UAV itself at later ones; a window that
+    # slides over the indices leaves out all other pairs, without index tensors.
     cells, n_last = fleet[..., 0], fleet.shape[-3]
     past = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf).unfold(-2, n_last, 1)
     other = torch.cat([fleet[..., 1:], past[..., 1:]], -1)
@@ -157,7 +184,8 @@ def _overlap_rows(fleet: Tensor) -> Tensor:
 
 
 def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
-    """Bitwise OR of M rows of a table [R, words] for each of K sets of them: ``[M, K]`` -> ``[K, words]``."""
+    """Bitwise OR of M rows of a table [R, words] for each of K sets of them: ``[M, K]`` ->
+    ``[K, words]``."""
     first, *others = rows.unbind(0)
     combined = table.index_select(0, first)
     for row in others:

@@ -1,4 +1,5 @@
-"""Actions (paper, section 4.2): a distance and a heading that lead to a landing point for one UAV alone."""
+"""Actions (paper, section 4.2): a distance and a heading that lead to a landing point for one UAV
+alone."""
 
 import math
 from typing import NamedTuple
@@ -15,11 +16,13 @@ from damian.world.config import ActionConfig
 BOOKING_CHUNK = 2**22
 """Landing points of all worlds in which UAVs book together, which bounds the memory: 32 MB."""
 _FEW_AGENTS = 4
-"""Most UAVs of a world that book one by one, in a fifth of the time of rounds for 3, in 5 times for 8."""
+"""Most UAVs of a world that book one by one, in a fifth of the time of rounds for 3, in 5 times for
+8."""
 _POINTS_AT_ONCE = 1024
 """Landing points whose actions are ranked together, which bounds the memory."""
 _EDGES_AT_ONCE = 2**18
-"""Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2 MB."""
+"""Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2
+MB."""
 
 
 def action_table(actions: ActionConfig, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -29,7 +32,8 @@ def action_table(actions: ActionConfig, dtype: torch.dtype = torch.float32) -> T
 
 
 def displacement(distance: Tensor, heading: Tensor) -> Tensor:
-    """Displacement east and north, [*, 2] metres, of flights by distance [*] metres and heading [*] rad."""
+    """Displacement east and north, [*, 2] metres, of flights by distance [*] metres and heading [*]
+    rad."""
     return distance.unsqueeze(-1) * torch.stack([heading.sin(), heading.cos()], -1)
 
 
@@ -45,8 +49,8 @@ class Ranking(NamedTuple):
 class Candidates:
     """Landing points to which an action of one of N UAVs may lead, nearest its target first.
 
-    For discrete actions they are computed once. Among ``2N - 1`` candidates, one is always free: the other
-    UAVs stand on at most ``N - 1`` points and have booked at most ``N - 1`` more.
+    For discrete actions they are computed once. Among ``2N - 1`` candidates, one is always free:
+    the other UAVs stand on at most ``N - 1`` points and have booked at most ``N - 1`` more.
     """
 
     def __init__(self, airspace: Airspace, config: ActionConfig, n_agents: int) -> None:
@@ -58,22 +62,28 @@ class Candidates:
             self._rank_all()
 
     def rank(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Ranking, Tensor]:
-        """Rank the points to which actions from points ``flat`` may lead; and the row of each UAV, [B, N]."""
+        """Rank the points to which actions from points ``flat`` may lead; and the row of each UAV,
+        [B, N]."""
         if self.config.kind == "discrete":
             return self.ranking, flat * self.config.n_actions + action
         action = action.double().clamp(0, 1)
-        move = displacement(action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi).flatten(0, 1)
+        move = displacement(
+            action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi
+        ).flatten(0, 1)
         own, base = flat.flatten(), (flat - flat % self.airspace.max_points).flatten()
         exact_points = self.airspace.exact_points
         target = gather_rows(exact_points.flatten(0, 1), own) + move
         where = region.unsqueeze(-1).expand_as(flat).flatten(), target, own - base
         edges, cells = self.airspace.edges, [*self.airspace.cells]
         nearest = _nearest_inside(edges, cells, exact_points, *where, self.n_candidates)
-        distance = self.airspace.length(own.unsqueeze(1).expand_as(nearest), nearest + base.unsqueeze(-1))
+        distance = self.airspace.length(
+            own.unsqueeze(1).expand_as(nearest), nearest + base.unsqueeze(-1)
+        )
         return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
 
     def goals(self) -> Tensor:
-        """The two nearest landing points to which each discrete action may lead, [C, R*L, A] indices."""
+        """The two nearest landing points to which each discrete action may lead, [C, R*L, A]
+        indices."""
         point = self.ranking.point.view(-1, self.config.n_actions, self.n_candidates)
         return point[..., :2].movedim(-1, 0).long().contiguous()
 
@@ -81,11 +91,15 @@ class Candidates:
         """Tabulate the candidates of every (landing point, action): R*L*A lists."""
         table = action_table(self.config, torch.float64)
         shape = (*self.airspace.points.shape[:2], len(table))
-        self.distance = torch.zeros(shape)  # to the nearest candidate; infinite if the target lies outside
+        self.distance = torch.zeros(
+            shape
+        )  # to the nearest candidate; infinite if the target lies outside
         distance = torch.zeros(*shape, self.n_candidates)
         self.ranking = Ranking(torch.zeros_like(distance, dtype=torch.int32), distance)
         counts = self.airspace.n_points.tolist()
-        parts = [(r, own) for r, n in enumerate(counts) for own in torch.arange(n).split(_POINTS_AT_ONCE)]
+        parts = [
+            (r, own) for r, n in enumerate(counts) for own in torch.arange(n).split(_POINTS_AT_ONCE)
+        ]
         for region, own in parts:
             ranked, within = self._rank_from(region, own, displacement(table[:, 0], table[:, 1]))
             for table_of_all, part in zip(self.ranking, ranked, strict=True):
@@ -97,15 +111,22 @@ class Candidates:
         self.distance = self.distance.flatten(0, 1)
         holds = table[:, 0] == 0
         self.can_hold = bool(holds.any())
-        self.hold = torch.arange(len(table)) == int(holds.int().argmax())  # the first one that holds, if any
+        self.hold = torch.arange(len(table)) == int(
+            holds.int().argmax()
+        )  # the first one that holds, if any
 
     def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
-        """Candidates [P, A, K] of moves from the points ``own`` [P], and whether these end inside [P, A]."""
+        """Candidates [P, A, K] of moves from the points ``own`` [P], and whether these end inside
+        [P, A]."""
         polygon, base = self.airspace.regions[region].polygon, region * self.airspace.max_points
         target = self.airspace.exact_points[region, own].unsqueeze(1) + move
         shapely.prepare(polygon)
         within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
-        where = torch.full((within.numel(),), region), target.flatten(0, 1), own.repeat_interleave(len(move))
+        where = (
+            torch.full((within.numel(),), region),
+            target.flatten(0, 1),
+            own.repeat_interleave(len(move)),
+        )
         cells, exact_points = self.airspace.cells, self.airspace.exact_points
         nearest = _nearest_or_own(cells, exact_points, *where, within.flatten(), self.n_candidates)
         nearest = nearest.view(*within.shape, -1)
@@ -115,7 +136,13 @@ class Candidates:
 
 @torch.library.custom_op("damian::nearest_inside", mutates_args=())
 def _nearest_inside(
-    edges: Tensor, cells: list[Tensor], points: Tensor, region: Tensor, target: Tensor, own: Tensor, n: int
+    edges: Tensor,
+    cells: list[Tensor],
+    points: Tensor,
+    region: Tensor,
+    target: Tensor,
+    own: Tensor,
+    n: int,
 ) -> Tensor:
     """Landing points nearest to targets, [M, n]; ``own`` [M] instead of missing ones or outside."""
     at_once = max(_EDGES_AT_ONCE // edges.shape[1], 1)
@@ -130,11 +157,19 @@ def _(edges, cells, points, region, target, own, n):  # compilers need only the 
 
 
 def _nearest_or_own(
-    cells: Cells, points: Tensor, region: Tensor, target: Tensor, own: Tensor, within: Tensor, n: int
+    cells: Cells,
+    points: Tensor,
+    region: Tensor,
+    target: Tensor,
+    own: Tensor,
+    within: Tensor,
+    n: int,
 ) -> Tensor:
     """As ``_nearest_inside``, where ``within`` [M] says which targets lie inside."""
     nearest = own.unsqueeze(-1).repeat(1, n)
-    if not devices.data_dependent(own.device):  # the number of targets inside is not known without waiting
+    if not devices.data_dependent(
+        own.device
+    ):  # the number of targets inside is not known without waiting
         found = nearest_points(cells, points, region, target, n)
         return torch.where(within.unsqueeze(-1) & (found >= 0), found, nearest)
     found = nearest_points(cells, points, region[within], target[within], n)
@@ -145,10 +180,12 @@ def _nearest_or_own(
 def assign_landing_points(
     ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int
 ) -> Tensor:
-    """Give every UAV its best free candidate, in index order, so that no two book one point, [B, N].
+    """Give every UAV its best free candidate, in index order, so that no two book one point,
+    [B, N].
 
-    A point is free to a UAV if no other UAV stands on it or flies to it (``standing`` [B, N]); its own point
-    always is. ``row`` [B, N] is that of each UAV in the ranking, ``reach`` [B, N] the largest distance that
+    A point is free to a UAV if no other UAV stands on it or flies to it (``standing`` [B, N]); its
+    own point always is. ``row`` [B, N] is that of each UAV in the ranking, ``reach`` [B, N] the
+    largest distance that
     it may fly [m], negative if it may not choose: candidates farther away stay free for other UAVs.
     """
     if row.shape[1] <= _FEW_AGENTS or not devices.data_dependent(row.device):
@@ -163,7 +200,9 @@ def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: T
     taken, goals = standing.t().unsqueeze(-1), []
     for own, wish in zip(standing.split(1, 1), wishes.unbind(1), strict=True):
         free = (wish == own) | ~(wish == taken).any(0)
-        goals.append(wish.gather(-1, free.byte().argmax(-1, keepdim=True)))  # of several, the first one
+        goals.append(
+            wish.gather(-1, free.byte().argmax(-1, keepdim=True))
+        )  # of several, the first one
         taken = torch.cat([taken, goals[-1].unsqueeze(0)])
     return torch.cat(goals, 1)
 
@@ -176,7 +215,11 @@ def _assign_in_rounds(
 
     Each point keeps the earliest UAV that has asked for it; all others ask for their next one.
     """
-    at_once, points, distances = max(BOOKING_CHUNK // n_points, 1), point.flatten(), distance.flatten()
+    at_once, points, distances = (
+        max(BOOKING_CHUNK // n_points, 1),
+        point.flatten(),
+        distance.flatten(),
+    )
     first = row * point.shape[1]
     parts = zip(*(each.split(at_once) for each in (first, standing, reach)), strict=True)
     return torch.cat([_rounds(points, distances, f, s, r, n_points) for f, s, r in parts])
@@ -190,11 +233,14 @@ def _(point, distance, row, standing, reach, n_points):  # compilers need only t
 def _rounds(
     points: Tensor, distances: Tensor, first: Tensor, standing: Tensor, reach: Tensor, n_points: int
 ) -> Tensor:
-    """The rounds of some worlds; ``first`` [B, N] indexes each UAV's first one of all candidates [M*K]."""
+    """The rounds of some worlds; ``first`` [B, N] indexes each UAV's first one of all candidates
+    [M*K]."""
     asked, stands, reach = first.flatten().clone(), standing.flatten(), reach.flatten()
-    # A world's first point, and the UAV that each point keeps, as a flat number; those of a world count up in
-    # index order.
-    base = (torch.arange(len(first), device=first.device) * n_points).repeat_interleave(first.shape[1])
+    # A world's first point, and the UAV that each point keeps, as a flat number; those of a world
+    # count up in index order.
+    base = (torch.arange(len(first), device=first.device) * n_points).repeat_interleave(
+        first.shape[1]
+    )
     nobody = first.numel()
     keeper = torch.full((len(first) * n_points,), nobody, device=first.device)
     keeper.index_fill_(0, base + stands, -1)
@@ -202,7 +248,9 @@ def _rounds(
     while len(asking):
         candidate, own = asked.index_select(0, asking), stands.index_select(0, asking)
         point = points.index_select(0, candidate).long()
-        flies = (distances.index_select(0, candidate) <= reach.index_select(0, asking)) & (point != own)
+        flies = (distances.index_select(0, candidate) <= reach.index_select(0, asking)) & (
+            point != own
+        )
         booked.index_copy_(0, asking, torch.where(flies, point, own))
         asking, point = asking[flies], point[flies]
         wanted = base.index_select(0, asking) + point

@@ -1,4 +1,5 @@
-"""The messages that UAVs send; a further field is declared in ``Messages`` and filled in ``Simulation``."""
+"""The messages that UAVs send; a further field is declared in ``Messages`` and filled in
+``Simulation``."""
 
 from typing import Annotated, NamedTuple, get_type_hints
 
@@ -28,7 +29,8 @@ class Widths(NamedTuple):
     requests: int = 0
     """Number of requests that can be open at once, M."""
     truths: int = 0
-    """Number of sources of which messages tell the true detections, too: K if rewards follow them."""
+    """Number of sources of which messages tell the true detections, too: K if rewards follow
+    them."""
 
 
 ONE_SOURCE = Widths()
@@ -37,7 +39,8 @@ ONE_SOURCE = Widths()
 class Messages(NamedTuple):
     """One message of each UAV, with any leading dimensions; each field [*, N] or [*, N, width].
 
-    It carries what the paper lists (section 3.2), the number of motions and the latest landing points.
+    It carries what the paper lists (section 3.2), the number of motions and the latest landing
+    points.
     """
 
     time: Annotated[Tensor, Column()]
@@ -61,20 +64,24 @@ class Messages(NamedTuple):
     detected_position: Annotated[Tensor, Column(None)]
     """Position of the UAV at its latest detection of each source, east, north [m], [*, N, K, 2]."""
     true_time: Annotated[Tensor, Column(None)]
-    """As ``detected_time``, of when the UAV truly was in reach, [*, N, T]; T is K, or 0 if it is not told."""
+    """As ``detected_time``, of when the UAV truly was in reach, [*, N, T]; T is K, or 0 if it is
+    not told."""
     true_position: Annotated[Tensor, Column(None)]
     """As ``detected_position``, of where the UAV truly was in reach, [*, N, T, 2]."""
     requests: Annotated[Tensor, Column(None)]
-    """The latest request of each slot (``damian.world.requests``) that the UAV has heard of, [*, N, M, 3].
+    """The latest request of each slot (``damian.world.requests``) that the UAV has heard of,
+    [*, N, M, 3].
 
     Without ``requests.range``, that which there is now, also if the UAV sends nothing.
     """
     served: Annotated[Tensor, Column(None)]
-    """When the latest request of each slot that the UAV has served appeared [s], [*, N, M]; -1 if none."""
+    """When the latest request of each slot that the UAV has served appeared [s], [*, N, M]; -1 if
+    none."""
     serves: Annotated[Tensor, Column(None)]
     """Whether it serves one now, 0 or 1, [*, N, 1]; [*, N, 0] if there are no requests."""
     trail: Annotated[Tensor, Column(None, torch.long)]
-    """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a stop."""
+    """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a
+    stop."""
     landed: Annotated[Tensor, Column(None)]
     """Time at which each of these stops began [s], [*, N, S]; -1 before the episode."""
     readings: Annotated[Tensor, Column(None)]
@@ -82,7 +89,8 @@ class Messages(NamedTuple):
 
     @classmethod
     def blank(cls, trail: Tensor, widths: Widths = ONE_SOURCE) -> "Messages":
-        """Messages of zeros, without a detection, of UAVs with the landing points ``trail`` [*, N, S]."""
+        """Messages of zeros, without a detection, of UAVs with the landing points ``trail``
+        [*, N, S]."""
         width = _FIXED + sum(_variable(widths)) + 2 * trail.shape[-1]
         blank = cls.unpack(torch.zeros(*trail.shape[:-1], width, device=trail.device), widths)
         unknown = ("detected_time", "true_time", "requests", "served")
@@ -90,17 +98,21 @@ class Messages(NamedTuple):
         return blank._replace(**never, trail=trail)
 
     def pack(self) -> Tensor:
-        """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through exactly."""
+        """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through
+        exactly."""
         flat = {name: getattr(self, name).flatten(-2) for name in _ROWS}
         fields = zip(self._replace(**flat), _COLUMNS, strict=True)
-        parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
+        parts = [
+            (field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields
+        ]
         return torch.cat(parts, -1)
 
     @classmethod
     def unpack(cls, rows: Tensor, widths: Widths = ONE_SOURCE) -> "Messages":
         """Messages from rows [*, N, M]; floats are views.
 
-        ``Server.messages``, which knows the widths, is the way to unpack messages of an environment.
+        ``Server.messages``, which knows the widths, is the way to unpack messages of an
+        environment.
         """
         *variable, readings = _variable(widths)
         stops = (rows.shape[-1] - _FIXED - sum(variable) - readings) // 2
@@ -136,15 +148,18 @@ class Messages(NamedTuple):
 
     @property
     def in_flight(self) -> Tensor:
-        """Whether the message was sent at a takeoff, so that its UAV flies to another point, [*, N]."""
+        """Whether the message was sent at a takeoff, so that its UAV flies to another point,
+        [*, N]."""
         return (self.position != self.target).any(-1)
 
     def region(self, n_points: int) -> Tensor:
-        """Index of the region of each world, [*], by the largest number of landing points in a region."""
+        """Index of the region of each world, [*], by the largest number of landing points in a
+        region."""
         return self.trail[..., 0, 0] // n_points
 
     def age(self, now: Tensor) -> Tensor:
-        """Age of information: time since each message was generated [s], [*, N]; ``now`` is in s, [*]."""
+        """Age of information: time since each message was generated [s], [*, N]; ``now`` is in s,
+        [*]."""
         return now.unsqueeze(-1) - self.time
 
 

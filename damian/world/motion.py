@@ -1,4 +1,5 @@
-"""Flights (paper, eq. 1): takeoff to the flight level, cruise and landing as rest-to-rest polynomials."""
+"""Flights (paper, eq. 1): takeoff to the flight level, cruise and landing as rest-to-rest
+polynomials."""
 
 import math
 
@@ -16,7 +17,8 @@ _PEAK_ACCELERATION = {3: 6.0, 5: 10 * math.sqrt(3) / 3, 7: 84 * math.sqrt(5) / 2
 
 
 def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> list[float]:
-    """One flight level per UAV [m], from the lowest upward; if ``shared``, UAVs may have the same one."""
+    """One flight level per UAV [m], from the lowest upward; if ``shared``, UAVs may have the same
+    one."""
     room = (config.max_level - config.min_level) / config.level_separation
     n_fit = math.floor(room + _TINY) + 1
     checks.require(
@@ -32,8 +34,8 @@ def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> 
 def time_law(tau: Tensor, degree: int) -> Tensor:
     """Share of a phase's length covered at the share ``tau`` of its time, any shape (paper, eq. 1).
 
-    The polynomial of lowest degree (3, 5 or 7) with s(0) = 0, s(1) = 1 and 1, 2 or 3 vanishing derivatives at
-    both ends. ``tau`` is clamped to [0, 1].
+    The polynomial of lowest degree (3, 5 or 7) with s(0) = 0, s(1) = 1 and 1, 2 or 3 vanishing
+    derivatives at both ends. ``tau`` is clamped to [0, 1].
     """
     t = tau.clamp(0.0, 1.0)
     if degree == 3:
@@ -59,18 +61,22 @@ def place_on(way: Tensor, share: Tensor) -> Tensor:
         return torch.lerp(way[..., 0, :], way[..., 1, :], share.unsqueeze(-1))
     legs = way.diff(dim=-2)
     length = torch.linalg.vector_norm(legs, dim=-1)
-    since = (share * length.sum(-1)).unsqueeze(-1) - (length.cumsum(-1) - length)  # since each leg began [m]
+    since = (share * length.sum(-1)).unsqueeze(-1) - (
+        length.cumsum(-1) - length
+    )  # since each leg began [m]
     done = (since / length.clamp_min(_TINY)).clamp(0, 1) * (length > 0)
     place = way[..., 0, :] + (done.unsqueeze(-1) * legs).sum(-2)
     return torch.where(share.unsqueeze(-1) < 1, place, way[..., -1, :])  # there, to the bit
 
 
 def air_length(way: Tensor, wind: Tensor, airspeed: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Way through the air [*] m of flights over places [*, W, 2] m, and their lowest ground speeds [*] m/s.
+    """Way through the air [*] m of flights over places [*, W, 2] m, and their lowest ground speeds
+    [*] m/s.
 
-    A leg of length L, flown at the ``airspeed`` v [*] m/s, has the ground speed sqrt(v^2 - cross^2) + along,
-    by the wind across and along it; its way through the air is L v over that. ``wind`` [*, 2] m/s: the way in
-    which it blows, east and north; ground speeds below ``least`` count as this.
+    A leg of length L, flown at the ``airspeed`` v [*] m/s, has the ground speed sqrt(v^2 - cross^2)
+    + along, by the wind across and along it; its way through the air is L v over that. ``wind``
+    [*, 2] m/s: the way in which it blows, east and north; ground speeds below ``least`` count as
+    this.
     """
     legs = way.diff(dim=-2)
     length = torch.linalg.vector_norm(legs, dim=-1)  # [*, W - 1]
@@ -85,15 +91,17 @@ def air_length(way: Tensor, wind: Tensor, airspeed: Tensor, least: float) -> tup
 def poses(
     way: Tensor, level: Tensor, elapsed: Tensor, vertical: Tensor, cruise: Tensor, degree: int
 ) -> tuple[Tensor, Tensor]:
-    """Positions [*, 3] m of UAVs ``elapsed`` seconds after takeoff, and how much of the cruise is flown [*].
+    """Positions [*, 3] m of UAVs ``elapsed`` seconds after takeoff, and how much of the cruise is
+    flown [*].
 
     After their flights, they stand at the targets.
 
-    ``way``: places from the origin to the target, [*, W, 2] m, ``level`` above 0 [*] m, and durations [s] of
-    takeoff or landing, above 0, and of the cruise, 0 for no flight; ``elapsed`` in double precision. The
-    second result is a share, from 0 to 1.
+    ``way``: places from the origin to the target, [*, W, 2] m, ``level`` above 0 [*] m, and
+    durations [s] of takeoff or landing, above 0, and of the cruise, 0 for no flight; ``elapsed`` in
+    double precision. The second result is a share, from 0 to 1.
     """
-    # A landing is a takeoff reversed in time, s(1 - tau) = 1 - s(tau), so one evaluation serves both.
+    # A landing is a takeoff reversed in time, s(1 - tau) = 1 - s(tau), so one evaluation serves
+    # both.
     remaining = torch.add(cruise, vertical, alpha=2) - elapsed
     climbing = torch.minimum(elapsed, remaining) / vertical
     cruising = (elapsed - vertical) / cruise.clamp_min(_TINY)

@@ -1,8 +1,10 @@
-"""Flights around what is in the way: shortest paths between landing points that do not leave the region.
+"""Flights around what is in the way: shortest paths between landing points that do not leave the
+region.
 
-Zones where nobody flies are holes of the region. Where the straight way between two landing points leaves the
-region or enters a hole, a UAV flies the shortest path around, which bends at corners only (de Berg et al.,
-"Computational Geometry", 2008, section 15.1). All such paths are computed once.
+Zones where nobody flies are holes of the region. Where the straight way between two landing points
+leaves the region or enters a hole, a UAV flies the shortest path around, which bends at corners
+only (de Berg et al., "Computational Geometry", 2008, section 15.1). All such paths are computed
+once.
 """
 
 from typing import NamedTuple
@@ -25,7 +27,8 @@ _CONVEX = 1e-9
 
 
 class Detours(NamedTuple):
-    """The ways between landing points that are not straight, P of them, with at most C corners each."""
+    """The ways between landing points that are not straight, P of them, with at most C corners
+    each."""
 
     pair: Tensor
     """Which landing points each connects, ``origin * M + goal`` of M flat ids, ascending, [P]."""
@@ -39,22 +42,28 @@ class Detours(NamedTuple):
     """Pairs farther apart than this were not looked at [m]."""
 
     def row(self, origin: Tensor, goal: Tensor) -> Tensor:
-        """The detour from each landing point to another, flat ids [*], or P for a straight way, [*]."""
+        """The detour from each landing point to another, flat ids [*], or P for a straight way,
+        [*]."""
         wanted = origin * self.n_points + goal
         found = torch.searchsorted(self.pair, wanted).clamp(max=len(self.pair) - 1)
         return torch.where(self.pair.take(found) == wanted, found, len(self.pair))
 
     def way(self, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
-        """Places on the ways between landing points, from one to the other, [*, C + 2, 2] metres."""
+        """Places on the ways between landing points, from one to the other, [*, C + 2, 2]
+        metres."""
         return self._along(self.row(origin, goal), origin, goal, points)
 
     def _along(self, row: Tensor, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
-        first, last = gather_rows(points, origin).unsqueeze(-2), gather_rows(points, goal).unsqueeze(-2)
+        first, last = (
+            gather_rows(points, origin).unsqueeze(-2),
+            gather_rows(points, goal).unsqueeze(-2),
+        )
         corners = gather_rows(self.corners, row)
         return torch.cat([first, torch.where(corners.isnan(), last, corners), last], -2)
 
     def length(self, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
-        """Lengths of the ways between landing points [m], [*]; infinite where none leads to the goal."""
+        """Lengths of the ways between landing points [m], [*]; infinite where none leads to the
+        goal."""
         row = self.row(origin, goal)
         way = self._along(row, origin, goal, points)
         straight = torch.linalg.vector_norm(way[..., -1, :] - way[..., 0, :], dim=-1)
@@ -62,7 +71,9 @@ class Detours(NamedTuple):
         return torch.linalg.vector_norm(way.diff(dim=-2), dim=-1).sum(-1).where(leads, torch.inf)
 
 
-def detours(polygons: list[Polygon | MultiPolygon], points: list[Floats], longest: float) -> Detours | None:
+def detours(
+    polygons: list[Polygon | MultiPolygon], points: list[Floats], longest: float
+) -> Detours | None:
     """The detours between landing points [L_r, 2] m of each region; None if all ways are straight.
 
     Only pairs are looked at that are at most ``longest`` [m] apart.
@@ -88,15 +99,20 @@ def detours(polygons: list[Polygon | MultiPolygon], points: list[Floats], longes
     pairs, reached = (np.concatenate([each[i] for each in found]) for i in (0, 2))
     return Detours(
         torch.as_tensor(pairs[:, 0] * n_points + pairs[:, 1]),
-        torch.as_tensor(np.concatenate([*padded, np.full((1, widest, 2), np.nan)]), dtype=torch.float32),
+        torch.as_tensor(
+            np.concatenate([*padded, np.full((1, widest, 2), np.nan)]), dtype=torch.float32
+        ),
         torch.as_tensor(np.append(reached, True)),
         n_points,
         longest,
     )
 
 
-def _shortest(polygon: shapely.Geometry, points: Floats, pairs: NDArray[np.int64]) -> tuple[Floats, NDArray]:
-    """Corners [P, C, 2] of the shortest paths between pairs [P, 2], NaN after the last; which exist."""
+def _shortest(
+    polygon: shapely.Geometry, points: Floats, pairs: NDArray[np.int64]
+) -> tuple[Floats, NDArray]:
+    """Corners [P, C, 2] of the shortest paths between pairs [P, 2], NaN after the last; which
+    exist."""
     corners = _dents(polygon)
     ends, index = np.unique(pairs, return_inverse=True)
     origin, goal = index.reshape(pairs.shape).T + len(corners)
@@ -105,7 +121,9 @@ def _shortest(polygon: shapely.Geometry, points: Floats, pairs: NDArray[np.int64
     straight = np.full((len(corners), len(places)), np.inf)
     one, other = np.divmod(np.arange(straight.size), len(places))
     seen = (one != other) & _visible(polygon, places[one], places[other])
-    one, other = (each[seen].astype(np.int32) for each in (one, other))  # scipy 1.14 takes no others
+    one, other = (
+        each[seen].astype(np.int32) for each in (one, other)
+    )  # scipy 1.14 takes no others
     straight[one, other] = np.linalg.norm(places[one] - places[other], axis=1)
     graph = csr_array((straight[one, other], (one, other)), shape=(len(places),) * 2)
     along, before = dijkstra(graph, indices=np.arange(len(corners)), return_predecessors=True)
@@ -128,9 +146,12 @@ def _visible(polygon: shapely.Geometry, origin: Floats, goal: Floats) -> NDArray
 
 
 def _dents(polygon: shapely.Geometry) -> Floats:
-    """The corners about which a shortest path may bend, those that point into the polygon, [V, 2] metres."""
+    """The corners about which a shortest path may bend, those that point into the polygon, [V, 2]
+    metres."""
     found = []
-    for ring in shapely.get_rings(shapely.get_parts(shapely.orient_polygons(polygon))):  # inside on the left
+    for ring in shapely.get_rings(
+        shapely.get_parts(shapely.orient_polygons(polygon))
+    ):  # inside on the left
         corner = shapely.get_coordinates(ring)[:-1]
         (x, y), (u, v) = (corner - np.roll(corner, 1, 0)).T, (np.roll(corner, -1, 0) - corner).T
         found.append(corner[x * v - y * u < 0])

@@ -1,8 +1,9 @@
-"""Requests that appear at random places; a UAV that lands within its footprint of them serves the oldest.
+"""Requests that appear at random places; a UAV that lands within its footprint of them serves the
+oldest.
 
-A world has M slots. Each holds the latest request that appeared in it: a row of its place, east, north [m],
-and the time at which it appeared [s], negative if there was none. A UAV remembers what it has served by that
-time of each slot.
+A world has M slots. Each holds the latest request that appeared in it: a row of its place, east,
+north [m], and the time at which it appeared [s], negative if there was none. A UAV remembers what
+it has served by that time of each slot.
 """
 
 from collections.abc import Sequence
@@ -38,14 +39,18 @@ def poisson_arrivals(
 ) -> Arrivals:
     """Poisson numbers of requests, ``mean`` in a step, for worlds with M ``slots``."""
     places = np.stack([sample_interior(region.polygon, _PLACES, rng) for region in regions])
-    # That at least k appear has the probability P(k, mean), the regularised lower incomplete gamma function.
+    # That at least k appear has the probability P(k, mean), the regularised lower incomplete gamma
+    # function.
     at_least = torch.arange(1, slots + 1, dtype=torch.float64)
     chance = torch.special.gammainc(at_least, torch.full_like(at_least, mean))
-    return Arrivals(chance.float(), torch.as_tensor(places, dtype=torch.float32), torch.arange(slots))
+    return Arrivals(
+        chance.float(), torch.as_tensor(places, dtype=torch.float32), torch.arange(slots)
+    )
 
 
 def is_open(requests: Tensor, served: Tensor) -> Tensor:
-    """Which requests [*, M, 3] no UAV has served, as far as its memory [*, N, M] tells, [*, M] bool."""
+    """Which requests [*, M, 3] no UAV has served, as far as its memory [*, N, M] tells, [*, M]
+    bool."""
     time = requests[..., 2]
     return (time >= 0) & (time > served.amax(-2))
 
@@ -53,10 +58,12 @@ def is_open(requests: Tensor, served: Tensor) -> Tensor:
 def appear(
     requests: Tensor, served: Tensor, arrivals: Arrivals, counters: tuple[Tensor, ...], now: Tensor
 ) -> Tensor:
-    """The slots [B, M, 3] after a step, in which requests have appeared; none has when an episode begins.
+    """The slots [B, M, 3] after a step, in which requests have appeared; none has when an episode
+    begins.
 
-    They take the slots whose requests are served, the oldest first; what finds none is lost. ``counters``:
-    the seed, the episode, the step and the region of each world [B]. ``now`` [B] is in seconds.
+    They take the slots whose requests are served, the oldest first; what finds none is lost.
+    ``counters``: the seed, the episode, the step and the region of each world [B]. ``now`` [B] is
+    in seconds.
     """
     seed, episode, step, region = (each.unsqueeze(-1) for each in counters)
     share = counter_rng.uniform(seed, torch.full_like(step, _APPEARS), episode, step)
@@ -74,10 +81,11 @@ def appear(
 def serve(
     requests: Tensor, served: Tensor, position: Tensor, lands: Tensor, radius: float | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What each UAV has served after its landing, [B, N, M], and whether it serves one now, [B, N] bool.
+    """What each UAV has served after its landing, [B, N, M], and whether it serves one now, [B, N]
+    bool.
 
-    Each UAV of ``lands`` [B, N] serves the oldest open request within ``radius`` [m], or [B, 1, 1], of its
-    ``position`` [B, N, 2]; of several UAVs that would serve the same one, the first does.
+    Each UAV of ``lands`` [B, N] serves the oldest open request within ``radius`` [m], or [B, 1, 1],
+    of its ``position`` [B, N, 2]; of several UAVs that would serve the same one, the first does.
     """
     time = requests[..., 2].unsqueeze(-2)  # [B, 1, M]
     near = (position.unsqueeze(-2) - requests[..., None, :, :2]).square().sum(-1) <= radius**2

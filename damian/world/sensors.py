@@ -1,4 +1,5 @@
-"""Sensors that a user adds: functions of the true state of the worlds, whose readings the messages carry."""
+"""Sensors that a user adds: functions of the true state of the worlds, whose readings the messages
+carry."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,8 @@ from damian.world.state import State
 
 
 class Sensor(NamedTuple):
-    """A function that reads the true state of the worlds, and how many values it returns for a UAV."""
+    """A function that reads the true state of the worlds, and how many values it returns for a
+    UAV."""
 
     compute: Callable[..., Tensor]
     """From the ``State`` of B worlds and the ``Simulation`` to values, [B, N] or [B, N, width]."""
@@ -37,12 +39,14 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
     """Decorator that makes a sensor of a function.
 
     The function gets the ``State`` of B worlds when the UAVs and the source have moved, and the
-    ``Simulation``; ``state.steps * world.dt`` is the time [s]. It returns a value for each UAV, [B, N], or
-    ``width`` of them, [B, N, width]. Its keyword-only arguments are parameters that a configuration may set.
-    It must be pure, batched over B and, for ``env.compile()``, free of branches on data. Random numbers come
-    from ``damian.common.counter_rng`` with ``state.seed``, ``state.episode`` and ``state.steps``.
+    ``Simulation``; ``state.steps * world.dt`` is the time [s]. It returns a value for each UAV,
+    [B, N], or ``width`` of them, [B, N, width]. Its keyword-only arguments are parameters that a
+    configuration may set. It must be pure, batched over B and, for ``env.compile()``, free of
+    branches on data. Random numbers come from ``damian.common.counter_rng`` with ``state.seed``,
+    ``state.episode`` and ``state.steps``.
 
-    Features read the reading, as float32, as ``cache.reading("name")``, by the name of the function.
+    Features read the reading, as float32, as ``cache.reading("name")``, by the name of the
+    function.
 
     Examples:
         >>> # in lab.py, used as sensors=[{sensor: lab:loudness, reach: 50}]
@@ -55,7 +59,9 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
     return lambda compute: Sensor(compute, width, compute.__name__)
 
 
-SENSORS = Registry[Sensor]("sensor", Sensor, "is not a sensor: decorate the function with damian.sensor")
+SENSORS = Registry[Sensor](
+    "sensor", Sensor, "is not a sensor: decorate the function with damian.sensor"
+)
 """Sensors, as ``package.module:name``."""
 
 
@@ -64,11 +70,16 @@ SENSORS = Registry[Sensor]("sensor", Sensor, "is not a sensor: decorate the func
 def footprint(state: State, world: Any) -> Tensor:
     """Radius of the UAV's footprint [m], [B, N]."""
     drawn = world.radii(state)
-    return torch.full_like(state.track, world.radius) if drawn is None else drawn.expand_as(state.track)
+    return (
+        torch.full_like(state.track, world.radius)
+        if drawn is None
+        else drawn.expand_as(state.track)
+    )
 
 
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
-    """Read ``package.module:name`` or ``{sensor: package.module:name, strength: 3}``; sensors by name."""
+    """Read ``package.module:name`` or ``{sensor: package.module:name, strength: 3}``; sensors by
+    name."""
     found: dict[str, Sensor] = {}
     for number, each in enumerate(written):
         key, entry = f"sensors[{number}]", each if isinstance(each, Mapping) else {"sensor": each}
@@ -76,7 +87,12 @@ def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
         name = name_of(parameters, declared.name, key)
         check_parameters(declared.compute, parameters, path, key)
         taken = name in found or name in Messages._fields
-        problem = "is the name of another sensor, or of a field of the messages: give it another one, as in "
+        problem = (
+            "is the name of another sensor, or of a field of the messages: give it another one, as "
+            "in "
+        )
         checks.require(not taken, f"{key}.name", name, f"{problem}{{sensor: {path}, name: other}}")
-        found[name] = Sensor(functools.partial(declared.compute, **parameters), declared.width, name)
+        found[name] = Sensor(
+            functools.partial(declared.compute, **parameters), declared.width, name
+        )
     return found

@@ -1,8 +1,8 @@
 """The signal source (paper, section 3.2): the radius within which UAVs detect it, and its walk.
 
-A dynamic source visits hotspots in a random order and, around each, a few inner points; it waits at every
-stop. Walks are drawn once as padded tensors, from which positions follow in closed form. In a concave
-polygon, the straight line between two stops may leave the polygon.
+A dynamic source visits hotspots in a random order and, around each, a few inner points; it waits at
+every stop. Walks are drawn once as padded tensors, from which positions follow in closed form. In a
+concave polygon, the straight line between two stops may leave the polygon.
 """
 
 import math
@@ -23,14 +23,16 @@ _FULL_DISC_ROUNDS, _ROUNDS = 256, 320
 
 
 class Walk(NamedTuple):
-    """Walks of ``W`` sources over at most ``K`` stops; a static source has one stop and never leaves it.
+    """Walks of ``W`` sources over at most ``K`` stops; a static source has one stop and never
+    leaves it.
 
     Padded stops lie at the first stop (walks that begin again have at least one), to which the walk
     then returns, or at the last one; they are left at the end of the walk and never reached.
 
     Attributes:
         stop: places, [W, K, 2] metres.
-        arrive, depart: times, [W, K] seconds; the first arrival is 0, and a static source never departs.
+        arrive, depart: times, [W, K] seconds; the first arrival is 0, and a static source never
+        departs.
         speed, acceleration: largest ones on the leg that leaves the stop, [W, K] m/s and m/s^2.
         emits: whether the source emits until it arrives at the next stop, [W, K] bool.
     """
@@ -48,7 +50,8 @@ class Located(NamedTuple):
 
     Attributes:
         position: [B, 2] metres.
-        stop, tour: index of the latest stop, and number of walks finished before this one, [B] int64.
+        stop, tour: index of the latest stop, and number of walks finished before this one, [B]
+        int64.
         finished: whether the source has stopped for good, [B] bool.
     """
 
@@ -59,7 +62,8 @@ class Located(NamedTuple):
 
 
 def footprint_radius(config: SourceConfig) -> float:
-    """Largest distance at which a UAV detects the source [m]: inverse-square law (paper, eq. 2 and 3)."""
+    """Largest distance at which a UAV detects the source [m]: inverse-square law
+    (paper, eq. 2 and 3)."""
     # R^2 = 4 pi I0 10^(level/10) / (4 pi I0 10^(microphone/10)), where all but the levels cancels.
     return 10 ** ((config.level_db - config.microphone_db) / 20)
 
@@ -78,9 +82,9 @@ def draw_walks(
 ) -> Walk:
     """Draw the walks of ``W = n_walks`` sources in a polygon of local metres, float32 on the CPU.
 
-    They begin at ``start``, [2] metres, if it is given. Hotspots are uniform in the polygon, inner points
-    uniform in the part of the disc around their hotspot that lies in it, or nearer where that part is very
-    thin (under about 1 % of the disc).
+    They begin at ``start``, [2] metres, if it is given. Hotspots are uniform in the polygon, inner
+    points uniform in the part of the disc around their hotspot that lies in it, or nearer where
+    that part is very thin (under about 1 % of the disc).
     """
     shapely.prepare(polygon)
     n_hotspots = 1 if config.motion == "static" else config.n_hotspots
@@ -95,9 +99,11 @@ def draw_walks(
 
 
 def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
-    """Positions of sources ``time`` [B] seconds after their first walks began (in double precision).
+    """Positions of sources ``time`` [B] seconds after their first walks began
+    (in double precision).
 
-    A source whose walk is over stays at its last stop, or ``loops``, if ``draw_walks`` has drawn it so.
+    A source whose walk is over stays at its last stop, or ``loops``, if ``draw_walks`` has drawn it
+    so.
     """
     last, end = walk.stop.shape[-2] - 1, walk.depart[..., -1].to(time.dtype)
     finished, tour = time >= end, torch.zeros_like(time)
@@ -121,7 +127,8 @@ def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
 
 
 def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-    """Duration of the acceleration, and of a whole rest-to-rest leg, trapezoidal or triangular [s], [*]."""
+    """Duration of the acceleration, and of a whole rest-to-rest leg, trapezoidal or triangular [s],
+    [*]."""
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
     return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp
@@ -130,7 +137,8 @@ def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Te
 def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:
     """Distance covered on a leg, [*] metres; 0 before it begins, ``length`` once it is over."""
     ramp, duration = leg_profile(length, speed, acceleration)
-    # The profile is symmetric: measured from the nearer end, speed has only risen or stayed the same.
+    # The profile is symmetric: measured from the nearer end, speed has only risen or stayed the
+    # same.
     from_end = torch.minimum(elapsed, duration - elapsed).clamp_min(0.0)
     rising = torch.minimum(from_end, ramp)
     near = acceleration * rising * (from_end - rising / 2)
@@ -142,7 +150,8 @@ def _draw_stops(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Each hotspot [W, H, 2] m followed by its inner points, packed to the left and padded.
 
-    Returns the places [W, K, 2] m, which stops are hotspots [W, K], and the number of real stops [W].
+    Returns the places [W, K, 2] m, which stops are hotspots [W, K], and the number of real stops
+    [W].
     """
     n_walks, inner = len(hotspots), _inner_points(polygon, hotspots, config, rng)
     grid = np.concatenate([hotspots[:, :, None], inner], axis=2)  # [W, H, 1 + max_stops, 2]
@@ -158,15 +167,21 @@ def _draw_stops(
 def _inner_points(
     polygon: _Polygon, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
 ) -> np.ndarray:
-    """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2] metres."""
+    """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2]
+    metres."""
     # Points outside after the first rounds are drawn from ever smaller discs, so that this ends.
     radii = config.local_distance / 2.0 ** np.maximum(np.arange(_ROUNDS) - _FULL_DISC_ROUNDS, 0)
     points = np.repeat(hotspots[:, :, None], config.max_stops, axis=2)
     flat, centre = points.reshape(-1, 2), points.reshape(-1, 2).copy()
     missing = np.arange(len(flat))
     for radius in radii:
-        distance, angle = radius * np.sqrt(rng.random(len(missing))), 2 * math.pi * rng.random(len(missing))
-        drawn = centre[missing] + distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+        distance, angle = (
+            radius * np.sqrt(rng.random(len(missing))),
+            2 * math.pi * rng.random(len(missing)),
+        )
+        drawn = centre[missing] + distance[:, None] * np.stack(
+            [np.sin(angle), np.cos(angle)], axis=1
+        )
         accepted = shapely.contains_xy(polygon, drawn)
         flat[missing[accepted]] = drawn[accepted]
         missing = missing[~accepted]
@@ -176,7 +191,11 @@ def _inner_points(
 
 
 def _timed_walk(
-    place: np.ndarray, hotspot: np.ndarray, n: np.ndarray, config: SourceConfig, rng: np.random.Generator
+    place: np.ndarray,
+    hotspot: np.ndarray,
+    n: np.ndarray,
+    config: SourceConfig,
+    rng: np.random.Generator,
 ) -> Walk:
     """Add waiting times, legs and emission to the stops."""
     shape, loops = hotspot.shape, config.after_walk == "loop"
@@ -185,7 +204,9 @@ def _timed_walk(
     emits = rng.random(shape) < (config.emission_probability if per_stop else 1.0)
     if loops:  # room for the return to the first stop
         drawn = place, hotspot, wait, emits
-        place, hotspot, wait, emits = (np.concatenate([each, each[:, -1:]], axis=1) for each in drawn)
+        place, hotspot, wait, emits = (
+            np.concatenate([each, each[:, -1:]], axis=1) for each in drawn
+        )
     last, column = (n - 1)[:, None], np.arange(hotspot.shape[1])
     padded = column > last
     after = np.zeros_like(last) if loops else last
@@ -194,11 +215,17 @@ def _timed_walk(
     speed = np.where(to_hotspot, config.speed, config.local_speed)
     acceleration = np.where(to_hotspot, config.acceleration, config.local_acceleration)
     length = np.linalg.norm(np.diff(place, axis=1), axis=2)
-    _, leg = leg_profile(*(torch.as_tensor(x) for x in (length, speed[:, :-1], acceleration[:, :-1])))
+    _, leg = leg_profile(
+        *(torch.as_tensor(x) for x in (length, speed[:, :-1], acceleration[:, :-1]))
+    )
     arrive = np.zeros(hotspot.shape)
     arrive[:, 1:] = np.cumsum(wait[:, :-1] + leg.numpy(), axis=1)
     depart = arrive + wait
-    end = np.take_along_axis(arrive, last + 1, axis=1) if loops else np.take_along_axis(depart, last, axis=1)
+    end = (
+        np.take_along_axis(arrive, last + 1, axis=1)
+        if loops
+        else np.take_along_axis(depart, last, axis=1)
+    )
     depart = np.where(padded, np.maximum(end, _TINY), depart)
     arrive = np.where(padded, math.inf, arrive)
     walk = Walk(*map(torch.as_tensor, (place, arrive, depart, speed, acceleration, emits)))

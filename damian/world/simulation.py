@@ -1,4 +1,5 @@
-"""The physics of B parallel worlds: decisions, flights, the source, and the messages that the UAVs send."""
+"""The physics of B parallel worlds: decisions, flights, the source, and the messages that the UAVs
+send."""
 
 import math
 from typing import Any
@@ -46,7 +47,9 @@ class Simulation:
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         region, start, self.walks = _draw_initial_conditions(config, self.airspace, rng)
-        self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
+        self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(
+            config, self.airspace, dt
+        )
         self.points = self.airspace.points.flatten(0, 1)
         if self.widths.requests:
             mean = config.requests.rate * dt / 60
@@ -57,14 +60,16 @@ class Simulation:
         )
         """Probabilities of the reports about each source, [K]."""
         self.pairs = torch.arange(config.agents * len(self.sources)).view(config.agents, -1)
-        """Numbers of the pairs of a UAV and a source, [N, K]; made within a step, they would not compile."""
+        """Numbers of the pairs of a UAV and a source, [N, K]; made within a step, they would not
+        compile."""
         self.unsure = any(each.miss or each.false_alarm for each in self.sources)
         """Whether reports about a source may be wrong."""
         self.draws = bool(self.sensors or self.vehicles.values.choices or self.unsure)
         """Whether first messages differ from episode to episode that begins alike."""
         shortest = self._shortest_flights()  # refuses actions that lead nowhere
         self.shortest_flight = shortest if config.battery.enabled else None
-        """Length of the shortest flight from each landing point [m], [R*L]; None without batteries."""
+        """Length of the shortest flight from each landing point [m], [R*L]; None without
+        batteries."""
         self.initial = self._initial_state(region, start, stops, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
@@ -106,8 +111,8 @@ class Simulation:
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
         """Simulate one step; actions of UAVs that are not ready change nothing.
 
-        Actions are discrete [B, N], or continuous [B, N, 2] in [0, 1]; only those of ``action_valid`` [B, N]
-        count.
+        Actions are discrete [B, N], or continuous [B, N, 2] in [0, 1]; only those of
+        ``action_valid`` [B, N] count.
         """
         state = self.decide(state, action, action_valid)
         state = self.vehicles.move(state)
@@ -119,21 +124,27 @@ class Simulation:
         valid = self._action_distances(state) <= reach
         if not self.candidates.can_hold:
             valid = valid | ~valid.any(-1, keepdim=True)
-        return valid if self.vehicles.instant else torch.where(reach >= 0, valid, self.candidates.hold)
+        return (
+            valid if self.vehicles.instant else torch.where(reach >= 0, valid, self.candidates.hold)
+        )
 
     def _action_distances(self, state: State) -> Tensor:
-        """Lengths of the discrete actions for the batteries [m], infinite outside the region, [B, N, A]."""
+        """Lengths of the discrete actions for the batteries [m], infinite outside the region,
+        [B, N, A]."""
         distance = gather_rows(self.candidates.distance, state.goal)
         if not self.vehicles.is_windy:
             return distance
         nearest = gather_rows(self.candidates.nearest, state.goal)
-        in_wind = self.vehicles.distance(state, state.goal.unsqueeze(-1).expand_as(nearest), nearest)
+        in_wind = self.vehicles.distance(
+            state, state.goal.unsqueeze(-1).expand_as(nearest), nearest
+        )
         return in_wind.where(distance.isfinite(), torch.inf)
 
     # The stages of one step, in order.
 
     def decide(self, state: State, action: Tensor, action_valid: Tensor | None) -> State:
-        """Assign landing points to the UAVs that may choose, and start their flights, as in ``step``."""
+        """Assign landing points to the UAVs that may choose, and start their flights, as in
+        ``step``."""
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
         ranking, row = self.candidates.rank(state.goal, state.region, action)
@@ -145,7 +156,9 @@ class Simulation:
         ready = reach >= 0
         goal = assign_landing_points(ranking, row, standing, reach, self.airspace.max_points) + base
         departs = goal != state.goal
-        east, north = (gather_rows(self.points, goal) - gather_rows(self.points, state.goal)).unbind(-1)
+        east, north = (
+            gather_rows(self.points, goal) - gather_rows(self.points, state.goal)
+        ).unbind(-1)
         heading = torch.remainder(torch.atan2(east, north), 2 * math.pi)
         state = state._replace(
             track=torch.where(departs, heading, state.track), motions=state.motions + ready
@@ -199,7 +212,9 @@ class Simulation:
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         if self.config.requests.known_at_once:
             sent = sent._replace(requests=messages.requests)
-        return state._replace(message_sent=sends, motions=torch.where(counts, 0, state.motions), sent=sent)
+        return state._replace(
+            message_sent=sends, motions=torch.where(counts, 0, state.motions), sent=sent
+        )
 
     def radii(self, state: State) -> Tensor | None:
         """Radius of the footprints of each world's UAVs [m], [B, 1], if it is drawn."""
@@ -207,7 +222,8 @@ class Simulation:
         return drawn_radius(level, self.config.source) if isinstance(level, Tensor) else None
 
     def in_reach(self, state: State, emits: Tensor, on_ground: Tensor) -> Tensor:
-        """Whether UAVs ``on_ground`` [B, N] are within the radius of sources that emit [B, K]; [B, N, K]."""
+        """Whether UAVs ``on_ground`` [B, N] are within the radius of sources that emit [B, K];
+        [B, N, K]."""
         ways = state.position[..., None, :2] - state.source.unsqueeze(-3)
         drawn = self.radii(state)
         reach = self.reach if drawn is None else drawn.unsqueeze(-1)
@@ -215,7 +231,8 @@ class Simulation:
         return on_ground.unsqueeze(-1) & emits.unsqueeze(-2) & near
 
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
-        """What each UAV reports of each source; some in reach miss it, some out of reach raise an alarm."""
+        """What each UAV reports of each source; some in reach miss it, some out of reach raise an
+        alarm."""
         values, drawn = self.vehicles.values, state.drawn
         miss, alarm = (values.get(f"source.{name}", drawn) for name in ("miss", "false_alarm"))
         if not (self.unsure or isinstance(miss, Tensor) or isinstance(alarm, Tensor)):
@@ -227,7 +244,9 @@ class Simulation:
         share = counter_rng.uniform(seed, *counters, self.pairs)
         return torch.where(in_reach, share >= miss, listens & (share < alarm))
 
-    def _true_detections(self, state: State, in_reach: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
+    def _true_detections(
+        self, state: State, in_reach: Tensor, now: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """When and where each UAV truly was in reach of each source last, if messages tell that."""
         time, place = state.sent.true_time, state.sent.true_position
         if not self.widths.truths:
@@ -298,12 +317,15 @@ class Simulation:
             length = torch.cat([_nearest_other(points) for points in self.airspace.points])
             longest = 2 * self.candidates.max_distance
         moves = self.airspace.max_points == 1 or bool((length < longest).any())
-        problem = "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
+        problem = (
+            "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
+        )
         checks.require(moves, "actions.distances", actions.distances, problem)
         return length.where(length.isfinite(), 0.0)
 
     def _shortest_in_wind(self, state: State) -> Tensor:
-        """As ``shortest_flight`` for each UAV, as long as the flights are for the batteries now, [B, N]."""
+        """As ``shortest_flight`` for each UAV, as long as the flights are for the batteries now,
+        [B, N]."""
         if self.config.actions.kind == "discrete":
             length = self._action_distances(state)
         else:
@@ -326,7 +348,8 @@ class Simulation:
         return torch.cat([sensor.read(state, self) for sensor in self.sensors.values()], -1)
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions of the sources [B, K, 2], whether they emit and whether their walks are over, [B, K]."""
+        """Positions of the sources [B, K, 2], whether they emit and whether their walks are over,
+        [B, K]."""
         found = [self._source_now(state, number) for number in range(len(self.sources))]
         place, emits, over = (torch.stack([each[i] for each in found], 1) for i in range(3))
         return place, emits, over
@@ -341,7 +364,9 @@ class Simulation:
         if config.motion == "static":
             place, over = state.source[:, number], torch.zeros_like(state.source_over)
         else:
-            walk = tree_map(lambda t: t.index_select(0, state.initial_condition), self.walks[number])
+            walk = tree_map(
+                lambda t: t.index_select(0, state.initial_condition), self.walks[number]
+            )
             time = state.steps.double() * self.dt
             place, stop, tour, over = locate(walk, time, config.after_walk == "loop")
             if config.emission == "per_stop":
@@ -380,7 +405,9 @@ class Simulation:
             source=torch.stack([walk.stop[:, 0] for walk in self.walks], 1),
             source_over=torch.zeros_like(number, dtype=torch.bool),
             requests=torch.full((n, self.widths.requests, 3), -1.0),
-            drawn=self.vehicles.values.draw(counter_rng.world_seeds(seed, n), torch.zeros_like(number)),
+            drawn=self.vehicles.values.draw(
+                counter_rng.world_seeds(seed, n), torch.zeros_like(number)
+            ),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
             sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, stops), self.widths),
@@ -392,7 +419,9 @@ class Simulation:
         blank = Messages.blank(state.sent.trail, self.widths)
         state = self._sense(state._replace(sent=blank))
         first = torch.arange(state.sent.landed.shape[-1], device=state.track.device) == 0
-        landed = torch.where(first, 0.0, -1.0).expand_as(state.sent.landed)  # nothing is known of before
+        landed = torch.where(first, 0.0, -1.0).expand_as(
+            state.sent.landed
+        )  # nothing is known of before
         return state._replace(sent=state.sent._replace(landed=landed))
 
 
@@ -401,10 +430,13 @@ def _draw_initial_conditions(
 ) -> tuple[Tensor, Tensor, tuple[Walk, ...]]:
     """Draw Q initial conditions, the same number for each region, on the CPU.
 
-    Returns the index of the region, [Q], the landing point of each UAV within it, [Q, N], and the walk of
-    each source over at most S stops, [Q, S].
+    Returns the index of the region, [Q], the landing point of each UAV within it, [Q, N], and the
+    walk of each source over at most S stops, [Q, S].
     """
-    per_region, sources = config.region.initial_conditions // len(airspace.regions), config.source.all
+    per_region, sources = (
+        config.region.initial_conditions // len(airspace.regions),
+        config.source.all,
+    )
     walks, starts = [[] for _ in sources], []
     for index, region in enumerate(airspace.regions):
         for source, drawn in zip(sources, walks, strict=True):
@@ -432,26 +464,34 @@ def _pad(walk: Walk, stops: int) -> Walk:
 def _draw_starts(
     config: WorldConfig, airspace: Airspace, region: int, n: int, rng: np.random.Generator
 ) -> Tensor:
-    """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for each."""
+    """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for
+    each."""
     given, together = config.region.start_positions, config.region.start_together
     n_points = int(airspace.n_points[region])
     if given is None and together:
         return torch.as_tensor(rng.integers(n_points, size=(n, 1))).repeat(1, config.agents)
     if given is None:
         return torch.as_tensor(rng.random((n, n_points))).topk(config.agents, dim=-1).indices
-    points = airspace.nearest(local_places("region.start_positions", given, airspace.regions[region]), region)
+    points = airspace.nearest(
+        local_places("region.start_positions", given, airspace.regions[region]), region
+    )
     name = airspace.regions[region].name
-    problem = f"lead to the same landing point of {name}: take others, or region.start_together=true"
+    problem = (
+        f"lead to the same landing point of {name}: take others, or region.start_together=true"
+    )
     distinct = together or len(points.unique()) == len(points)
     checks.require(distinct, "region.start_positions", given, problem)
     return points.expand(n, -1).clone()
 
 
 def _nearest_other(points: Tensor) -> Tensor:
-    """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for padded ones."""
+    """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for
+    padded ones."""
     distance, real = torch.full((len(points),), torch.inf), points.isfinite().all(-1)
     places = np.asarray(shapely.points(points[real].double().numpy()))
     options = {"exclusive": True, "return_distance": True, "all_matches": False}
-    (index, _), found = map(torch.as_tensor, shapely.STRtree(places).query_nearest(places, **options))
+    (index, _), found = map(
+        torch.as_tensor, shapely.STRtree(places).query_nearest(places, **options)
+    )
     distance[real.nonzero().squeeze(-1)[index]] = found.float()
     return distance

@@ -1,4 +1,5 @@
-"""The state of B worlds: named fields for the physics, one row per world for resets and compilers."""
+"""The state of B worlds: named fields for the physics, one row per world for resets and
+compilers."""
 
 from typing import NamedTuple
 
@@ -52,7 +53,8 @@ class State(NamedTuple):
     drawn: Tensor
     """Values of the settings that are drawn for the episode, [B, D]."""
     coverage: Tensor
-    """Coverage of each UAV, as an undelayed server computed it last; negative if it has not, [B, N]."""
+    """Coverage of each UAV, as an undelayed server computed it last; negative if it has not,
+    [B, N]."""
     message_sent: Tensor
     """Whether the UAV sent a message in this step, [B, N]."""
     sent: Messages
@@ -60,7 +62,8 @@ class State(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """What the environments' entry ``state`` tells, with any leading dimensions: the simulator's truth."""
+    """What the environments' entry ``state`` tells, with any leading dimensions: the simulator's
+    truth."""
 
     position: Tensor
     """Positions of the UAVs, east, north, up [m], [*, N, 3]."""
@@ -71,7 +74,8 @@ class Truth(NamedTuple):
     source: Tensor
     """Their positions, east, north [m], [*, K, 2]."""
     requests: Tensor
-    """The latest request of each slot, east, north [m], and 1 while nobody has served it, [*, M, 3]."""
+    """The latest request of each slot, east, north [m], and 1 while nobody has served it,
+    [*, M, 3]."""
     drawn: Tensor
     """Values of the settings that are drawn for the episode (``randomise``), [*, D]."""
 
@@ -82,7 +86,8 @@ class Truth(NamedTuple):
 
     @classmethod
     def unpack(cls, rows: Tensor, widths: Widths = ONE_SOURCE, n_drawn: int = 0) -> "Truth":
-        """The truth in rows [*, 4 N + 3 K + 3 M + D], with K sources and M requests as messages have."""
+        """The truth in rows [*, 4 N + 3 K + 3 M + D], with K sources and M requests as messages
+        have."""
         k, m = widths.sources, widths.requests
         n = (rows.shape[-1] - 3 * k - 3 * m - n_drawn) // 4
         parts = rows.split([3 * n, n, k, 2 * k, 3 * m, n_drawn], -1)
@@ -96,7 +101,8 @@ SEED, EPISODE, INITIAL_CONDITION = 0, 1, 2
 
 
 class PackedState(NamedTuple):
-    """A state as one row per world and dtype, so that only three tensors are copied, compiled and saved."""
+    """A state as one row per world and dtype, so that only three tensors are copied, compiled and
+    saved."""
 
     floats: Tensor
     """All float32 fields, [B, F]."""
@@ -107,7 +113,8 @@ class PackedState(NamedTuple):
 
 
 class StateLayout:
-    """The layout of a state's fields in its packed rows, read from an example of any number of worlds."""
+    """The layout of a state's fields in its packed rows, read from an example of any number of
+    worlds."""
 
     def __init__(self, example: State) -> None:
         self._fields = [(leaf.dtype, leaf.shape[1:]) for leaf in _leaves(example)]

@@ -1,4 +1,5 @@
-"""Settings as numbers: one for all UAVs, one for each, or one that is drawn for each world and episode."""
+"""Settings as numbers: one for all UAVs, one for each, or one that is drawn for each world and
+episode."""
 
 from typing import NamedTuple
 
@@ -24,15 +25,20 @@ class Values(NamedTuple):
     """Numbers of the streams of what is drawn; computed within a step, they would not compile."""
 
     def draw(self, seed: Tensor, episode: Tensor) -> Tensor:
-        """The drawn values of an episode, [B, D], by the seeds and numbers of episodes of the worlds [B]."""
+        """The drawn values of an episode, [B, D], by the seeds and numbers of episodes of the
+        worlds [B]."""
         columns = []
         for key, values in self.choices.items():
             share = counter_rng.uniform(seed, torch.full_like(episode, self.streams[key]), episode)
             if len(values) == 2:
                 columns.append(values[0] + (values[1] - values[0]) * share)
             else:
-                columns.append(torch.tensor(values, device=share.device)[(share * len(values)).long()])
-        return torch.stack(columns, -1) if columns else torch.zeros(len(seed), 0, device=seed.device)
+                columns.append(
+                    torch.tensor(values, device=share.device)[(share * len(values)).long()]
+                )
+        return (
+            torch.stack(columns, -1) if columns else torch.zeros(len(seed), 0, device=seed.device)
+        )
 
     def get(self, key: str, drawn: Tensor) -> Value:
         """The value of a setting in worlds whose drawn values are ``drawn`` [B, D]."""

@@ -1,4 +1,5 @@
-"""Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
+"""Motion models: how UAVs move between landing points, how long this takes, and how batteries
+change."""
 
 import math
 from abc import ABC, abstractmethod
@@ -37,10 +38,12 @@ _ROUNDING = 1e-12
 
 
 class MotionModel(ABC):
-    """Motion of N UAVs in B worlds with steps of ``dt`` seconds, as pure functions of their state."""
+    """Motion of N UAVs in B worlds with steps of ``dt`` seconds, as pure functions of their
+    state."""
 
     instant: bool
-    """Whether a UAV is at its target as soon as a step ends; if not, no two UAVs share a flight level."""
+    """Whether a UAV is at its target as soon as a step ends; if not, no two UAVs share a flight
+    level."""
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt
@@ -51,7 +54,8 @@ class MotionModel(ABC):
             check_levels(levels, airspace)
         self.levels = torch.tensor(levels)
         self.gusts = torch.arange(2 * config.agents).view(-1, 2)
-        """Numbers of the two draws of each UAV's gust, [N, 2]; made within a step, they would not compile."""
+        """Numbers of the two draws of each UAV's gust, [N, 2]; made within a step, they would not
+        compile."""
         self.chargers = _charging_points(config, airspace)
 
     @abstractmethod
@@ -64,7 +68,8 @@ class MotionModel(ABC):
 
     @abstractmethod
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
-        """Start flights to ``goal`` of UAVs that have just chosen (``ready``) to fly (``departs``), [B, N].
+        """Start flights to ``goal`` of UAVs that have just chosen (``ready``) to fly (``departs``),
+        [B, N].
 
         In the state's ``goal`` is where each stands or flies to.
         """
@@ -74,18 +79,25 @@ class MotionModel(ABC):
         """State with the positions and batteries after a step of ``dt``."""
 
     @abstractmethod
-    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
-        """Which UAVs send a message in this step [B, N] bool, and the latest message of each UAV [B, N].
+    def latest_messages(
+        self, state: State, on_ground: Tensor, messages: Messages
+    ) -> tuple[Tensor, Messages]:
+        """Which UAVs send a message in this step [B, N] bool, and the latest message of each UAV
+        [B, N].
 
         ``state.sent`` are the latest ones before, ``messages`` what each would send.
         """
 
     @abstractmethod
-    def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
-        """Whether each UAV adds its landing point to its trail, [B, N] bool; None if all UAVs do."""
+    def new_stop(
+        self, state: State, on_ground: Tensor, action_valid: Tensor | None
+    ) -> Tensor | None:
+        """Whether each UAV adds its landing point to its trail, [B, N] bool; None if all UAVs
+        do."""
 
     def reach(self, state: State) -> Tensor:
-        """Longest cruise of each UAV now [m], [B, N]; 0: it can only hold; negative: it may not choose."""
+        """Longest cruise of each UAV now [m], [B, N]; 0: it can only hold; negative: it may not
+        choose."""
         return torch.where(self.ready(state), self.battery_reach(state), -1.0)
 
     def battery_reach(self, state: State) -> Tensor:
@@ -93,10 +105,13 @@ class MotionModel(ABC):
         if not self.battery.enabled:
             return torch.full_like(state.battery, checks.METRES)
         battery, vertical = battery_of(self.values, state.drawn), self.vertical(state)
-        return cruise_range(state.battery - vertical_drain(2 * vertical, battery), battery).clamp(min=0)
+        return cruise_range(state.battery - vertical_drain(2 * vertical, battery), battery).clamp(
+            min=0
+        )
 
     def distance(self, state: State, origin: Tensor, goal: Tensor) -> Tensor:
-        """How long the flights between landing points are for the batteries [m], as far as can be foreseen.
+        """How long the flights between landing points are for the batteries [m], as far as can be
+        foreseen.
 
         ``origin`` and ``goal`` are flat ids, [B, N, ...]; infinite where a UAV cannot fly.
         """
@@ -108,7 +123,9 @@ class MotionModel(ABC):
         ``drawn`` are the drawn values of the worlds, if there may be any.
         """
         drawn = length.new_zeros(0) if drawn is None else drawn
-        limits = (self.values.get(f"motion.{name}", drawn) for name in ("max_speed", "max_acceleration"))
+        limits = (
+            self.values.get(f"motion.{name}", drawn) for name in ("max_speed", "max_acceleration")
+        )
         return minimum_time(length, self.motion.degree, *limits)
 
     def kinds(self, n_agents: int) -> Tensor:
@@ -118,13 +135,15 @@ class MotionModel(ABC):
         return kinds / kinds.amax(0)
 
     def vertical(self, state: State) -> Tensor:
-        """Duration of a takeoff, and of a landing, of each UAV [s], [N], or [B, N] if it is drawn."""
+        """Duration of a takeoff, and of a landing, of each UAV [s], [N], or [B, N] if it is
+        drawn."""
         return self.shortest_time(self.levels, state.drawn)
 
     def battery_after(
         self, state: State, level: Tensor, drain: Tensor, rested: Tensor, goal: Tensor
     ) -> Tensor:
-        """Battery levels [%] after a flight and ``rested`` steps on the landing point ``goal``, [B, N]."""
+        """Battery levels [%] after a flight and ``rested`` steps on the landing point ``goal``,
+        [B, N]."""
         step = charge_gain(level.new_full((), self.dt), battery_of(self.values, state.drawn))
         gain = step * (rested * gather_rows(self.chargers, goal))
         return (level - drain + gain).clamp(0, 100)
@@ -163,16 +182,21 @@ class InstantMotion(MotionModel):
         level = self.battery_after(state, state.battery, drain, length == 0, state.goal)
         return state._replace(battery=level)
 
-    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
+    def latest_messages(
+        self, state: State, on_ground: Tensor, messages: Messages
+    ) -> tuple[Tensor, Messages]:
         return on_ground, messages
 
-    def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
+    def new_stop(
+        self, state: State, on_ground: Tensor, action_valid: Tensor | None
+    ) -> Tensor | None:
         return action_valid
 
 
 @MOTION_MODELS.register("polynomial")
 class PolynomialFlight(MotionModel):
-    """Takeoff, cruise and landing take time (paper, eq. 1); the UAV then senses before it chooses again."""
+    """Takeoff, cruise and landing take time (paper, eq. 1); the UAV then senses before it chooses
+    again."""
 
     instant = False
 
@@ -207,7 +231,9 @@ class PolynomialFlight(MotionModel):
         battery = battery_of(self.values, state.drawn)
         used = used_so_far(elapsed, state.vertical, state.cruise, cruised, battery)
         rested = (state.elapsed - self.steps(state)).clamp(min=0)
-        level = self.battery_after(state, state.battery_before, used.to(cruised.dtype), rested, state.goal)
+        level = self.battery_after(
+            state, state.battery_before, used.to(cruised.dtype), rested, state.goal
+        )
         return state._replace(battery=level)
 
     def distance(self, state: State, origin: Tensor, goal: Tensor) -> Tensor:
@@ -216,7 +242,9 @@ class PolynomialFlight(MotionModel):
         wind = self._wind(state).view(-1, *[1] * (origin.dim() - 1), 2)
         air, slowest = self._through(state, origin, goal, wind)
         stays = origin == goal
-        return torch.where(stays, 0.0, air.where(slowest >= self.motion.min_ground_speed, torch.inf))
+        return torch.where(
+            stays, 0.0, air.where(slowest >= self.motion.min_ground_speed, torch.inf)
+        )
 
     def _air(self, state: State) -> Tensor:
         """Way of each flight through the air that begins now [m], gusts included, [B, N]."""
@@ -226,34 +254,51 @@ class PolynomialFlight(MotionModel):
         seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
         size, turn = counter_rng.uniform(seed, *counters, self.gusts).unbind(-1)
         size = times((-2 * (1 - size).log()).sqrt(), self.values.get("wind.gusts", state.drawn))
-        gust = displacement(size, 2 * math.pi * turn)  # normal east and north (Box and Muller, 1958)
-        return self._through(state, state.origin, state.goal, self._wind(state).unsqueeze(-2) + gust)[0]
+        gust = displacement(
+            size, 2 * math.pi * turn
+        )  # normal east and north (Box and Muller, 1958)
+        return self._through(
+            state, state.origin, state.goal, self._wind(state).unsqueeze(-2) + gust
+        )[0]
 
     def _wind(self, state: State) -> Tensor:
         """Mean wind of each world, the way in which it blows, east and north [m/s], [B, 2]."""
         calm = state.track.new_zeros(len(state.seed), 1)
-        direction, speed = (self.values.get(f"wind.{name}", state.drawn) for name in ("direction", "speed"))
+        direction, speed = (
+            self.values.get(f"wind.{name}", state.drawn) for name in ("direction", "speed")
+        )
         return displacement(calm - speed, (calm + direction).deg2rad()).squeeze(-2)
 
-    def _through(self, state: State, origin: Tensor, goal: Tensor, wind: Tensor) -> tuple[Tensor, Tensor]:
-        """As ``air_length``, of flights between landing points, flat ids [B, N, ...], wind [B, 1, ..., 2]."""
+    def _through(
+        self, state: State, origin: Tensor, goal: Tensor, wind: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """As ``air_length``, of flights between landing points, flat ids [B, N, ...], wind
+        [B, 1, ..., 2]."""
         speed = torch.as_tensor(self.values.get("motion.max_speed", state.drawn)).to(state.track)
         speed = speed.expand_as(state.track).view(*state.track.shape, *[1] * (origin.dim() - 2))
-        return air_length(self.airspace.way(origin, goal), wind, speed, self.motion.min_ground_speed)
+        return air_length(
+            self.airspace.way(origin, goal), wind, speed, self.motion.min_ground_speed
+        )
 
-    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
-        """A UAV sends messages while it is on the ground, and one from its takeoff point as it departs."""
+    def latest_messages(
+        self, state: State, on_ground: Tensor, messages: Messages
+    ) -> tuple[Tensor, Messages]:
+        """A UAV sends messages while it is on the ground, and one from its takeoff point as it
+        departs."""
         sends = on_ground | (state.elapsed == 1)
         start = gather_rows(self.points, state.origin)
         position = torch.where(expand_mask(on_ground, start), messages.position, start)
         return sends, tree_where(sends, messages._replace(position=position), state.sent)
 
-    def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
+    def new_stop(
+        self, state: State, on_ground: Tensor, action_valid: Tensor | None
+    ) -> Tensor | None:
         """Each decision adds one landing point, however long the UAV then senses there."""
         return on_ground & (state.elapsed == self.steps(state).clamp(min=1))
 
     def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
-        """Least number of steps after which the latest flight, and a time [s] after it, are over, [B, N]."""
+        """Least number of steps after which the latest flight, and a time [s] after it, are over,
+        [B, N]."""
         flight = 2 * state.vertical + state.cruise
         seconds = flight.double() * (1 - _FLIGHT_ERROR) + sensing_time
         return (seconds * ((1 - _ROUNDING) / self.dt)).ceil().long()

@@ -62,7 +62,9 @@ class Contract(TransformBase):
         self.check(TransformedEnv(SerialEnv(2, ContinuousActionVecMockEnv), self.make()))
 
     def test_trans_parallel_env_check(self, maybe_fork_ParallelEnv):
-        self.check(TransformedEnv(maybe_fork_ParallelEnv(2, ContinuousActionVecMockEnv), self.make()))
+        self.check(
+            TransformedEnv(maybe_fork_ParallelEnv(2, ContinuousActionVecMockEnv), self.make())
+        )
 
     def refused(self):
         return pytest.raises(RuntimeError, match="works only in an environment")
@@ -102,12 +104,16 @@ class TestObservationDelay(Contract):
         assert steps["age"].flatten().tolist() == [1, 2, 3, 3, 3, 3, 3, 3]
 
     def test_a_delay_belongs_to_a_message(self):
-        env = TransformedEnv(CountingEnv(max_steps=200), ObservationDelay((0, 4), delay_key="delay"))
+        env = TransformedEnv(
+            CountingEnv(max_steps=200), ObservationDelay((0, 4), delay_key="delay")
+        )
         set_seed(env, 0)
         steps, newest = env.rollout(100, onward)["next"], [0]
         arrival = [t + 1 + d for t, d in enumerate(steps["delay"].flatten().tolist())]
         for t in range(1, 101):
-            newest.append(max([newest[-1], *(i + 1 for i, at in enumerate(arrival[:t]) if at == t)]))
+            newest.append(
+                max([newest[-1], *(i + 1 for i, at in enumerate(arrival[:t]) if at == t)])
+            )
         assert steps["observation"].flatten().tolist() == newest[1:]
 
     def test_no_delay_is_the_identity(self):

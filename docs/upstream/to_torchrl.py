@@ -4,8 +4,8 @@
     python docs/upstream/to_torchrl.py ../rl
     cd ../rl && pytest test/transforms/test_delay_transforms.py
 
-The code is that of ``damian``, but for laws by name, in whose place ``laws.py`` stands, and for how stored
-steps are corrected. What the three transforms do not use is left out.
+The code is that of ``damian``, but for laws by name, in whose place ``laws.py`` stands, and for how
+stored steps are corrected. What the three transforms do not use is left out.
 """
 
 import ast
@@ -18,7 +18,17 @@ from typing import NamedTuple
 import damian
 
 ROOTS = ("ActionDelay", "ObservationDelay", "ObservationTimeline", "set_seed")
-MODULES = ("errors", "checks", "text_files", "tensors", "counter_rng", "keys", "samplers", "laws", "line")
+MODULES = (
+    "errors",
+    "checks",
+    "text_files",
+    "tensors",
+    "counter_rng",
+    "keys",
+    "samplers",
+    "laws",
+    "line",
+)
 MODULES += ("entries", "base", "context", "observation", "action", "timeline")
 QUALIFIED = ("checks", "counter_rng")
 """Modules whose functions are named together with them."""
@@ -79,7 +89,9 @@ def read(name: str) -> Module:
             continue
         named = {n.id for n in inside if isinstance(n, ast.Name)}
         of_modules = {
-            n.attr for n in inside if isinstance(n, ast.Attribute) and ast.unparse(n.value) in QUALIFIED
+            n.attr
+            for n in inside
+            if isinstance(n, ast.Attribute) and ast.unparse(n.value) in QUALIFIED
         }
         whole = isinstance(node, ast.FunctionDef | ast.ClassDef)
         stored = {n.id for n in inside if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
@@ -88,7 +100,8 @@ def read(name: str) -> Module:
 
 
 def imported(node: ast.Import | ast.ImportFrom, used: set[str]) -> str:
-    """An import of what is used, from the package if it is one of ``damian``; empty if nothing is."""
+    """An import of what is used, from the package if it is one of ``damian``; empty if nothing
+    is."""
     names = [each for each in node.names if (each.asname or each.name).partition(".")[0] in used]
     if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("damian"):
         last = (node.module or "").rpartition(".")[2]
@@ -126,19 +139,28 @@ def main(checkout: Path) -> None:
             sys.exit(f"{name}: say this without DAMIAN: {left}")
         (checkout / FOLDER / f"{name}.py").write_text(text, encoding="utf-8")
     names = [*ROOTS[:3]]
-    lines = [HEADER + '"""Delays of observations and actions, and what is known of the latest steps."""\n']
+    lines = [
+        HEADER
+        + '"""Delays of observations and actions, and what is known of the latest steps."""\n'
+    ]
     lines += [
         f"from .{module} import {name}"
         for module, name in zip(("action", "observation", "timeline"), names, strict=True)
     ]
     lines += ["from .base import set_seed", f"\n__all__ = {[*ROOTS]}\n"]
     (checkout / FOLDER / "__init__.py").write_text("\n".join(lines), encoding="utf-8")
-    entry = f"\nfrom .transforms.delays import {', '.join(names)}  # noqa: E402\n\n__all__ += {names}\n"
+    entry = (
+        f"\nfrom .transforms.delays import {', '.join(names)}  # noqa: E402\n\n__all__ += {names}\n"
+    )
     insert(entry, checkout / "torchrl/envs/__init__.py")
     for name, after in zip(
         names, ("ActionDiscretizer", "ObservationNorm", "ObservationTransform"), strict=True
     ):
-        insert(f"    {name}\n", checkout / "docs/source/reference/envs_transforms.rst", f"    {after}\n")
+        insert(
+            f"    {name}\n",
+            checkout / "docs/source/reference/envs_transforms.rst",
+            f"    {after}\n",
+        )
     shutil.copy(OWN / "test_delay_transforms.py", checkout / "test/transforms")
 
 

@@ -1,11 +1,13 @@
-"""Measure the speed of the environment and of training beside VMAS, the cost of delays, scaling, and memory.
+"""Measure the speed of the environment and of training beside VMAS, the cost of delays, scaling,
+and memory.
 
     python examples/benchmarks/bench.py            (make bench: a quarter of an hour)
-    python examples/benchmarks/bench.py --quick    (make bench-quick: a minute, the whole chain beside VMAS)
+    python examples/benchmarks/bench.py --quick    (make bench-quick: a minute, the whole chain
+    beside VMAS)
 
-Everything runs on one CPU thread. The measured environments take turns, episodes end at different times
-(``bench_timing.py``), and medians with the lowest and the highest time are reported. The tables are printed
-and written to runs/bench.md, with a figure in runs/bench.png.
+Everything runs on one CPU thread. The measured environments take turns, episodes end at different
+times (``bench_timing.py``), and medians with the lowest and the highest time are reported. The
+tables are printed and written to runs/bench.md, with a figure in runs/bench.png.
 """
 
 import importlib.util
@@ -48,8 +50,20 @@ JAXMARL, JAXMARL_PYTHON = "JaxMARL simple_spread, one graph", Path("build/jaxmar
 BARE, WHOLE = "bare", "whole chain"
 NO_BELIEF = "no belief"
 
-TABLE_2 = ["source_distance", "source_bearing", "source_drift", "source_time", "agent_distances", "coverage"]
-TABLE_2 += ["mean_distance", "mean_distance_not_spotting", "mean_distance_spotting", "spotting_agents"]
+TABLE_2 = [
+    "source_distance",
+    "source_bearing",
+    "source_drift",
+    "source_time",
+    "agent_distances",
+    "coverage",
+]
+TABLE_2 += [
+    "mean_distance",
+    "mean_distance_not_spotting",
+    "mean_distance_spotting",
+    "spotting_agents",
+]
 """Global features of the paper."""
 
 Scenarios = dict[str, ScenarioConfig]
@@ -62,7 +76,9 @@ class Sizes:
     worlds: int = 1024  # beside VMAS, in the cost of delays, and in the growth with UAVs
     steps: int = 50  # of a rollout
     batch: int = 10  # steps of a collector's batch
-    repeats: int = 7  # measured rollouts or batches of each environment, and iterations of each training
+    repeats: int = (
+        7  # measured rollouts or batches of each environment, and iterations of each training
+    )
     many_worlds: tuple[int, ...] = (1, 8, 64, 512, 1024, 4096, 16384)
     many_uavs: tuple[int, ...] = (1, 3, 5, 10, 20, 50, 100)
     growth_steps: int = 10  # of a rollout in the measurements of growth
@@ -71,11 +87,14 @@ class Sizes:
 
 
 def scenarios() -> Scenarios:
-    """The paper's use case 2 (section 5.2), and the same region with every feature, reward and model on."""
+    """The paper's use case 2 (section 5.2), and the same region with every feature, reward and
+    model on."""
     paper = composed_config("scenario=paper/usecase2")
     full = replace(
         paper,
-        region=replace(paper.region, start_positions=None, start_together=False, initial_conditions=1024),
+        region=replace(
+            paper.region, start_positions=None, start_together=False, initial_conditions=1024
+        ),
         motion=MotionConfig(kind="polynomial"),
         battery=BatteryConfig(enabled=True),
         actions=replace(paper.actions, mask=True),
@@ -87,7 +106,8 @@ def scenarios() -> Scenarios:
 
 
 def believing() -> Scenarios:
-    """The tracking task of delaybench without a belief, with the server's, and with that of each UAV too."""
+    """The tracking task of delaybench without a belief, with the server's, and with that of each
+    UAV too."""
     plain = composed_config("scenario=delaybench/tracking")
     features = {"belief": ["belief_gain", "belief_moments"]}
     changes = {
@@ -102,18 +122,22 @@ def believing() -> Scenarios:
 
 
 def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
-    """The scenario with another number of UAVs, which start at random ones of 372 landing points."""
+    """The scenario with another number of UAVs, which start at random ones of 372 landing
+    points."""
     start = {"start_positions": None, "start_together": False, "initial_conditions": 1024}
     return replace(
         scenario,
         agents=agents,
         region=replace(scenario.region, lattice_step=15.0, **start),
-        motion=replace(scenario.motion, max_level=30.0, level_separation=0.2),  # room for 100 flight levels
+        motion=replace(
+            scenario.motion, max_level=30.0, level_separation=0.2
+        ),  # room for 100 flight levels
     )
 
 
 def delays() -> dict[str, dict[str, Any]]:
-    """Changes to a scenario by name; "whole chain" is the paper's delay with an action history of four."""
+    """Changes to a scenario by name; "whole chain" is the paper's delay with an action history of
+    four."""
     paper = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
     everything = DelayConfig(obs=paper, act=1, rew=2, history=4, loss=0.1, reward_window=3)
     slow = ClockConfig(agents="2s", server="4s")
@@ -176,7 +200,8 @@ def policy_for(env: EnvBase) -> torch.nn.Module:
 
 
 def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE, WHOLE)) -> str:
-    """Speed beside VMAS, through rollouts and collectors; the figure is written to runs/bench.png."""
+    """Speed beside VMAS, through rollouts and collectors; the figure is written to
+    runs/bench.png."""
     others = rivals(sizes.worlds)
     envs = others | methods(presets, sizes.worlds, kinds, sizes.modes)
     rolled = rollout_times(envs, sizes.steps, sizes.repeats)
@@ -184,26 +209,35 @@ def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE,
     collected = collector_times(pairs, sizes.batch, sizes.repeats)
     both = (rolled, collected)
     plot_ratios(
-        {name: [min(ratios(t, name), default=0) for t in both] for name in envs}, Path("runs/bench.png")
+        {name: [min(ratios(t, name), default=0) for t in both] for name in envs},
+        Path("runs/bench.png"),
     )
     rows = []
     for name in envs:
         cells = [(f"{t[name].median:.2f}", t[name].spread, _listed(ratios(t, name))) for t in both]
-        rows.append((name, *cells[0], *cells[1], f"{rolled[name].first:.0f}" if "compiled" in name else ""))
+        rows.append(
+            (name, *cells[0], *cells[1], f"{rolled[name].first:.0f}" if "compiled" in name else "")
+        )
     if (ms := jaxmarl_ms(sizes.worlds)) is not None:
         rows.insert(len(others), (JAXMARL, f"{ms:.2f}", *[""] * 6))
-    title = f"{sizes.worlds} worlds, 3 UAVs, episodes end at different times; {sizes.repeats} repetitions"
+    title = (
+        f"{sizes.worlds} worlds, 3 UAVs, episodes end at different times; {sizes.repeats} "
+        "repetitions"
+    )
     header = ("ms/step", "lowest to highest", f"times VMAS {', '.join(RIVAL_TASKS)}")
     columns = (*(f"rollout: {name}" for name in header), *(f"collector: {name}" for name in header))
     return table(title, ("environment", *columns, "compile [s]"), rows)
 
 
 def jaxmarl_ms(worlds: int) -> float | None:
-    """Time of a step of JaxMARL's task, in its own environment and process; None if it is not installed."""
+    """Time of a step of JaxMARL's task, in its own environment and process; None if it is not
+    installed."""
     if not JAXMARL_PYTHON.exists():
         return None
     words = [str(JAXMARL_PYTHON), str(Path(__file__).with_name("bench_jaxmarl.py")), str(worlds)]
-    return float(subprocess.run(words, capture_output=True, encoding="utf-8", check=True).stdout.split()[-1])
+    return float(
+        subprocess.run(words, capture_output=True, encoding="utf-8", check=True).stdout.split()[-1]
+    )
 
 
 def ratios(times: Mapping[str, Measured], name: str) -> list[float]:
@@ -217,10 +251,13 @@ def _listed(numbers: list[float]) -> str:
 
 
 def beside_first(scenario: str, times: Mapping[str, Measured]) -> list[tuple[str, str, str]]:
-    """A row for each of the measured times: its median, and how many times that of the first one it is."""
+    """A row for each of the measured times: its median, and how many times that of the first one it
+    is."""
     medians = {what: measured.median for what, measured in times.items()}
     first = next(iter(medians.values()))
-    return [(f"{scenario}: {what}", f"{ms:.2f}", f"{ms / first:.2f}") for what, ms in medians.items()]
+    return [
+        (f"{scenario}: {what}", f"{ms:.2f}", f"{ms / first:.2f}") for what, ms in medians.items()
+    ]
 
 
 def limit_of_speed(presets: Scenarios, sizes: Sizes) -> str:
@@ -249,7 +286,8 @@ def steps_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
 
 
 def graphs_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
-    """Call the compiled graph of a step with the same actions again and again, without any TensorDict."""
+    """Call the compiled graph of a step with the same actions again and again, without any
+    TensorDict."""
     memories, entries = env._step_inputs(env._fused(), env.rand_action(following))
     step, worlds = env._compiled_fn("step_and_reset_fn", *entries), env.uav_env.worlds
     with torch.no_grad():
@@ -261,7 +299,9 @@ def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
     """Time of a step with each kind of delay beside the bare environment, not compiled."""
     rows = []
     for name, scenario in presets.items():
-        envs = {kind: delayed(scenario, changes, sizes.worlds) for kind, changes in delays().items()}
+        envs = {
+            kind: delayed(scenario, changes, sizes.worlds) for kind, changes in delays().items()
+        }
         times = rollout_times(envs, sizes.steps, sizes.repeats)
         rows += beside_first(name, times)
     title = f"What delays cost: {sizes.worlds} worlds, 3 UAVs, eager"
@@ -285,14 +325,21 @@ def cost_of_belief(sizes: Sizes) -> str:
 
 
 def growth(presets: Scenarios, sizes: Sizes, what: str, numbers: tuple[int, ...]) -> str:
-    """Time of a step for each number of worlds (with 3 UAVs) or of UAVs, whole chain, not compiled."""
+    """Time of a step for each number of worlds (with 3 UAVs) or of UAVs, whole chain, not
+    compiled."""
     rows = []
     for number in tqdm(numbers, what):
         worlds = number if what == "worlds" else sizes.worlds
-        flown = presets if what == "worlds" else {name: fleet(s, number) for name, s in presets.items()}
-        envs = {name: delayed(scenario, delays()[WHOLE], worlds) for name, scenario in flown.items()}
+        flown = (
+            presets if what == "worlds" else {name: fleet(s, number) for name, s in presets.items()}
+        )
+        envs = {
+            name: delayed(scenario, delays()[WHOLE], worlds) for name, scenario in flown.items()
+        }
         times = rollout_times(envs, sizes.growth_steps, sizes.repeats).values()
-        costs = [text for t in times for text in (f"{t.median:.2f}", f"{worlds / t.median * 1e3:,.0f}")]
+        costs = [
+            text for t in times for text in (f"{t.median:.2f}", f"{worlds / t.median * 1e3:,.0f}")
+        ]
         rows.append((number, *costs))
     fixed = "3 UAVs" if what == "worlds" else f"{sizes.worlds} worlds, starting anywhere"
     header = [f"{name}: {cost}" for name in presets for cost in ("ms/step", "environment steps/s")]
@@ -308,15 +355,20 @@ def many_beside_few(presets: Scenarios, sizes: Sizes) -> str:
         for number in (3, 20)
     }
     named = {" ".join(map(str, key)): env for key, env in envs.items()}
-    found = dict(zip(envs, rollout_times(named, sizes.growth_steps, sizes.repeats).values(), strict=True))
-    pairs = [(key[:2], found[key].median, found[*key[:2], 3].median) for key in envs if key[2] == 20]
+    found = dict(
+        zip(envs, rollout_times(named, sizes.growth_steps, sizes.repeats).values(), strict=True)
+    )
+    pairs = [
+        (key[:2], found[key].median, found[*key[:2], 3].median) for key in envs if key[2] == 20
+    ]
     rows = [(*key, f"{few:.2f}", f"{many:.2f}", f"{many / few:.2f}") for key, many, few in pairs]
     header = ("scenario", "mode", "3 UAVs [ms/step]", "20 UAVs", "times")
     return table(f"20 UAVs beside 3: {sizes.worlds} worlds, whole chain", header, rows)
 
 
 def memory(presets: Scenarios) -> str:
-    """Bytes of the state and of a step's output for each world, and of the tables that all worlds share."""
+    """Bytes of the state and of a step's output for each world, and of the tables that all worlds
+    share."""
     rows = []
     for name, scenario in presets.items():
         env = UavEnv(scenario, 2, extras=EXTRAS)
@@ -326,7 +378,9 @@ def memory(presets: Scenarios) -> str:
             sum(x.nbytes for x in tensors(e.rand_step(e.reset()).select("next").to_dict())) // 2
             for e in (bare, env)
         ]
-        shared = {x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), vars(bare.server)])}
+        shared = {
+            x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), vars(bare.server)])
+        }
         rows.append((name, state, *outputs, f"{sum(shared.values()) / 2**20:.1f} MiB"))
     return table(
         "Memory: bytes of a world with 3 UAVs",
@@ -338,7 +392,9 @@ def memory(presets: Scenarios) -> str:
 def training_speed(sizes: Sizes) -> str:
     """Environment steps per second of training, and the time that each part of it takes."""
     worlds, steps = sizes.training
-    title = f"Training: {worlds} worlds, 3 UAVs, {steps} steps; median of {sizes.repeats} iterations"
+    title = (
+        f"Training: {worlds} worlds, 3 UAVs, {steps} steps; median of {sizes.repeats} iterations"
+    )
     return table(title, HEADER, training(worlds, steps, sizes.repeats))
 
 
@@ -363,12 +419,17 @@ def table(title: str, header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> s
 
 
 def plot_ratios(ratios: Mapping[str, list[float]], path: Path) -> None:
-    """Draw a pair of bars for each environment: how many times as fast as the fastest task of VMAS it is."""
+    """Draw a pair of bars for each environment: how many times as fast as the fastest task of VMAS
+    it is."""
     labels = ("in rollouts, random actions", "in a collector, with a policy")
     figure = Figure(figsize=(8, 0.45 * len(ratios) + 1), layout="constrained")
     axis = figure.subplots()
-    for shift, label, column in zip((0.2, -0.2), labels, zip(*ratios.values(), strict=True), strict=True):
-        bars = axis.barh([row + shift for row in range(len(ratios))], column, height=0.38, label=label)
+    for shift, label, column in zip(
+        (0.2, -0.2), labels, zip(*ratios.values(), strict=True), strict=True
+    ):
+        bars = axis.barh(
+            [row + shift for row in range(len(ratios))], column, height=0.38, label=label
+        )
         axis.bar_label(bars, fmt="%.1f", padding=3)
     axis.set_yticks(range(len(ratios)), list(ratios))
     axis.invert_yaxis()

@@ -1,9 +1,12 @@
-"""Check that a GPU computes what the CPU computes, then measure worlds of one device (``make bench-gpu``).
+"""Check that a GPU computes what the CPU computes, then measure worlds of one device
+(``make bench-gpu``).
 
-    python examples/benchmarks/bench_gpu.py                               (on a GPU: eight minutes at most)
-    python examples/benchmarks/bench_gpu.py --device cpu --worlds 64 256  (the same at small sizes)
+    python examples/benchmarks/bench_gpu.py
+    (on a GPU: eight minutes at most) python examples/benchmarks/bench_gpu.py --device cpu --worlds
+    64 256  (the same at small sizes)
 
-The tables are printed as they come and written to runs/bench_gpu.md. No row begins after ``--minutes``.
+The tables are printed as they come and written to runs/bench_gpu.md. No row begins after
+``--minutes``.
 """
 
 import time
@@ -33,18 +36,24 @@ KINDS = {
 }
 MODES = {"CUDA graph": True, "compiled": False}
 RIVALS = {"simple_spread": 1 << 20, "navigation": 1 << 20, "discovery": 1 << 16}
-"""Tasks of VMAS, and the most worlds that are measured: with more, discovery takes half a second a step."""
+"""Tasks of VMAS, and the most worlds that are measured: with more, discovery takes half a second a
+step."""
 STEPS, REPEATS = 20, 3
 
 
 def make(kind: str, worlds: int, device: str) -> DelayedEnv:
     """One of ``KINDS`` on a device."""
     scenario, changes = KINDS[kind]
-    return make_env(replace(scenarios()[scenario], **delays()[changes]), worlds, device=torch.device(device))
+    return make_env(
+        replace(scenarios()[scenario], **delays()[changes]), worlds, device=torch.device(device)
+    )
 
 
-def differences(kind: str, device: str, mode: str, worlds: int = 64, steps: int = 50) -> tuple[str, ...]:
-    """Share of the numbers that differ from the CPU's, and the largest difference, after the same actions."""
+def differences(
+    kind: str, device: str, mode: str, worlds: int = 64, steps: int = 50
+) -> tuple[str, ...]:
+    """Share of the numbers that differ from the CPU's, and the largest difference, after the same
+    actions."""
     ours, theirs = make(kind, worlds, "cpu"), make(kind, worlds, device)
     if mode != "eager":
         theirs.compile()
@@ -52,7 +61,9 @@ def differences(kind: str, device: str, mode: str, worlds: int = 64, steps: int 
     rollout = ours.rollout(steps, break_when_any_done=False)
     actions = iter(rollout["agents", "action"].unbind(1))
     again = theirs.rollout(
-        steps, lambda td: td.set(("agents", "action"), next(actions).to(device)), break_when_any_done=False
+        steps,
+        lambda td: td.set(("agents", "action"), next(actions).to(device)),
+        break_when_any_done=False,
     )
     n, n_different, largest = 0, 0, 0.0
     for key, value in rollout["next"].items(True, True):
@@ -81,7 +92,8 @@ def waits(kind: str, worlds: int) -> str:
 
 
 def per_second(chunk: Callable[[], object], frames: int, device: str) -> str:
-    """World steps a second [millions], the median of ``REPEATS`` calls after two that do not count."""
+    """World steps a second [millions], the median of ``REPEATS`` calls after two that do not
+    count."""
     ends = []
     for _ in range(2 + REPEATS + 1):
         chunk()
@@ -107,14 +119,21 @@ def rivals(worlds: int, device: str) -> dict[str, Callable[[], EnvBase]]:
     return {f"VMAS {task}": partial(VmasEnv, task, **options) for task in tasks}
 
 
-def measured(name: str, make_env: Callable[[], EnvBase], worlds: int, device: str) -> tuple[str, ...]:
+def measured(
+    name: str, make_env: Callable[[], EnvBase], worlds: int, device: str
+) -> tuple[str, ...]:
     """A row: steps with random actions, and with a policy in TorchRL's ``Collector``."""
     env = make_env()
     following = staggered(env, groups=10)
     stepped = per_second(lambda: steps_of(env, following, STEPS), worlds * STEPS, device)
     policy = policy_for(env).to(device)
     collector = Collector(env, policy, frames_per_batch=worlds * STEPS, total_frames=-1)
-    return name, f"{worlds:,}", stepped, per_second(iter(collector).__next__, worlds * STEPS, device)
+    return (
+        name,
+        f"{worlds:,}",
+        stepped,
+        per_second(iter(collector).__next__, worlds * STEPS, device),
+    )
 
 
 def trained(worlds: int, device: str) -> tuple[str, ...]:
@@ -128,10 +147,15 @@ def trained(worlds: int, device: str) -> tuple[str, ...]:
 
 
 def jobs(options: Namespace) -> Iterator[tuple[str, int, Callable[[], tuple[str, ...]]]]:
-    """What makes each row, the most important first: its name, its number of worlds, and a function."""
+    """What makes each row, the most important first: its name, its number of worlds, and a
+    function."""
     device, modes = options.device, list(MODES)[options.device == "cpu" :]
     kinds: list[Callable[[int, str], dict[str, Callable[[], EnvBase]]]]
-    kinds = [partial(environments, modes[0]), rivals, *(partial(environments, mode) for mode in modes[1:])]
+    kinds = [
+        partial(environments, modes[0]),
+        rivals,
+        *(partial(environments, mode) for mode in modes[1:]),
+    ]
     rows = [
         [
             (name, worlds, partial(measured, name, make_one, worlds, device))
@@ -140,18 +164,28 @@ def jobs(options: Namespace) -> Iterator[tuple[str, int, Callable[[], tuple[str,
         ]
         for kind in kinds
     ]
-    trainings = [("training", worlds, partial(trained, worlds, device)) for worlds in options.trainings]
+    trainings = [
+        ("training", worlds, partial(trained, worlds, device)) for worlds in options.trainings
+    ]
     yield from [*rows[0], *trainings, *chain(*rows[1:])]
 
 
 def measure(options: Namespace) -> Iterator[str]:
     """The tables, one after the other."""
     device, until = options.device, time.monotonic() + 60 * options.minutes
-    name = torch.cuda.get_device_name() if device != "cpu" else f"CPU, {torch.get_num_threads()} threads"
+    name = (
+        torch.cuda.get_device_name()
+        if device != "cpu"
+        else f"CPU, {torch.get_num_threads()} threads"
+    )
     yield f"# {name}, torch {torch.__version__}\n"
     n_modes = 1 if device == "cpu" else 2
     header = ("environment", "share of numbers apart by 1e-4", "largest difference")
-    rows = [differences(kind, device, mode) for kind in KINDS for mode in ("eager", "CUDA graph")[:n_modes]]
+    rows = [
+        differences(kind, device, mode)
+        for kind in KINDS
+        for mode in ("eager", "CUDA graph")[:n_modes]
+    ]
     yield table("The same as on the CPU?", header, rows)
     if device != "cpu":
         rows = [(kind, waits(kind, options.worlds[0])) for kind in KINDS]
@@ -165,7 +199,12 @@ def measure(options: Namespace) -> Iterator[str]:
         rows.append(row)
         print(*row, sep="  ", flush=True)
         torch.compiler.reset()  # frees what the row has compiled
-    header = ("environment", "worlds", "random actions [million world steps/s]", "a policy in a collector")
+    header = (
+        "environment",
+        "worlds",
+        "random actions [million world steps/s]",
+        "a policy in a collector",
+    )
     yield table("World steps a second", header, rows)
 
 
@@ -173,7 +212,9 @@ if __name__ == "__main__":
     parser = ArgumentParser(description="Compare a GPU with the CPU, and measure it.")
     parser.add_argument("--device", default="cuda", help="cuda, or cpu for a trial")
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 16384, 65536, 262144])
-    parser.add_argument("--trainings", type=int, nargs="+", default=[2048, 16384], help="worlds of trainings")
+    parser.add_argument(
+        "--trainings", type=int, nargs="+", default=[2048, 16384], help="worlds of trainings"
+    )
     parser.add_argument("--minutes", type=float, default=8.0, help="no row begins later")
     Path("runs").mkdir(exist_ok=True)
     with Path("runs/bench_gpu.md").open("w", encoding="utf-8") as report:

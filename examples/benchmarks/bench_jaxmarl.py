@@ -1,9 +1,12 @@
-"""Time a step of JaxMARL's simple_spread with random actions, in a Python that has JaxMARL but not damian.
+"""Time a step of JaxMARL's simple_spread with random actions, in a Python that has JaxMARL but not
+damian.
 
-    python examples/benchmarks/bench_jaxmarl.py 1024    (worlds; prints milliseconds per step of all worlds)
+    python examples/benchmarks/bench_jaxmarl.py 1024
+    (worlds; prints milliseconds per step of all worlds)
 
-``bench.py`` runs it where ``make bench-jaxmarl`` has installed JaxMARL. Steps are one compiled scan on one
-thread, in which worlds whose episodes end begin anew; the first scan, which compiles, is not timed.
+``bench.py`` runs it where ``make bench-jaxmarl`` has installed JaxMARL. Steps are one compiled scan
+on one thread, in which worlds whose episodes end begin anew; the first scan, which compiles, is not
+timed.
 """
 
 import os

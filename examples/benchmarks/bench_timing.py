@@ -1,7 +1,8 @@
 """How ``bench.py`` times environments: in turn, with episodes that end at different times.
 
-If all worlds began together, most steps would be without a reset, and a rollout shorter than an episode would
-never reset at all. So before the measurement a few worlds at a time are reset until all have been.
+If all worlds began together, most steps would be without a reset, and a rollout shorter than an
+episode would never reset at all. So before the measurement a few worlds at a time are reset until
+all have been.
 """
 
 import statistics
@@ -32,7 +33,9 @@ class Measured(NamedTuple):
         return f"{self.lowest:.2f} to {self.highest:.2f}"
 
 
-def in_turn(chunks: Mapping[str, Callable[[], object]], steps: int, repeats: int) -> dict[str, Measured]:
+def in_turn(
+    chunks: Mapping[str, Callable[[], object]], steps: int, repeats: int
+) -> dict[str, Measured]:
     """Times of steps, where the chunks take turns, so that a busy machine slows all of them.
 
     Args:
@@ -72,7 +75,8 @@ def rollout_times(
 
 
 def staggered(env: EnvBase, groups: int) -> TensorDictBase:
-    """Step an environment with random actions while one group of worlds after the other is reset."""
+    """Step an environment with random actions while one group of worlds after the other is
+    reset."""
     following = env.reset()
     for group in range(groups):
         _, following = env.step_and_maybe_reset(env.rand_action(following))
@@ -86,7 +90,9 @@ def staggered(env: EnvBase, groups: int) -> TensorDictBase:
 def rollouts(env: EnvBase, following: TensorDictBase, steps: int) -> Iterator[None]:
     """Endless rollouts, each of which goes on where the one before has ended."""
     while True:
-        rollout = env.rollout(steps, auto_reset=False, tensordict=following, break_when_any_done=False)
+        rollout = env.rollout(
+            steps, auto_reset=False, tensordict=following, break_when_any_done=False
+        )
         following = cast(TensorDictBase, env.maybe_reset(env.step_mdp(rollout[:, -1].clone())))
         yield
 

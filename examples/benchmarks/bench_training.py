@@ -1,12 +1,13 @@
-"""Time of collecting, back-updating and optimising in a training iteration, beside TorchRL's MAPPO on VMAS.
+"""Time of collecting, back-updating and optimising in a training iteration, beside TorchRL's MAPPO
+on VMAS.
 
-The training part of ``bench.py``. All methods have the same batch size, number of epochs and layer widths.
-They take turns, iteration by iteration, so that a busy machine slows all of them.
+The training part of ``bench.py``. All methods have the same batch size, number of epochs and layer
+widths. They take turns, iteration by iteration, so that a busy machine slows all of them.
 
     python examples/benchmarks/bench_training.py --seeds 3     (make bench-training)
 
-trains until a return is reached, on crowded ground, and beside it TorchRL's MAPPO on the same environment,
-and that of BenchMARL where it is installed.
+trains until a return is reached, on crowded ground, and beside it TorchRL's MAPPO on the same
+environment, and that of BenchMARL where it is installed.
 """
 
 import importlib.util
@@ -39,7 +40,13 @@ from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.schedule import SystemClock
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.config import TrainConfig
-from damian.recipes.shared.learning import learning_env, make_collector, make_learner, replay_buffer, ticks
+from damian.recipes.shared.learning import (
+    learning_env,
+    make_collector,
+    make_learner,
+    replay_buffer,
+    ticks,
+)
 
 OBSERVED = ("agents", "observation")
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
@@ -47,15 +54,26 @@ RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
 """Is one value computed for all agents, as with our ``model.shared_value``?"""
 WIDTHS = {"2 x 64": [64, 64], "2 x 256": [256, 256]}
 """Layer widths of all networks, by name."""
-UNDELAYED, AWARE = "scenario=paper/usecase2", "scenario=paper/usecase2 delay=paper aware=backupdate+history"
+UNDELAYED, AWARE = (
+    "scenario=paper/usecase2",
+    "scenario=paper/usecase2 delay=paper aware=backupdate+history",
+)
 COMPILED, SHARED = "compile=true", "compile=true model.shared_value=true"
-METHODS = (UNDELAYED, f"{UNDELAYED} {COMPILED}", f"{UNDELAYED} {SHARED}", AWARE, f"{AWARE} {SHARED}")
+METHODS = (
+    UNDELAYED,
+    f"{UNDELAYED} {COMPILED}",
+    f"{UNDELAYED} {SHARED}",
+    AWARE,
+    f"{AWARE} {SHARED}",
+)
 """Overrides of ``damian train``, separated by spaces."""
 PRODUCTS = "the matrix products of the first one's update alone"
 """What no update can be faster than, on this processor and with these networks."""
 HEADER = ("training", "frames/s", "collecting [ms]", "back-updating [ms]", "optimising [ms]")
 HEADER += ("back-updating's share", "times TorchRL and VMAS")
-WARM_UP = 2  # iterations that do not count: the first compiles; back-updating has a full buffer after two
+WARM_UP = (
+    2  # iterations that do not count: the first compiles; back-updating has a full buffer after two
+)
 
 
 class Seconds(NamedTuple):
@@ -67,7 +85,8 @@ class Seconds(NamedTuple):
 
 
 def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
-    """Rows under ``HEADER``: medians of ``repeats`` iterations of each, with batches [worlds, steps]."""
+    """Rows under ``HEADER``: medians of ``repeats`` iterations of each, with batches
+    [worlds, steps]."""
     found = []
     for width, hidden in WIDTHS.items():
         methods = {words: damian(method_config(words, hidden, worlds, steps)) for words in METHODS}
@@ -86,7 +105,8 @@ def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
 
 
 def rows(medians: dict[str, Seconds], frames: int) -> list[tuple[str, ...]]:
-    """Rows under ``HEADER``, from median times of iterations with ``frames`` environment steps each."""
+    """Rows under ``HEADER``, from median times of iterations with ``frames`` environment steps
+    each."""
     totals = {name: sum(parts) for name, parts in medians.items()}
     return [
         (
@@ -102,7 +122,12 @@ def rows(medians: dict[str, Seconds], frames: int) -> list[tuple[str, ...]]:
 
 def method_config(words: str, hidden: Sequence[int], worlds: int, steps: int) -> TrainConfig:
     """The configuration of a method: overrides, layer widths, and B and T of a batch."""
-    batch = [f"worlds={worlds}", f"learner.steps={steps}", "learner.epochs=4", "learner.minibatches=4"]
+    batch = [
+        f"worlds={worlds}",
+        f"learner.steps={steps}",
+        "learner.epochs=4",
+        "learner.minibatches=4",
+    ]
     return composed_config(*words.split(), f"model.hidden={list(hidden)}", *batch)
 
 
@@ -125,7 +150,10 @@ def damian_batches(config: TrainConfig) -> Iterator[tuple[Seconds, TensorDictBas
         backupdated = time.perf_counter()
         add_advantages(batch, learner.critic, learner.config)
         learner.optimize(batch)
-        yield Seconds(collected - begin, backupdated - collected, time.perf_counter() - backupdated), batch
+        yield (
+            Seconds(collected - begin, backupdated - collected, time.perf_counter() - backupdated),
+            batch,
+        )
 
 
 def products(config: TrainConfig) -> Iterator[Seconds]:
@@ -150,7 +178,8 @@ def products(config: TrainConfig) -> Iterator[Seconds]:
 
 
 def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
-    """Train on VMAS's navigation with TorchRL's own networks, loss and buffer; yields times of iterations.
+    """Train on VMAS's navigation with TorchRL's own networks, loss and buffer; yields times of
+    iterations.
 
     ``together``: compute one value for all agents (MAPPO) instead of one for each (IPPO).
     """
@@ -163,18 +192,28 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
 def mappo_batches(
     config: TrainConfig, env: EnvBase, actor: ProbabilisticActor, together: bool
 ) -> Iterator[tuple[Seconds, TensorDictBase]]:
-    """Train with TorchRL's MAPPO, buffer and collector; yields the times and the steps of each iteration."""
+    """Train with TorchRL's MAPPO, buffer and collector; yields the times and the steps of each
+    iteration."""
     worlds, steps, learner = config.worlds, config.update_steps, cast(MappoConfig, config.learner)
-    network, observed = agent_network(env, config.agents, config.model.hidden, 1, together), OBSERVED
+    network, observed = (
+        agent_network(env, config.agents, config.model.hidden, 1, together),
+        OBSERVED,
+    )
     critic = TensorDictModule(network, in_keys=[observed], out_keys=[("agents", "state_value")])
-    loss = MAPPOLoss(actor, critic, clip_epsilon=learner.clip_epsilon, entropy_coeff=learner.entropy_coeff)
-    loss.set_keys(reward=("agents", "reward"), value=("agents", "state_value"), action=("agents", "action"))
+    loss = MAPPOLoss(
+        actor, critic, clip_epsilon=learner.clip_epsilon, entropy_coeff=learner.entropy_coeff
+    )
+    loss.set_keys(
+        reward=("agents", "reward"), value=("agents", "state_value"), action=("agents", "action")
+    )
     loss.set_keys(sample_log_prob=("agents", "action_log_prob"))
     loss.make_value_estimator(ValueEstimators.MAGAE, gamma=learner.gamma, lmbda=learner.lmbda)
     optimizer = torch.optim.Adam(loss.parameters(), lr=learner.lr)
     collector = Collector(env, actor, frames_per_batch=worlds * steps, total_frames=-1)
     storage, size = LazyTensorStorage(worlds * steps), worlds * steps // learner.minibatches
-    memory = TensorDictReplayBuffer(storage=storage, sampler=SamplerWithoutReplacement(), batch_size=size)
+    memory = TensorDictReplayBuffer(
+        storage=storage, sampler=SamplerWithoutReplacement(), batch_size=size
+    )
     batches = iter(collector)
     while True:
         begin = time.perf_counter()
@@ -187,7 +226,9 @@ def mappo_batches(
             for minibatch in memory:
                 losses = loss(minibatch)
                 optimizer.zero_grad()
-                (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+                (
+                    losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+                ).backward()
                 nn.utils.clip_grad_norm_(loss.parameters(), learner.max_grad_norm)
                 optimizer.step()
         collector.update_policy_weights_()
@@ -197,7 +238,9 @@ def mappo_batches(
 def vmas_actor(env: EnvBase, agents: int, hidden: Sequence[int]) -> ProbabilisticActor:
     """A policy with tanh-normal actions of each agent, from its own observation."""
     n_out = 2 * env.full_action_spec_unbatched["agents", "action"].shape[-1]
-    network = nn.Sequential(agent_network(env, agents, hidden, n_out, False), NormalParamExtractor())
+    network = nn.Sequential(
+        agent_network(env, agents, hidden, n_out, False), NormalParamExtractor()
+    )
     normal = [("agents", "loc"), ("agents", "scale")]
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=[OBSERVED], out_keys=normal),
@@ -243,9 +286,11 @@ def discrete_actor(env: EnvBase, config: TrainConfig) -> ProbabilisticActor:
 
 
 class Meter:
-    """Processor time [s] and steps until the mean return of the episodes that a batch ends reaches ``goal``.
+    """Processor time [s] and steps until the mean return of the episodes that a batch ends reaches
+    ``goal``.
 
-    Infinite if it does not within ``frames`` steps. Kernels that other processes compile do not count.
+    Infinite if it does not within ``frames`` steps. Kernels that other processes compile do not
+    count.
     """
 
     def __init__(self, goal: float, frames: int) -> None:
@@ -266,7 +311,8 @@ def until(batches: Iterator[tuple[Seconds, TensorDictBase]], meter: Meter) -> tu
 
 
 def to_a_return(goal: float, seeds: int, frames: int) -> str:
-    """Processor time and steps until trainings without delay reach a return, median (least, most)."""
+    """Processor time and steps until trainings without delay reach a return, median
+    (least, most)."""
     found: dict[str, list[tuple[float, int]]] = defaultdict(list)
     for seed in tqdm(range(seeds), "seeds"):
         for name, words in OURS.items():
@@ -280,18 +326,24 @@ def to_a_return(goal: float, seeds: int, frames: int) -> str:
         found["TorchRL's MAPPO, the same environment"].append(until(rival, meter))
         if importlib.util.find_spec("benchmarl"):
             rival_until = importlib.import_module("until").until
-            found["BenchMARL's, the same"].append(rival_until(config, [TASK], Meter(goal, frames).after))
+            found["BenchMARL's, the same"].append(
+                rival_until(config, [TASK], Meter(goal, frames).after)
+            )
     rows = []
     for name, runs in found.items():
         cells = [(statistics.median(x), min(x), max(x)) for x in zip(*runs, strict=True)]
-        rows.append((name, *(f"{middle:,.0f} ({least:,.0f}, {most:,.0f})" for middle, least, most in cells)))
+        rows.append(
+            (name, *(f"{middle:,.0f} ({least:,.0f}, {most:,.0f})" for middle, least, most in cells))
+        )
     header = ("training", "processor time [s]", "steps")
     return f"Until a mean return of {goal:g}, {seeds} seeds\n\n" + markdown_table(header, rows)
 
 
 if __name__ == "__main__":
     options = ArgumentParser(description="Time until trainings reach a return, on one core.")
-    options.add_argument("--goal", type=float, default=28.0, help="mean return of episodes, undelayed")
+    options.add_argument(
+        "--goal", type=float, default=28.0, help="mean return of episodes, undelayed"
+    )
     options.add_argument("--seeds", type=int, default=3)
     options.add_argument(
         "--frames", type=int, default=2_000_000, help="steps after which a training has failed"

@@ -1,10 +1,11 @@
-"""Trains an algorithm of BenchMARL where observations arrive late, and compares it with random actions.
+"""Trains an algorithm of BenchMARL where observations arrive late, and compares it with random
+actions.
 
     python examples/benchmarl/train.py --algorithm qmix --scenario delaybench/tracking --delay 4
     python examples/benchmarl/train.py --algorithm masac --scenario vmas/navigation --delay 4
 
-Exit code 1 says that the trained policy is not clearly better than random actions (by three standard errors),
-2 that a setting is wrong.
+Exit code 1 says that the trained policy is not clearly better than random actions
+(by three standard errors), 2 that a setting is wrong.
 """
 
 import argparse
@@ -32,7 +33,8 @@ ALGORITHMS = {"mappo": MappoConfig, "masac": MasacConfig, "qmix": QmixConfig}
 AWARE = ("aware=history", "observation.own=true")
 """A UAV knows its own latest message at once, and its latest actions."""
 WORLDS, STEPS = 32, 50
-"""Worlds that are stepped as one batch, and their steps between two updates: an episode of delaybench."""
+"""Worlds that are stepped as one batch, and their steps between two updates: an episode of
+delaybench."""
 EVALUATIONS, EPISODES = 10, 20
 """A policy is evaluated with these many seeds, in these many episodes each."""
 
@@ -43,20 +45,30 @@ def arguments() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--algorithm", choices=ALGORITHMS, default="mappo")
-    parser.add_argument("--scenario", default="delaybench/tracking", help="of damian train, or vmas/NAME")
+    parser.add_argument(
+        "--scenario", default="delaybench/tracking", help="of damian train, or vmas/NAME"
+    )
     parser.add_argument("--delay", default="4", help="steps, or a law, as in damian train")
     parser.add_argument("--frames", type=int, default=64_000, help="steps in all worlds together")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--continuous", action="store_true", help="continuous actions; QMIX has none")
-    parser.add_argument("--folder", type=Path, default=Path("runs/benchmarl"), help="for BenchMARL's logs")
-    parser.add_argument("overrides", nargs="*", help="further settings of the UAVs, such as agents=5")
+    parser.add_argument(
+        "--continuous", action="store_true", help="continuous actions; QMIX has none"
+    )
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/benchmarl"), help="for BenchMARL's logs"
+    )
+    parser.add_argument(
+        "overrides", nargs="*", help="further settings of the UAVs, such as agents=5"
+    )
     return parser.parse_args()
 
 
 def make_task(args: argparse.Namespace) -> UavTask | DelayedVmasTask:
     """The task of ``--scenario``, with its delay."""
     if args.scenario.startswith("vmas/"):
-        return DelayedVmasTask(args.scenario.removeprefix("vmas/"), delay=yaml.safe_load(args.delay))
+        return DelayedVmasTask(
+            args.scenario.removeprefix("vmas/"), delay=yaml.safe_load(args.delay)
+        )
     settings = [f"scenario={args.scenario}", f"delay.obs={args.delay}", *AWARE, *args.overrides]
     return UavTask(args.scenario.replace("/", "_"), {"overrides": settings})
 
@@ -79,7 +91,9 @@ def experiment_config(args: argparse.Namespace) -> ExperimentConfig:
     config.lr, config.gamma = 1e-3, 0.9  # those of delaybench with DAMIAN's own learners
     config.on_policy_n_envs_per_worker = config.off_policy_n_envs_per_worker = WORLDS
     batch = WORLDS * STEPS
-    config.on_policy_collected_frames_per_batch = config.off_policy_collected_frames_per_batch = batch
+    config.on_policy_collected_frames_per_batch = config.off_policy_collected_frames_per_batch = (
+        batch
+    )
     config.on_policy_n_minibatch_iters, config.on_policy_minibatch_size = 10, 400
     config.off_policy_n_optimizer_steps, config.off_policy_train_batch_size = 100, 256
     config.off_policy_memory_size = 200_000
@@ -131,7 +145,10 @@ def main() -> None:
         f"\n{args.algorithm}, {args.scenario}, delay {args.delay}, seed {args.seed}: "
         f"{experiment.total_frames} frames in {duration:.0f} s\n"
     )
-    rows = [[name, f"{each.mean():.2f}", f"{standard_error(each):.2f}"] for name, each in measured.items()]
+    rows = [
+        [name, f"{each.mean():.2f}", f"{standard_error(each):.2f}"]
+        for name, each in measured.items()
+    ]
     print(markdown_table(["policy", "return", "standard error"], rows))
     gain = measured["trained, sampled"] - measured["random"]
     if gain.mean() <= 3 * standard_error(gain):

@@ -16,15 +16,16 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.runs.metrics import evaluate
 
 STATE = "critic_state"
-"""What central critics and the mixer of QMIX read, [B, S]: of all UAVs the observations that the server makes
-of the messages it holds, and what they observe themselves (with the actions that the server cannot know of
-yet). Nothing in it is the simulator's truth."""
+"""What central critics and the mixer of QMIX read, [B, S]: of all UAVs the observations that the
+server makes of the messages it holds, and what they observe themselves
+(with the actions that the server cannot know of yet). Nothing in it is the simulator's truth."""
 
 
 class UavTask(TaskClass):
     """UAVs whose messages arrive late, for any algorithm of BenchMARL.
 
-    ``damian.make_env`` puts the delays, and the history of a UAV's own actions, into the environment. Actions
+    ``damian.make_env`` puts the delays, and the history of a UAV's own actions, into the
+    environment. Actions
     are discrete, with a mask, or continuous: BenchMARL decides, and its default is continuous.
 
     Args:
@@ -45,7 +46,10 @@ class UavTask(TaskClass):
         scenario = compose_scenario(*self.config["overrides"], f"actions={kind}")
         problem = "is no time limit [steps], and BenchMARL needs one"
         checks.require(
-            scenario.episode.max_steps is not None, "episode.max_steps", scenario.episode.max_steps, problem
+            scenario.episode.max_steps is not None,
+            "episode.max_steps",
+            scenario.episode.max_steps,
+            problem,
         )
         return scenario
 
@@ -57,8 +61,13 @@ class UavTask(TaskClass):
 
     def get_env_transforms(self, env: EnvBase) -> list[Transform]:
         known = "critic_known"
-        joined = CatTensors([keys.GLOBAL_OBSERVATION, keys.OBSERVATION], (keys.AGENTS, known), del_keys=False)
-        return [joined, FlattenObservation(-2, -1, in_keys=[(keys.AGENTS, known)], out_keys=[STATE])]
+        joined = CatTensors(
+            [keys.GLOBAL_OBSERVATION, keys.OBSERVATION], (keys.AGENTS, known), del_keys=False
+        )
+        return [
+            joined,
+            FlattenObservation(-2, -1, in_keys=[(keys.AGENTS, known)], out_keys=[STATE]),
+        ]
 
     def evaluation_env(self, num_envs: int, continuous_actions: bool, seed: int) -> DelayedEnv:
         """Worlds that also output the messages themselves, to be judged by."""
@@ -107,6 +116,7 @@ class UavTask(TaskClass):
 
 
 def _entry(env: EnvBase, key: NestedKey) -> Composite:
-    """The spec of one entry of the UAVs: BenchMARL's networks read every entry that they are given."""
+    """The spec of one entry of the UAVs: BenchMARL's networks read every entry that they are
+    given."""
     spec = env.full_observation_spec_unbatched[key]
     return Composite({keys.AGENTS: Composite({key[1]: spec}, shape=spec.shape[:1])})

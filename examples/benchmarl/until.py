@@ -1,4 +1,5 @@
-"""BenchMARL's MAPPO, set as ``damian train`` is, until a return is reached (``make bench-training``)."""
+"""BenchMARL's MAPPO, set as ``damian train`` is, until a return is reached
+(``make bench-training``)."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -37,14 +38,20 @@ class Ends(Callback):
 def until(
     config: TrainConfig, words: Sequence[str], after: Callable[[TensorDictBase], Measured | None]
 ) -> Measured:
-    """Train with the settings of ``config``, which is made of ``words``, until ``after`` ends it."""
+    """Train with the settings of ``config``, which is made of ``words``, until ``after`` ends
+    it."""
     ours = cast(mappo.MappoConfig, config.learner)
     batch, options = config.worlds * config.update_steps, ExperimentConfig.get_from_yaml()
-    options.on_policy_n_envs_per_worker, options.on_policy_collected_frames_per_batch = config.worlds, batch
+    options.on_policy_n_envs_per_worker, options.on_policy_collected_frames_per_batch = (
+        config.worlds,
+        batch,
+    )
     options.on_policy_minibatch_size = batch // ours.minibatches
     options.on_policy_n_minibatch_iters = ours.epochs
     options.lr, options.gamma, options.clip_grad_val = ours.lr, ours.gamma, ours.max_grad_norm
-    options.prefer_continuous_actions = options.evaluation = options.render = options.create_json = False
+    options.prefer_continuous_actions = options.evaluation = options.render = (
+        options.create_json
+    ) = False
     options.loggers = []
     algorithm, model = MappoConfig.get_from_yaml(), MlpConfig.get_from_yaml()
     algorithm.entropy_coef, algorithm.clip_epsilon = ours.entropy_coeff, ours.clip_epsilon
@@ -52,7 +59,9 @@ def until(
     model.num_cells = list(config.model.hidden)
     task = UavTask("until", {"overrides": list(words)})
     with tempfile.TemporaryDirectory() as options.save_folder:
-        experiment = Experiment(task, algorithm, model, config.seed, options, callbacks=[Ends(after)])
+        experiment = Experiment(
+            task, algorithm, model, config.seed, options, callbacks=[Ends(after)]
+        )
         try:
             experiment.run()
         except Reached as end:

@@ -1,4 +1,5 @@
-"""Tasks of VMAS with late observations: transforms of DAMIAN as BenchMARL's environment transforms."""
+"""Tasks of VMAS with late observations: transforms of DAMIAN as BenchMARL's environment
+transforms."""
 
 from typing import Any
 
@@ -19,7 +20,8 @@ AGE = (keys.AGENTS, "age")
 class DelayedVmasTask(VmasClass):
     """A task of VMAS with agents that observe late, each with delays of its own.
 
-    They know the age of what they observe, and their own latest actions. Everything else is BenchMARL's.
+    They know the age of what they observe, and their own latest actions. Everything else is
+    BenchMARL's.
 
     Args:
         name: of VMAS's scenario, such as ``navigation``.
@@ -45,7 +47,9 @@ class DelayedVmasTask(VmasClass):
         codes = torch.eye(action.space.n) if isinstance(action, Categorical) else None
         return [
             ObservationDelay(self.delay, [keys.OBSERVATION]),
-            CatTensors([keys.OBSERVATION, AGE], keys.OBSERVATION, sort=False),  # one entry, as QMIX needs
+            CatTensors(
+                [keys.OBSERVATION, AGE], keys.OBSERVATION, sort=False
+            ),  # one entry, as QMIX needs
             ActionHistory(self.history, keys.ACTION, append_to=keys.OBSERVATION, codes=codes),
         ]
 

@@ -7,9 +7,10 @@ The teacher needs a simulator.
     damian train scenario=tracking delay=paper aware=history learner=distillation:DistillationConfig \\
         learner.teacher=../../runs/teacher
 
-The student collects with its own policy, so that it learns where it goes itself (DAgger; Ross et al. 2011).
-It learns to choose as the teacher would, who is shown each step as if nothing were late. The teacher acts on
-what the student cannot always infer, and its steps of training count too.
+The student collects with its own policy, so that it learns where it goes itself
+(DAgger; Ross et al. 2011). It learns to choose as the teacher would, who is shown each step as if
+nothing were late. The teacher acts on what the student cannot always infer, and its steps of
+training count too.
 """
 
 from dataclasses import dataclass
@@ -49,12 +50,15 @@ class DistillationConfig(LearnerConfig):
         for name in ("epochs", "minibatches"):
             checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
 
-    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "Distillation":
+    def make(
+        self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None
+    ) -> "Distillation":
         return Distillation(env, self, setup)
 
 
 class Distillation:
-    """Brings the student's choices near the teacher's, by the Kullback-Leibler divergence between them."""
+    """Brings the student's choices near the teacher's, by the Kullback-Leibler divergence between
+    them."""
 
     def __init__(self, env: EnvBase, config: DistillationConfig, setup: LearningSetup) -> None:
         self.config, self.teacher = config, load_teacher(config.teacher, env)
@@ -79,8 +83,12 @@ class Distillation:
         return {"divergence": sum(divergence) / len(divergence)}
 
     def step(self, steps: TensorDictBase) -> float:
-        """Make one step of gradient descent on steps [K]; returns the mean divergence before it [nats]."""
-        ready, wanted = steps[keys.READY].float(), steps["wanted"]  # a UAV in flight chooses nothing
+        """Make one step of gradient descent on steps [K]; returns the mean divergence before it
+        [nats]."""
+        ready, wanted = (
+            steps[keys.READY].float(),
+            steps["wanted"],
+        )  # a UAV in flight chooses nothing
         divergence = (wanted.exp() * (wanted - self.actor.get_dist(steps).logits)).sum(-1)
         loss = (divergence * ready).sum() / ready.sum().clamp(min=1)
         self.optimizer.zero_grad()
@@ -90,18 +98,28 @@ class Distillation:
 
 
 def load_teacher(folder: str, env: EnvBase) -> Any:
-    """The actor of a run without delay, which observes what the critic observes as if nothing were late."""
+    """The actor of a run without delay, which observes what the critic observes as if nothing were
+    late."""
     key = "learner.teacher"
-    checks.require(bool(folder), key, "''", "is missing: the run folder of a policy trained without delay")
+    checks.require(
+        bool(folder), key, "''", "is missing: the run folder of a policy trained without delay"
+    )
     config = stored_config(Path(folder), key)
-    checks.require(not config.make_delays().obs.late, key, folder, "was trained with delayed messages")
+    checks.require(
+        not config.make_delays().obs.late, key, folder, "was trained with delayed messages"
+    )
     world = make_env(config, 1, device=env.device)
-    spec, wanted = env.full_action_spec_unbatched[keys.ACTION], world.full_action_spec_unbatched[keys.ACTION]
+    spec, wanted = (
+        env.full_action_spec_unbatched[keys.ACTION],
+        world.full_action_spec_unbatched[keys.ACTION],
+    )
     should = "chooses from other actions, or from continuous ones"
     checks.require(getattr(spec, "n", 0) == getattr(wanted, "n", None), key, folder, should)
     n_seen = world.observation_spec[keys.OBSERVATION].shape[-1]
     n_known = env.observation_spec[keys.PRIVILEGED_OBSERVATION].shape[-1] - OFFSET
-    should = f"observes {n_seen} numbers, but the critic of this run {n_known}: choose the same features"
+    should = (
+        f"observes {n_seen} numbers, but the critic of this run {n_known}: choose the same features"
+    )
     checks.require(n_seen == n_known, key, folder, should)
     actor = config.learner.make_actor(world, config.model)
     load_networks(Path(folder), key, {"actor": actor})

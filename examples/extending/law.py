@@ -1,13 +1,14 @@
-"""Your own distributions of delays: a satellite link, a radio link to antennas, and a route that drifts.
+"""Your own distributions of delays: a satellite link, a radio link to antennas, and a route that
+drifts.
 
     cd examples/extending
     damian train "delay.obs={law: law:Satellite, hop: 2s, extra: 0.2}" aware=backupdate+history
     damian train "delay.obs={law: law:Distance, antenna: [0, 0], speed: 40, reach: 300}" aware=backupdate
     damian train "delay.obs={law: law:Route, longest: 6s, change: 0.3}" aware=backupdate+history
 
-A law is a frozen dataclass derived from ``damian.Law``. ``sampler`` returns the probability of each delay in
-steps (``Satellite``), a function of the circumstances under which messages are sent (``Distance``), or a
-sampler of your own, whose senders have a state (``Route``).
+A law is a frozen dataclass derived from ``damian.Law``. ``sampler`` returns the probability of each
+delay in steps (``Satellite``), a function of the circumstances under which messages are sent
+(``Distance``), or a sampler of your own, whose senders have a state (``Route``).
 """
 
 from collections.abc import Sequence
@@ -41,7 +42,8 @@ class Satellite(Law):
 
 @dataclass(frozen=True)
 class Distance(Law):
-    """A delay grows with the distance to an antenna, and with the number of UAVs that send in this step."""
+    """A delay grows with the distance to an antenna, and with the number of UAVs that send in this
+    step."""
 
     antenna: Sequence[float] = (0.0, 0.0)
     """Place of the antenna, east and north [m]."""
@@ -61,7 +63,8 @@ class Distance(Law):
         )
 
     def delays(self, context: MessageContext) -> Tensor:
-        """Delay of each of M messages [steps], [M]; it is rounded up, and a negative one is a loss."""
+        """Delay of each of M messages [steps], [M]; it is rounded up, and a negative one is a
+        loss."""
         position = context.entries["position"]
         distance = torch.linalg.vector_norm(position - position.new_tensor(self.antenna), dim=-1)
         steps = distance / (self.speed * context.dt) + context.n_sending // self.capacity
@@ -71,19 +74,22 @@ class Distance(Law):
 
 @dataclass(frozen=True)
 class Route(Law):
-    """The delay of a sender is a random walk: from one message to the next it changes by one step at most."""
+    """The delay of a sender is a random walk: from one message to the next it changes by one step
+    at most."""
 
     longest: Delay = 6
     """Longest delay: steps, or a time such as ``6s``."""
     change: float = setting(0.3, low=0, high=1)
-    """Probability that the delay grows or shrinks by a step, each as likely, between 0 and ``longest``."""
+    """Probability that the delay grows or shrinks by a step, each as likely, between 0 and
+    ``longest``."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         return Walk(in_steps(f"{key}.longest", self.longest, dt), self.change, loss)
 
 
 class Walk(Sampler):
-    """Draws the delays of ``Route``; the state of a sender is the delay of its latest message [steps], [M].
+    """Draws the delays of ``Route``; the state of a sender is the delay of its latest message
+    [steps], [M].
 
     It goes on from one episode to the next; ``begin_episode`` could change that.
     """

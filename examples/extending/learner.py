@@ -3,8 +3,9 @@
     cd examples/extending
     damian train learner=learner:ReinforceConfig learner.entropy=0.02 learner.steps=50
 
-The settings are a dataclass derived from ``damian.LearnerConfig``; ``make`` builds the learner, which has an
-``actor``, learns from batches [B, T], and names the components that a checkpoint stores.
+The settings are a dataclass derived from ``damian.LearnerConfig``; ``make`` builds the learner,
+which has an ``actor``, learns from batches [B, T], and names the components that a checkpoint
+stores.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,8 @@ from damian.common import checks
 
 @dataclass
 class ReinforceConfig(LearnerConfig):
-    """Settings of REINFORCE, beside the learning rate, the discount and the steps between two updates."""
+    """Settings of REINFORCE, beside the learning rate, the discount and the steps between two
+    updates."""
 
     entropy: float = 0.01
     """Weight of the entropy bonus."""
@@ -36,7 +38,8 @@ class ReinforceConfig(LearnerConfig):
 
 
 class Reinforce:
-    """Increases the probability of actions that were followed by more reward than the batch's mean."""
+    """Increases the probability of actions that were followed by more reward than the batch's
+    mean."""
 
     def __init__(self, env: EnvBase, config: ReinforceConfig, setup: LearningSetup) -> None:
         self.config = config

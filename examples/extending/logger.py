@@ -3,8 +3,9 @@
     cd examples/extending
     damian train "logger.custom=[{logger: logger:Progress, every: 10, goal: 1.0}]"
 
-A logger is called with the run folder, and gets every number that the training logs; its keyword-only
-arguments are parameters. TorchRL's loggers fit too, through a function such as ``weights_and_biases``.
+A logger is called with the run folder, and gets every number that the training logs; its
+keyword-only arguments are parameters. TorchRL's loggers fit too, through a function such as
+``weights_and_biases``.
 """
 
 from pathlib import Path

@@ -3,8 +3,8 @@
     cd examples/extending
     damian train motion=polynomial motion.kind=motion:WindyFlight "motion.options={wind: 4}"
 
-A model derives from ``MotionModel``, or from one that exists. Its methods are pure functions of the worlds'
-``State``.
+A model derives from ``MotionModel``, or from one that exists. Its methods are pure functions of the
+worlds' ``State``.
 """
 
 import math

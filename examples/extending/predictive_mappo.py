@@ -1,10 +1,11 @@
-"""Your own learner: MAPPO whose actor predicts, from the messages that have arrived, what arrives later.
+"""Your own learner: MAPPO whose actor predicts, from the messages that have arrived, what arrives
+later.
 
     damian train scenario=delaybench/tracking delay=paper aware=backupdate delay.messages=8 \\
         learner=examples.extending.predictive_mappo:PredictiveMappoConfig            (in a clone)
 
-The actor asks the messages, by attention, one question for each action, predicts what they will have said
-when that action has ended, and chooses. It learns to predict from the replay buffer.
+The actor asks the messages, by attention, one question for each action, predicts what they will
+have said when that action has ended, and chooses. It learns to predict from the replay buffer.
 docs/extending.md says more.
 """
 
@@ -42,12 +43,18 @@ PREDICTION = (keys.AGENTS, "prediction")
 
 @dataclass
 class PredictiveMappoConfig(MappoConfig):
-    """MAPPO with a learnt belief: attention over the messages that have arrived, trained by prediction."""
+    """MAPPO with a learnt belief: attention over the messages that have arrived, trained by
+    prediction."""
 
     prediction_steps: int = setting(
-        100, "Steps of gradient descent on the predictions after each update.", low=1, high=checks.STEPS
+        100,
+        "Steps of gradient descent on the predictions after each update.",
+        low=1,
+        high=checks.STEPS,
     )
-    prediction_batch: int = setting(400, "Environment steps in each of them.", low=1, high=checks.STEPS)
+    prediction_batch: int = setting(
+        400, "Environment steps in each of them.", low=1, high=checks.STEPS
+    )
     prediction_lr: float = setting(0.002, "Learning rate of the predictions.", above=0, high=1)
     prediction_buffer: int = setting(
         32000, "Environment steps from which predictions are learnt.", low=1, high=checks.STEPS
@@ -61,7 +68,9 @@ class PredictiveMappoConfig(MappoConfig):
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
         model, constant_delay = setup.model, setup.action_delay is not None
-        should = "needs backupdate=true and a message delay (delay.obs): it predicts what arrives late"
+        should = (
+            "needs backupdate=true and a message delay (delay.obs): it predicts what arrives late"
+        )
         checks.require(setup.backupdate, "learner", self.name, should)
         should = "needs a constant action delay (delay.act): it predicts when actions take effect"
         checks.require(constant_delay, "learner", self.name, should)
@@ -73,9 +82,15 @@ class PredictiveMappoConfig(MappoConfig):
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         least = super().buffer_size(setup)
-        return None if least is None else max(least, self.prediction_buffer // setup.worlds * setup.worlds)
+        return (
+            None
+            if least is None
+            else max(least, self.prediction_buffer // setup.worlds * setup.worlds)
+        )
 
-    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "PredictiveMappo":
+    def make(
+        self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None
+    ) -> "PredictiveMappo":
         return PredictiveMappo(env, self, setup, buffer)
 
     def make_actor(self, env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
@@ -85,8 +100,9 @@ class PredictiveMappoConfig(MappoConfig):
 class PredictiveMappo(Mappo):
     """MAPPO that after each update also learns to predict, from random steps of the replay buffer.
 
-    The target of a decision is the critic's observation when its action has ended, as the back-updating
-    storage knows it by now. A decision whose last message has not arrived by now has no weight.
+    The target of a decision is the critic's observation when its action has ended, as the
+    back-updating storage knows it by now. A decision whose last message has not arrived by now has
+    no weight.
     """
 
     config: PredictiveMappoConfig
@@ -94,31 +110,42 @@ class PredictiveMappo(Mappo):
     loss_keys = (*LOSS_KEYS, ENCODING, PREDICTION)
 
     def __init__(
-        self, env: EnvBase, config: PredictiveMappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None
+        self,
+        env: EnvBase,
+        config: PredictiveMappoConfig,
+        setup: LearningSetup,
+        buffer: ReplayBuffer | None,
     ) -> None:
         super().__init__(env, config, setup, buffer)
         self.head = next(each for each in self.actor.modules() if isinstance(each, BeliefHead))
-        self.head_optimizer = torch.optim.Adam(self.head.parameters(), lr=config.prediction_lr, fused=True)
+        self.head_optimizer = torch.optim.Adam(
+            self.head.parameters(), lr=config.prediction_lr, fused=True
+        )
 
     def components(self) -> dict[str, Any]:
         """What a checkpoint stores: also the optimiser of the belief head."""
         return {**super().components(), "head_optimizer": self.head_optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """As ``Mappo.learn``; also the mean ``prediction_error``, 1 if no better than the targets' mean."""
-        # What is known after a step is what is known before the next one: it need not be stored twice.
+        """As ``Mappo.learn``; also the mean ``prediction_error``, 1 if no better than the targets'
+        mean."""
+        # What is known after a step is what is known before the next one: it need not be stored
+        # twice.
         numbers = super().learn(batch.exclude(next_key(keys.TIMELINE)))
         last = self.last_steps()
         errors = [self.learn_prediction(last) for _ in range(self.config.prediction_steps)]
         return {**numbers, "prediction_error": torch.stack(errors).mean().item()}
 
     def learn_prediction(self, last: Tensor) -> Tensor:
-        """Make one step of gradient descent on random steps of the replay buffer; the error before it, []."""
+        """Make one step of gradient descent on random steps of the replay buffer; the error before
+        it, []."""
         before, target, counts = self.sample(last)
         if counts.any():
             self.head.norm.update(target[counts.squeeze(-1)].double())
         wanted = self.head.norm.normalize(target).clamp(-LARGEST, LARGEST).to(target.dtype)
-        error = prediction_loss(self.head.predict(*before), wanted.unsqueeze(-2), counts.unsqueeze(-2))
+        error = prediction_loss(
+            self.head.predict(*before), wanted.unsqueeze(-2), counts.unsqueeze(-2)
+        )
         self.head_optimizer.zero_grad()
         error.backward()
         self.head_optimizer.step()
@@ -130,19 +157,27 @@ class PredictiveMappo(Mappo):
         return cast(BackupdateStorage, self.buffer.storage)
 
     def last_steps(self) -> Tensor:
-        """The last step of each UAV's action in each stored step, as in ``ends_of_actions``, [T, B, N]."""
+        """The last step of each UAV's action in each stored step, as in ``ends_of_actions``,
+        [T, B, N]."""
         steps, rows = self.storage.steps, self.storage.latest()
-        ready, reset = (cast(Tensor, steps[key])[rows] for key in (next_key(keys.READY), keys.RESET_AFTER))
+        ready, reset = (
+            cast(Tensor, steps[key])[rows] for key in (next_key(keys.READY), keys.RESET_AFTER)
+        )
         return ends_of_actions(ready, reset, cast(int, self.setup.action_delay))
 
     def sample(self, last: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Draw K stored steps: what predictions are made from, what came after, and what of it counts.
+        """Draw K stored steps: what predictions are made from, what came after, and what of it
+        counts.
 
-        Returns observations, histories and actions, [K, N, ...]; the critic's observation when these actions
-        had ended, [K, N, G]; and whether the UAV could choose, has completed its action, and its last message
-        has arrived by now, [K, N, 1] bool.
+        Returns observations, histories and actions, [K, N, ...]; the critic's observation when
+        these actions had ended, [K, N, G]; and whether the UAV could choose, has completed its
+        action, and its last message has arrived by now, [K, N, 1] bool.
         """
-        steps, rows, n_samples = self.storage.steps, self.storage.latest(), self.config.prediction_batch
+        steps, rows, n_samples = (
+            self.storage.steps,
+            self.storage.latest(),
+            self.config.prediction_batch,
+        )
         n_rows, device = len(rows), rows.device
         since = torch.randint(n_rows, (n_samples,), device=device)
         world = torch.randint(self.setup.worlds, (n_samples,), device=device)
@@ -158,7 +193,8 @@ class PredictiveMappo(Mappo):
         after = (keys.READY, keys.DELAY, keys.GLOBAL_OBSERVATION)
         completed, delay, target = (cast(Tensor, steps[next_key(key)])[index] for key in after)
         arrived = arrived_by_now(delay, n_rows - 1 - end)
-        # An action whose flight the end of the episode has cut leads to nothing that could be predicted.
+        # An action whose flight the end of the episode has cut leads to nothing that could be
+        # predicted.
         return before, target, arrived & (ready & completed).unsqueeze(-1)
 
 
@@ -171,16 +207,19 @@ CODE_SIZE = 8
 PREFERENCE_UNIT = 30.0
 """Logits per unit of the learnt weights of predictions, which move slowly."""
 LARGEST = 5.0
-"""Largest magnitude of a normalised target, so that a number that hardly ever changes weighs no more."""
+"""Largest magnitude of a normalised target, so that a number that hardly ever changes weighs no
+more."""
 FORGETTING = 0.99
 """Share of the running statistics of the targets that an update keeps."""
 
 
 class MessageEncoder(nn.Module):
-    """Encodes F features, a set of messages of C columns, and a code [K] of what is asked, by attention.
+    """Encodes F features, a set of messages of C columns, and a code [K] of what is asked, by
+    attention.
 
-    Each message is given as it is and relative to the newest known message of the first sender, which with
-    ``ObservationTimeline`` is the receiver itself. Messages that are not known have no influence.
+    Each message is given as it is and relative to the newest known message of the first sender,
+    which with ``ObservationTimeline`` is the receiver itself. Messages that are not known have no
+    influence.
     """
 
     def __init__(
@@ -203,18 +242,25 @@ class MessageEncoder(nn.Module):
             nn.ReLU(),
             nn.Linear(2 * width, heads * width, device=device),
         )
-        self.layers = hidden_layers(config, heads * width + n_known + n_code, config.hidden).to(device)
+        self.layers = hidden_layers(config, heads * width + n_known + n_code, config.hidden).to(
+            device
+        )
 
     def forward(self, observation: Tensor, history: Tensor, codes: Tensor) -> Tensor:
-        """Encode observations [*, F] and timelines [*, S, K, C], for Q codes each [*, Q, E], into [*, Q, H].
+        """Encode observations [*, F] and timelines [*, S, K, C], for Q codes each [*, Q, E], into
+        [*, Q, H].
 
         A timeline has K slots for each of S senders; of one sender it may be [*, K, C].
         """
-        if observation.dim() > 2:  # a compiler replaces attention in four dimensions by a slower kernel
+        if (
+            observation.dim() > 2
+        ):  # a compiler replaces attention in four dimensions by a slower kernel
             batch = observation.shape[:-1]
             rows = (part.flatten(0, len(batch) - 1) for part in (observation, history, codes))
             return self(*rows).unflatten(0, batch)
-        history = with_age(history if history.dim() > observation.dim() + 1 else history.unsqueeze(-3))
+        history = with_age(
+            history if history.dim() > observation.dim() + 1 else history.unsqueeze(-3)
+        )
         message, known = history[..., : self.n_message], history[..., self.n_message]
         newest = known.argmax(-1, keepdim=True).unsqueeze(-1)  # the first of the known ones
         reference = message.gather(-2, newest.expand(*newest.shape[:-1], self.n_message))
@@ -232,7 +278,8 @@ class MessageEncoder(nn.Module):
 
 
 def with_age(timeline: Tensor) -> Tensor:
-    """Rows of a timeline [*, S, K, C], followed by age and whether of the first sender, [*, S K, C + 2]."""
+    """Rows of a timeline [*, S, K, C], followed by age and whether of the first sender,
+    [*, S K, C + 2]."""
     senders, slots = timeline.shape[-3:-1]
     age = torch.arange(slots, device=timeline.device) / slots
     first = (torch.arange(senders, device=timeline.device) == 0).float().unsqueeze(-1)
@@ -241,9 +288,12 @@ def with_age(timeline: Tensor) -> Tensor:
 
 
 def _linear_of_parts(layer: nn.Module, *parts: Tensor) -> Tensor:
-    """What a linear layer makes of features in several parts, [*, K] each, broadcast without copies."""
+    """What a linear layer makes of features in several parts, [*, K] each, broadcast without
+    copies."""
     weights = cast(nn.Linear, layer).weight.split([part.shape[-1] for part in parts], -1)
-    return sum((part @ w.T for part, w in zip(parts, weights, strict=True)), cast(nn.Linear, layer).bias)
+    return sum(
+        (part @ w.T for part, w in zip(parts, weights, strict=True)), cast(nn.Linear, layer).bias
+    )
 
 
 def _apply(layers: list[nn.Module], features: Tensor) -> Tensor:
@@ -253,11 +303,13 @@ def _apply(layers: list[nn.Module], features: Tensor) -> Tensor:
 
 
 class BeliefHead(TensorDictModuleBase):
-    """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
+    """Predicts what arrives later, for every discrete action, and encodes what is known for a
+    policy.
 
-    The predictions are normalised targets. Code 0 asks what will have been whatever the action; its encoding
-    is for the policy. While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
-    ``("agents", "prediction")`` [*, A G]; in TorchRL's recurrent mode, which losses switch on, nothing.
+    The predictions are normalised targets. Code 0 asks what will have been whatever the action; its
+    encoding is for the policy. While acting it writes ``("agents", "encoding")`` [*, H] and, with
+    discrete actions, ``("agents", "prediction")`` [*, A G]; in TorchRL's recurrent mode, which
+    losses switch on, nothing.
     """
 
     def __init__(
@@ -299,7 +351,8 @@ class BeliefHead(TensorDictModuleBase):
 
 
 class Preference(nn.Module):
-    """Logits from observations, encodings and what is predicted for each action, with learnt weights."""
+    """Logits from observations, encodings and what is predicted for each action, with learnt
+    weights."""
 
     def __init__(self, network: nn.Module, n_targets: int, device: torch.device | None) -> None:
         super().__init__()
@@ -308,7 +361,9 @@ class Preference(nn.Module):
     def forward(self, observation: Tensor, encoding: Tensor, prediction: Tensor) -> Tensor:
         """Logits [*, A] from observations [*, F], encodings [*, H] and predictions [*, A G]."""
         logits = self.network(torch.cat([observation, encoding], -1))
-        return logits + PREFERENCE_UNIT * (prediction.unflatten(-1, (logits.shape[-1], -1)) @ self.weight)
+        return logits + PREFERENCE_UNIT * (
+            prediction.unflatten(-1, (logits.shape[-1], -1)) @ self.weight
+        )
 
 
 class NormalPolicy(nn.Module):
@@ -323,19 +378,32 @@ class NormalPolicy(nn.Module):
         return self.normal(self.network(torch.cat([observation, encoding], -1)))
 
 
-def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int) -> ProbabilisticActor:
+def make_belief_actor(
+    env: EnvBase, config: ModelConfig, heads: int, width: int
+) -> ProbabilisticActor:
     """Make the policy from observations and histories to ``("agents", "action")``."""
     known, device = env.observation_spec.keys(True, True), env.device
-    should = "reads no messages: set delay.messages, or add damian.ObservationTimeline to the environment"
+    should = (
+        "reads no messages: set delay.messages, or add damian.ObservationTimeline to the "
+        "environment"
+    )
     checks.require(keys.TIMELINE in known, "learner", "this one", should)
-    observation, history = env.observation_spec[keys.OBSERVATION], env.observation_spec[keys.TIMELINE]
-    n_targets, n_encoding = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1], config.hidden[-1]
+    observation, history = (
+        env.observation_spec[keys.OBSERVATION],
+        env.observation_spec[keys.TIMELINE],
+    )
+    n_targets, n_encoding = (
+        env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1],
+        config.hidden[-1],
+    )
 
     def network(n_out: int, *out_keys: NestedKey) -> TensorDictSequential:
         discrete = len(out_keys) == 1
         n_actions, n_code = (n_out, CODE_SIZE) if discrete else (None, n_out // 2)
         n_features = observation.shape[-1]
-        encoder = MessageEncoder(n_features, history.shape[-1], n_code, config, heads, width, device)
+        encoder = MessageEncoder(
+            n_features, history.shape[-1], n_code, config, heads, width, device
+        )
         head = BeliefHead(encoder, n_encoding, n_targets, n_actions, n_code, device)
         read = [keys.OBSERVATION, *head.out_keys]
         policy = make_mlp(config, n_features + n_encoding, n_out).to(device)
@@ -347,10 +415,11 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
 
 
 def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
-    """The last step of the action chosen in each of T steps, [T, ...]; T if it comes later, or never.
+    """The last step of the action chosen in each of T steps, [T, ...]; T if it comes later, or
+    never.
 
-    ``ready`` [T, ...] and ``reset`` tell whether the UAV could choose, and the episode was reset, after each
-    step; an action is executed ``delay`` steps later.
+    ``ready`` [T, ...] and ``reset`` tell whether the UAV could choose, and the episode was reset,
+    after each step; an action is executed ``delay`` steps later.
     """
     ends, n_steps = next_true(ready | reset), len(ready)
     executed = torch.arange(n_steps, device=ready.device) + delay
@@ -360,6 +429,7 @@ def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
 
 
 def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor:
-    """Mean square error of predictions of targets [*, G] where they count, [*, 1] bool; 0 if none does."""
+    """Mean square error of predictions of targets [*, G] where they count, [*, 1] bool; 0 if none
+    does."""
     error = torch.where(counts, predicted - target, 0.0).square()
     return error.sum() / counts.expand_as(error).sum().clamp(min=1)

@@ -1,12 +1,14 @@
-"""Your own learner: QMIX (Rashid et al. 2018), or VDN (Sunehag et al. 2018), on TorchRL's mixers and loss.
+"""Your own learner: QMIX (Rashid et al. 2018), or VDN (Sunehag et al. 2018), on TorchRL's mixers
+and loss.
 
     damian train scenario=delaybench/crowded delay.obs=4 observation.own=true \\
         learner=examples.extending.qmix:QmixConfig             (in a clone; VDN: learner.mixer=vdn)
     ... aware=backupdate      (rewards and what the mixer reads are corrected; only settled steps are drawn)
 
-The UAVs share one network of action values; the mixer joins those of the chosen actions to the value of the
-team, and reads what the critic observes of all UAVs. The policy is epsilon-greedy: an evaluation that samples
-does so with the last epsilon, and a deterministic one is greedy. A UAV in flight has a single action.
+The UAVs share one network of action values; the mixer joins those of the chosen actions to the
+value of the team, and reads what the critic observes of all UAVs. The policy is epsilon-greedy: an
+evaluation that samples does so with the last epsilon, and a deterministic one is greedy. A UAV in
+flight has a single action.
 """
 
 import math
@@ -39,7 +41,9 @@ class QmixConfig(LearnerConfig):
 
     lr: float = 5e-4
     steps: int = 4
-    mixer: str = setting("qmix", "How values are joined: qmix, or vdn (their sum).", choices=("qmix", "vdn"))
+    mixer: str = setting(
+        "qmix", "How values are joined: qmix, or vdn (their sum).", choices=("qmix", "vdn")
+    )
     epsilon: float = setting(0.95, "Probability of a random action at first.", low=0.05, high=0.95)
     epsilon_end: float = setting(0.05, "The same after ``annealed``.", above=0, high=0.95)
     annealed: float = setting(0.5, "Share of the run in which epsilon falls.", above=0, high=1)
@@ -59,32 +63,42 @@ class QmixConfig(LearnerConfig):
 
     def make_actor(self, env: EnvBase, model: Any) -> Any:
         masked = keys.ACTION_MASK in env.observation_spec.keys(True)
-        checks.require(masked, "actions.mask", masked, "is not true: QMIX chooses among legal actions")
+        checks.require(
+            masked, "actions.mask", masked, "is not true: QMIX chooses among legal actions"
+        )
         n_features = env.observation_spec[keys.OBSERVATION].shape[-1]
 
         def make(n_actions: int, *out_keys: Any) -> TensorDictModule:
-            chooser = EpsilonGreedy(make_mlp(model, n_features, n_actions).to(env.device), self.epsilon)
+            chooser = EpsilonGreedy(
+                make_mlp(model, n_features, n_actions).to(env.device), self.epsilon
+            )
             return TensorDictModule(chooser, [keys.OBSERVATION, keys.ACTION_MASK], list(out_keys))
 
         return with_distribution(env, make)
 
 
 class EpsilonGreedy(nn.Module):
-    """From observations [*, F] and legal actions [*, A] to the logarithms of their probabilities, [*, A]."""
+    """From observations [*, F] and legal actions [*, A] to the logarithms of their probabilities,
+    [*, A]."""
 
     def __init__(self, network: nn.Module, epsilon: float) -> None:
         super().__init__()
         self.network, device = network, next(network.parameters()).device
-        self.epsilon, self.learnt = (nn.Buffer(torch.tensor(n, device=device)) for n in (epsilon, 0))
+        self.epsilon, self.learnt = (
+            nn.Buffer(torch.tensor(n, device=device)) for n in (epsilon, 0)
+        )
 
     def forward(self, observation: Tensor, legal: Tensor) -> Tensor:
         values = self.network(observation).masked_fill(~legal, -math.inf)
         greedy = torch.zeros_like(values).scatter(-1, values.argmax(-1, keepdim=True), 1.0)
-        return ((1 - self.epsilon) * greedy + self.epsilon * legal / legal.sum(-1, keepdim=True)).log()
+        return (
+            (1 - self.epsilon) * greedy + self.epsilon * legal / legal.sum(-1, keepdim=True)
+        ).log()
 
 
 class Qmix:
-    """Learns the value of the team by temporal differences of steps that are drawn from a replay buffer."""
+    """Learns the value of the team by temporal differences of steps that are drawn from a replay
+    buffer."""
 
     def __init__(self, env: EnvBase, config: QmixConfig, setup: LearningSetup, buffer: Any) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
@@ -128,9 +142,12 @@ class Qmix:
         return {"loss": loss.item(), "epsilon": self.chooser.epsilon.item()}
 
     def joint(self, steps: TensorDictBase) -> TensorDictBase:
-        """Turn stored steps [K] into those of a team that chooses at once, as the loss reads them."""
+        """Turn stored steps [K] into those of a team that chooses at once, as the loss reads
+        them."""
         if keys.VALID in steps:
-            steps = steps[steps[keys.VALID].squeeze(-1)]  # not after an end that was known only later
+            steps = steps[
+                steps[keys.VALID].squeeze(-1)
+            ]  # not after an end that was known only later
         team = steps.select(keys.OBSERVATION, next_key(keys.OBSERVATION), *map(next_key, keys.ENDS))
         for now, found in ((team, steps), (team["next"], steps["next"])):
             legal, ready = found[keys.ACTION_MASK], found[keys.READY].unsqueeze(-1)

@@ -3,8 +3,8 @@
     cd examples/extending
     damian train region=vertices region.kind=region:yard "region.options={side: 300}"
 
-A source is a function from the settings and a random generator to regions; polygons are in local metres, x
-east, y north. It may return several regions, of which each episode flies over one.
+A source is a function from the settings and a random generator to regions; polygons are in local
+metres, x east, y north. It may return several regions, of which each episode flies over one.
 """
 
 import numpy as np

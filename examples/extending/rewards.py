@@ -5,7 +5,8 @@
         "reward.custom=[{term: rewards:low_battery, weight: -0.2, below: 0.5}]"
     damian train "reward.custom=[{term: rewards:together, weight: 0.1}]"
 
-A term reads features by name and returns a value for each UAV, [*, N]; its keyword-only arguments are
+A term reads features by name and returns a value for each UAV, [*, N]; its keyword-only arguments
+are
 parameters. Its name is its column in metrics.csv: ``reward/low_battery``.
 """
 

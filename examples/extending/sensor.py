@@ -4,8 +4,9 @@
     damian train "sensors=[{sensor: sensor:wind, strength: 3}]" \
         "observation.local_features=[spotted,sensor:wind_felt]"
 
-A sensor reads the true state of B worlds with N UAVs, and every message carries its values; its keyword-only
-arguments are parameters. A feature reads the values that the server holds by the name of the sensor.
+A sensor reads the true state of B worlds with N UAVs, and every message carries its values; its
+keyword-only arguments are parameters. A feature reads the values that the server holds by the name
+of the sensor.
 """
 
 import math
@@ -32,8 +33,11 @@ def wind(state: State, world: Simulation, *, strength: float = 5.0, noise: float
     time = (state.steps * world.dt).unsqueeze(-1)  # [B, 1]
     angle = 2 * math.pi * (time / 600 + state.position[..., 0] / 1000)
     direction = torch.stack([angle.sin(), angle.cos()], -1)
-    # A number for each world, episode, step, UAV and value; a second sensor would add a counter of its own.
-    seed, episode, step = (number.view(-1, 1, 1) for number in (state.seed, state.episode, state.steps))
+    # A number for each world, episode, step, UAV and value; a second sensor would add a counter of
+    # its own.
+    seed, episode, step = (
+        number.view(-1, 1, 1) for number in (state.seed, state.episode, state.steps)
+    )
     uav = torch.arange(angle.shape[-1], device=angle.device).unsqueeze(-1)
     value = torch.arange(2, device=angle.device)
     draw = counter_rng.uniform(seed, episode, step, uav, value)

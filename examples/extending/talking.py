@@ -4,11 +4,13 @@
     damian train scenario=delaybench/crowded delay.obs=4 aware=backupdate model=talking:AttentionConfig
     ... links=matrix links.delay=4 "observation.global_features=[talking:heard,coverage,coverage_map]"
 
-What is known of the others stands in blocks of rows of the UAV's own observation (``env.layout``): those of
-``others``, of ``requests``, or, where every UAV sends its message to every other one, of the feature ``heard``
-below, with the age of each message (TarMAC, Das et al. 2019, with late messages). One network encodes the
-rows of a block, and attention weighs them, so that it works with any number of UAVs, in any order. Whoever
-receives a message can encode it as well as its sender: the gradient needs no way back through a link.
+What is known of the others stands in blocks of rows of the UAV's own observation (``env.layout``):
+those of ``others``, of ``requests``, or, where every UAV sends its message to every other one, of
+the feature ``heard`` below, with the age of each message
+(TarMAC, Das et al. 2019, with late messages). One network encodes the rows of a block, and
+attention weighs them, so that it works with any number of UAVs, in any order. Whoever
+receives a message can encode it as well as its sender: the gradient needs no way back through a
+link.
 """
 
 from dataclasses import dataclass
@@ -29,14 +31,17 @@ from damian.server.layout import Layout
 def heard(v: FeatureCache) -> Tensor:
     """What the UAV holds of each other UAV, [*, N, N - 1, K] with K = 2 ``observation.window`` + 5.
 
-    The ways to its target and to its latest landing points, east and north, over half the largest vertex
-    distance of the region; whether it spots the source; the age of the message, over ten seconds; and 1.
+    The ways to its target and to its latest landing points, east and north, over half the largest
+    vertex distance of the region; whether it spots the source; the age of the message, over ten
+    seconds; and 1.
     """
     messages, own = v.messages, v.wanted(v.messages.target)
     landed = gather_rows(v.context.points, v.trail)  # [*, N, window, 2]
     places = torch.cat([messages.target.unsqueeze(-2), landed], -2)
     ways = places.unsqueeze(-4) - own[..., :, None, None, :]
-    ways = (ways / (v.context.scale / 2)[..., None, None, None, None]).flatten(-2)  # [*, N, N, 2 + 2 window]
+    ways = (ways / (v.context.scale / 2)[..., None, None, None, None]).flatten(
+        -2
+    )  # [*, N, N, 2 + 2 window]
     age = messages.age(v.context.now) / v.context.observation.age_scale
     rest = torch.stack([messages.spotted.float(), age, torch.ones_like(age)], -1)
     rest = rest.unsqueeze(-3).expand(*ways.shape[:-1], 3)
@@ -51,7 +56,9 @@ class AttentionConfig(ModelConfig):
 
     def make_network(self, layout: Layout, n_out: int) -> nn.Module:
         self.refuse(
-            not any(block.rows for block in layout), "name", "needs a feature of rows, such as others"
+            not any(block.rows for block in layout),
+            "name",
+            "needs a feature of rows, such as others",
         )
         return Attention(self, layout, n_out)
 
@@ -75,7 +82,8 @@ class Attention(nn.Module):
         return self.decide(torch.cat([rest, *read], -1))
 
     def attended(self, i: int, observation: Tensor, rest: Tensor) -> Tensor:
-        """The mean of the encoded rows of a block, weighed by how well they match a query, [*, width]."""
+        """The mean of the encoded rows of a block, weighed by how well they match a query,
+        [*, width]."""
         rows = self.rows[i].of(observation).flatten(observation.dim())  # [*, R, K]
         encoded, query = self.encode[i](rows), self.query[i](rest).unsqueeze(-1)
         match = encoded @ query / encoded.shape[-1] ** 0.5  # [*, R, 1]

@@ -1,21 +1,25 @@
-"""Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed late.
+"""Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed
+late.
 
-    python examples/studies/control.py --jobs 2                  (Pendulum-v1; an hour, two free cores)
-    python examples/studies/control.py --methods history bpql         (these methods only)
-    python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out runs/control_random
+    python examples/studies/control.py --jobs 2
+    (Pendulum-v1; an hour, two free cores) python examples/studies/control.py --methods history bpql
+    (these methods only) python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out
+    runs/control_random
                                                     (delays are drawn from 1 to 7 steps: two hours)
-    python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 --hidden 256 \\
-        --lr 3e-4 --episodes 10 --out runs/cheetah               (pip install "gymnasium[mujoco]"; 50 minutes)
+    python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9
+    --hidden 256 \\
+        --lr 3e-4 --episodes 10 --out runs/cheetah
+        (pip install "gymnasium[mujoco]"; 50 minutes)
     ... --shortest 1 --out runs/cheetah_random                   (delays are drawn from 1 to 9 steps)
 
-These methods are trained for each seed: undelayed; naive, whose observations are late; history, which also
-observes the agent's latest actions, with the age of the observation if that varies (an augmented state); and
-bpql, whose actor is the same, but whose critics read only the state, as it is known once it has arrived
-(``BackupdateStorage``). Where delays vary, there are two more ways to observe for each of the last two:
-timeline, all that has arrived, by when it was true (``ObservationTimeline``); and hold, a jitter buffer, in
-which observations wait until they are as old as the oldest may be. The undelayed policy is also evaluated
-under the delay. The folder gets the mean returns as results.md and results.csv, and a JSON file for each
-method and seed.
+These methods are trained for each seed: undelayed; naive, whose observations are late; history,
+which also observes the agent's latest actions, with the age of the observation if that varies
+(an augmented state); and bpql, whose actor is the same, but whose critics read only the state, as
+it is known once it has arrived (``BackupdateStorage``). Where delays vary, there are two more ways
+to observe for each of the last two: timeline, all that has arrived, by when it was true
+(``ObservationTimeline``); and hold, a jitter buffer, in which observations wait until they are as
+old as the oldest may be. The undelayed policy is also evaluated under the delay. The folder gets
+the mean returns as results.md and results.csv, and a JSON file for each method and seed.
 """
 
 import csv
@@ -80,7 +84,8 @@ class Task(NamedTuple):
     history: int = 0
     """Number of latest actions that are appended to the actor's observation."""
     timeline: bool = False
-    """Does the actor observe all that has arrived of the latest steps, instead of the newest message?"""
+    """Does the actor observe all that has arrived of the latest steps, instead of the newest
+    message?"""
 
     @property
     def horizon(self) -> int:
@@ -93,11 +98,12 @@ def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
 
     Args:
         task: the environment, its delays, and what is observed.
-        worlds: batch size of a ``SerialEnv``; a single environment without a batch size if not given.
+        worlds: batch size of a ``SerialEnv``; a single environment without a batch size if not
+            given.
 
     Returns:
-        The environment. Its entry ``observation`` is sent in each step, and ``received`` is what has arrived;
-        a learner reads only what follows from the latter.
+        The environment. Its entry ``observation`` is sent in each step, and ``received`` is what
+        has arrived; a learner reads only what follows from the latter.
     """
 
     def control() -> EnvBase:
@@ -121,27 +127,38 @@ def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
     if task.history:
         transforms.append(ActionHistory(task.history, append_to="observed"))
     # The learner expects these keys; a single agent needs no agent dimension.
-    outputs = {"observed": keys.OBSERVATION, "state": keys.GLOBAL_OBSERVATION, "reward": keys.REWARD}
+    outputs = {
+        "observed": keys.OBSERVATION,
+        "state": keys.GLOBAL_OBSERVATION,
+        "reward": keys.REWARD,
+    }
     transforms.append(RenameTransform([*outputs], [*outputs.values()], ["action"], [keys.ACTION]))
     return TransformedEnv(SerialEnv(worlds, control) if worlds else control(), Compose(transforms))
 
 
 def arrived_states(steps: TensorDictBase, observations: Tensor) -> dict[NestedKey, Tensor]:
-    """The states after steps [T, B]: what was observed then, as far as it has arrived, [T, B, D]."""
+    """The states after steps [T, B]: what was observed then, as far as it has arrived,
+    [T, B, D]."""
     return {next_key(keys.GLOBAL_OBSERVATION): observations}
 
 
 def make_learner(
     env: TransformedEnv, bpql: bool, steps: int, delay: int, hidden: int, lr: float = 1e-3
 ) -> Sac:
-    """The learner that also trains UAVs: SAC, or BPQL with a storage that learns of states as they arrive."""
+    """The learner that also trains UAVs: SAC, or BPQL with a storage that learns of states as they
+    arrive."""
     kind = BpqlConfig if bpql else SacConfig
     config = kind(lr=lr, alpha_lr=lr, gamma=GAMMA, tau=TAU, alpha_init=1.0)
     model = MlpConfig(hidden=[hidden, hidden], activation="relu")
     setup = LearningSetup(model, 1, 1, 1, critic_key=keys.OBSERVATION)
     if not bpql:
         return config.make(env, setup, ReplayBuffer(storage=TimeStorage(steps)))
-    names = {"message_key": "observation", "received_key": "received", "delay_key": "delay", "age_key": "age"}
+    names = {
+        "message_key": "observation",
+        "received_key": "received",
+        "delay_key": "delay",
+        "age_key": "age",
+    }
     storage = BackupdateStorage(steps, arrived_states, longest=delay, **names)
     setup = setup._replace(longest_delay=delay, critic_key=keys.GLOBAL_OBSERVATION)
     return config.make(env, setup, ReplayBuffer(storage=storage))
@@ -151,11 +168,14 @@ def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
     """Train for ``steps`` environment steps, with one update after each."""
     td = env.reset()
     for step in range(steps):
-        # Outside of such a context TorchRL's actor takes the most likely action, and explores nothing.
+        # Outside of such a context TorchRL's actor takes the most likely action, and explores
+        # nothing.
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             td = env.rand_action(td) if step < RANDOM_STEPS else learner.actor(td)
             transition, td = env.step_and_maybe_reset(td)
-        learner.buffer.extend(transition.select(*STORED, strict=False).view(1, 1))  # one world, one step
+        learner.buffer.extend(
+            transition.select(*STORED, strict=False).view(1, 1)
+        )  # one world, one step
         if step >= RANDOM_STEPS:
             learner.update(draw(learner))
         bar.update()
@@ -164,7 +184,8 @@ def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
 
 
 def draw(learner: Sac) -> TensorDictBase:
-    """Transitions [BATCH] from all steps whose observations have arrived, if the learner waits for these."""
+    """Transitions [BATCH] from all steps whose observations have arrived, if the learner waits for
+    these."""
     storage = cast(TimeStorage, learner.buffer.storage)
     order = storage.latest()
     settled = order[: len(order) - learner.setup.settle_steps]
@@ -173,7 +194,8 @@ def draw(learner: Sac) -> TensorDictBase:
 
 @torch.no_grad()
 def evaluate_under(task: Task, actor: nn.Module, episodes: int) -> float:
-    """Mean return of the most likely actions, in episodes with the same initial conditions at every call."""
+    """Mean return of the most likely actions, in episodes with the same initial conditions at every
+    call."""
     env = make_env(task, episodes)
     set_seed(env, EVALUATION_SEED)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -199,7 +221,9 @@ def run_method(method: str, seed: int, args: Namespace) -> dict[str, float]:
         train(env, learner, args.steps, bar)
     name = f"{shortest} to {args.delay}" if shortest < args.delay else str(args.delay)
     flown = {"0": task, name: late} if method == "undelayed" else {name: late}
-    return {name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()}
+    return {
+        name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()
+    }
 
 
 def table(results: Results, args: Namespace) -> str:
@@ -209,7 +233,9 @@ def table(results: Results, args: Namespace) -> str:
         found = [results[method, seed] for seed in args.seeds]
         for name in found[0]:
             values = [returns[name] for returns in found]
-            rows.append([method, name, *(f"{value:.0f}" for value in (statistics.mean(values), *values))])
+            rows.append(
+                [method, name, *(f"{value:.0f}" for value in (statistics.mean(values), *values))]
+            )
     with (args.out / "results.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows(rows)
     title = f"# {args.env}, SAC, {args.steps} steps: return, mean of {args.episodes} episodes"
@@ -221,12 +247,18 @@ def table(results: Results, args: Namespace) -> str:
 def main(words: list[str] | None = None) -> None:
     """Train, evaluate and print the table."""
     options = parser("SAC on a control task with late observations.", METHODS, "runs/control")
-    options.add_argument("--env", default="Pendulum-v1", help="task of Gymnasium with continuous actions")
+    options.add_argument(
+        "--env", default="Pendulum-v1", help="task of Gymnasium with continuous actions"
+    )
     options.add_argument("--steps", type=int, default=20_000, help="training steps of each method")
     options.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
-    options.add_argument("--shortest", type=int, help="delays are drawn, from this to --delay [steps]")
+    options.add_argument(
+        "--shortest", type=int, help="delays are drawn, from this to --delay [steps]"
+    )
     options.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
-    options.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
+    options.add_argument(
+        "--hidden", type=int, default=128, help="units in each of two hidden layers"
+    )
     options.add_argument("--lr", type=float, default=1e-3, help="learning rate of Adam")
     options.set_defaults(methods=None)  # which ones depends on the delays
     args = options.parse_args(words)

@@ -1,8 +1,9 @@
 """PettingZoo's ``simple_spread_v3`` and ``simple_tag_v3`` in batches, whose agents see others late.
 
-N agents have to cover N landmarks in a plane and to avoid each other, or to catch a prey that is faster.
-Physics and rewards are those of the discrete environments (Lowe et al. 2017, "Multi-Agent Actor-Critic for
-Mixed Cooperative-Competitive Environments"; their maintained version is mpe2).
+N agents have to cover N landmarks in a plane and to avoid each other, or to catch a prey that is
+faster. Physics and rewards are those of the discrete environments
+(Lowe et al. 2017, "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments"; their
+maintained version is mpe2).
 """
 
 import math
@@ -33,21 +34,23 @@ REACH = DT**2 / DAMPING
 KINEMATICS = (keys.AGENTS, "kinematics")
 """Velocity and position of each agent, [B, N, 4]: what it knows of itself, at once."""
 SEEN = ("seen", "message")
-"""Places of the landmarks and of the other agents relative to each agent, [B, N K, 2]: the K blocks that
-agent 0 sees, then those that agent 1 sees; in simple_tag also where the prey is, and would be in a second at
-its velocity. Each block is a message, with a delay of its own. If they are registered, an agent has added
+"""Places of the landmarks and of the other agents relative to each agent, [B, N K, 2]: the K blocks
+that agent 0 sees, then those that agent 1 sees; in simple_tag also where the prey is, and would be
+in a second at its velocity. Each block is a message, with a delay of its own. If they are
+registered, an agent has added
 where it was itself: they are places in the plane."""
 HELD, AGES, DELAYS, PAST = (("seen", name) for name in ("received", "age", "delay", "timeline"))
-"""Of each block: the message that the agent holds, its age and the delay of the latest one [steps], and the
-messages of the latest steps that have arrived (``ObservationTimeline``)."""
+"""Of each block: the message that the agent holds, its age and the delay of the latest one [steps],
+and the messages of the latest steps that have arrived (``ObservationTimeline``)."""
 
 
 class SimpleSpread(EnvBase):
     """``simple_spread_v3`` for B worlds at a time, with discrete actions.
 
-    It writes PettingZoo's observation ``("agents", "observation")`` [B, N, 6 N] (kinematics, landmarks, other
-    agents, and zeros for what they might say), its parts, ``KINEMATICS`` and ``SEEN``, and where each agent
-    is, ``keys.POSITION`` [B, N, 2]. Episodes are truncated after ``HORIZON`` steps.
+    It writes PettingZoo's observation ``("agents", "observation")`` [B, N, 6 N]
+    (kinematics, landmarks, other agents, and zeros for what they might say), its parts,
+    ``KINEMATICS`` and ``SEEN``, and where each agent is, ``keys.POSITION`` [B, N, 2]. Episodes are
+    truncated after ``HORIZON`` steps.
 
     Args:
         worlds: number of worlds, B.
@@ -154,20 +157,27 @@ class SimpleSpread(EnvBase):
     def _seen(self) -> Tensor:
         """The places that agents see, relative to themselves, [B, N, K, 2]."""
         own = self.agents.unsqueeze(2)
-        return torch.cat([self.landmarks.unsqueeze(1) - own, self.position[:, self.others] - own], 2)
+        return torch.cat(
+            [self.landmarks.unsqueeze(1) - own, self.position[:, self.others] - own], 2
+        )
 
     def _kinematics(self) -> Tensor:
         return torch.cat([self.velocity[:, : self.n_agents], self.agents], -1)
 
     def _observation(self) -> Tensor:
-        """PettingZoo's observation, [B, N, F]: kinematics, what is seen, and what others say, which is 0."""
+        """PettingZoo's observation, [B, N, F]: kinematics, what is seen, and what others say, which
+        is 0."""
         known = torch.cat([self._kinematics(), self._seen().flatten(2)], -1)
         return torch.cat([known, known.new_zeros(*known.shape[:-1], 2 * (self.n_agents - 1))], -1)
 
     def _outputs(self) -> TensorDictBase:
         shape, seen = self.agents.shape[:2], self._seen()
         over = self.steps >= HORIZON
-        ends = {keys.DONE: over, keys.TERMINATED: torch.zeros_like(over), keys.TRUNCATED: over.clone()}
+        ends = {
+            keys.DONE: over,
+            keys.TERMINATED: torch.zeros_like(over),
+            keys.TRUNCATED: over.clone(),
+        }
         agents = {"observation": self._observation(), "kinematics": self._kinematics()}
         agents["position"] = self.agents.clone()
         messages = (seen + self.agents.unsqueeze(2) if self.registered else seen).flatten(1, 2)
@@ -181,9 +191,10 @@ class SimpleSpread(EnvBase):
 class SimpleTag(SimpleSpread):
     """``simple_tag_v3`` without its bonus for the prey, which is no agent here but flees by a rule.
 
-    The N predators get 10 for each of them that touches the prey. Of its five actions the prey takes the one
-    after which it would come to rest farthest from the nearest predator, and not outside the plane's edge.
-    In PettingZoo the prey learns, too; Fu et al. (2025) have trained one beforehand.
+    The N predators get 10 for each of them that touches the prey. Of its five actions the prey
+    takes the one after which it would come to rest farthest from the nearest predator, and not
+    outside the plane's edge. In PettingZoo the prey learns, too; Fu et al. (2025) have trained one
+    beforehand.
     """
 
     moving = ((3.0, 1.0, 0.075), (4.0, 1.3, 0.05))
@@ -205,7 +216,9 @@ class SimpleTag(SimpleSpread):
 
     def _contacts(self) -> Tensor:
         size = torch.cat([self.size, torch.full(self.landmarks.shape[1:2], self.obstacle)])
-        return contact_forces(torch.cat([self.position, self.landmarks], 1), size)[:, : len(self.size)]
+        return contact_forces(torch.cat([self.position, self.landmarks], 1), size)[
+            :, : len(self.size)
+        ]
 
     def _rewards(self) -> Tensor:
         way = (self.agents - self.position[:, -1:]).norm(dim=-1)
@@ -218,13 +231,18 @@ class SimpleTag(SimpleSpread):
 
     def _observation(self) -> Tensor:
         seen = self._seen()
-        seen = torch.cat([seen[:, :, :-1], seen[:, :, -1:] - seen[:, :, -2:-1]], 2)  # the prey's velocity
+        seen = torch.cat(
+            [seen[:, :, :-1], seen[:, :, -1:] - seen[:, :, -2:-1]], 2
+        )  # the prey's velocity
         return torch.cat([self._kinematics(), seen.flatten(2)], -1)
 
 
 def contact_forces(position: Tensor, size: Tensor) -> Tensor:
-    """Forces on bodies at positions [B, M, 2], of radius [M], by all others that they touch, [B, M, 2]."""
-    way = position.unsqueeze(-2) - position.unsqueeze(-3)  # from the others to each body, [B, M, M, 2]
+    """Forces on bodies at positions [B, M, 2], of radius [M], by all others that they touch,
+    [B, M, 2]."""
+    way = position.unsqueeze(-2) - position.unsqueeze(
+        -3
+    )  # from the others to each body, [B, M, M, 2]
     distance, touching = way.norm(dim=-1, keepdim=True), (size.unsqueeze(-1) + size).unsqueeze(-1)
     overlap = CONTACT_MARGIN * softplus((touching - distance) / CONTACT_MARGIN)
     return CONTACT_FORCE * (way / distance.clamp(min=1e-12) * overlap).sum(-2)
@@ -233,10 +251,10 @@ def contact_forces(position: Tensor, size: Tensor) -> Tensor:
 class Receiver(Transform):
     """Writes what agents and critics observe of their kinematics and of what they see.
 
-    Critics observe ``observed(...)`` of the blocks that are held or, if there is one, of their timeline; and
-    actors too, with ``ages`` followed by the age of each block. For learners it also writes that every agent
-    may choose in every step, the longest delay of the blocks that were sent in this step, and that nothing is
-    back-updated yet.
+    Critics observe ``observed(...)`` of the blocks that are held or, if there is one, of their
+    timeline; and actors too, with ``ages`` followed by the age of each block. For learners it also
+    writes that every agent may choose in every step, the longest delay of the blocks that were sent
+    in this step, and that nothing is back-updated yet.
 
     Args:
         longest: steps that are an age of 1.
@@ -251,7 +269,9 @@ class Receiver(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.update(self._written(next_tensordict))
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return self._step(tensordict, tensordict_reset)
 
     def _written(self, outputs: TensorDictBase) -> dict[Any, Tensor]:
@@ -278,8 +298,8 @@ def observed(kinematics: Tensor, seen: Tensor, registered: bool = False) -> Tens
     """What agents make of their kinematics [*, N, 4] and of what they see, [*, N, 4 + C + N].
 
     That is, the kinematics, the C numbers, and which agent it is. What it sees are blocks
-    [*, N K, 2], which are moved into the agent's present frame if they are ``registered``, or their timelines
-    [*, N K, slots, 3].
+    [*, N K, 2], which are moved into the agent's present frame if they are ``registered``, or their
+    timelines [*, N K, slots, 3].
     """
     *rows, n, _ = kinematics.shape
     seen = seen.unflatten(len(rows), (n, -1))
@@ -301,7 +321,8 @@ def late_game(
 ) -> TransformedEnv:
     """A game for B worlds whose agents see each landmark, each other agent and the prey late.
 
-    An agent knows its own velocity and position at once. At the beginning it holds what it sees there.
+    An agent knows its own velocity and position at once. At the beginning it holds what it sees
+    there.
 
     Args:
         game: ``SimpleSpread`` or ``SimpleTag``.
@@ -310,12 +331,16 @@ def late_game(
         longest: number of latest actions that an aware actor observes.
         aware: whether actors observe ages, and their own latest actions by how far these move them.
         registered: whether the blocks that agents hold are moved into their present frame.
-        slots: number of latest steps that agents observe as the timelines of the blocks, in their present
-            frame, instead of the blocks that they hold; 0: there are none.
+        slots: number of latest steps that agents observe as the timelines of the blocks, in their
+            present frame, instead of the blocks that they hold; 0: there are none.
     """
-    parts: list[Transform] = [ObservationDelay(delay, [SEEN], [HELD], age_key="age", delay_key="delay")]
+    parts: list[Transform] = [
+        ObservationDelay(delay, [SEEN], [HELD], age_key="age", delay_key="delay")
+    ]
     if slots:
-        parts.append(ObservationTimeline(slots, SEEN, delay_key="delay", position_key=keys.POSITION))
+        parts.append(
+            ObservationTimeline(slots, SEEN, delay_key="delay", position_key=keys.POSITION)
+        )
     parts.append(Receiver(longest, aware, registered))
     if aware:
         codes = torch.tensor(DIRECTIONS) * game.moving[0][0] * REACH

@@ -1,10 +1,11 @@
 """Make the policies of the package, ``damian/data/NAME``, each with a card (docs/policies.md).
 
-    python examples/studies/pretrained.py      (three hours on one core; a run that has finished is taken)
-    python examples/studies/pretrained.py requests --runs runs/pretrained
+    python examples/studies/pretrained.py      (three hours on one core; a run that has finished is
+    taken) python examples/studies/pretrained.py requests --runs runs/pretrained
 
-A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half precision,
-``config.yaml`` the settings, ``result.csv`` and the card ``README.md`` what it returns under which delays.
+A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half
+precision, ``config.yaml`` the settings, ``result.csv`` and the card ``README.md`` what it returns
+under which delays.
 """
 
 import json
@@ -34,7 +35,8 @@ POLICIES = {
     "crowded-any-delay": (
         "scenario=delaybench/crowded aware=timeline model=gru seed=0 "
         '"delay.obs={law: lag, lag: {law: uniform, low: 1, high: 7}, update_period: episode}"',
-        "Three UAVs that are at their targets at once, in regions of 0.1 to 0.2 km²; footprints of 100 m.",
+        "Three UAVs that are at their targets at once, in regions of 0.1 to 0.2 km²; footprints of "
+        "100 m.",
     ),
     "flights": (
         "scenario=delaybench/crowded motion=polynomial aware=timeline delay.obs=1..7 seed=10",
@@ -42,17 +44,21 @@ POLICIES = {
     ),
     "requests": (
         "scenario=requests aware=timeline delay.obs=1..7 seed=0",
-        "Three UAVs that are at their targets at once, in regions of 0.3 to 0.6 km², with 30 requests a "
+        "Three UAVs that are at their targets at once, in regions of 0.3 to 0.6 km², with 30 "
+        "requests a "
         "minute, at most six of them open at once.",
     ),
     "convoy": (
         "scenario=convoy frames=600000 aware=timeline model=gru delay.obs=1..7 seed=0",
-        "UAVs of 10, 15 and 20 m/s that follow two sources in the paper's polygon, and no other region.",
+        "UAVs of 10, 15 and 20 m/s that follow two sources in the paper's polygon, and no other "
+        "region.",
     ),
     "tracking": (
         "scenario=delaybench/tracking frames=600000 aware=belief delay.obs=1..7 seed=0",
-        "Three UAVs that are at their targets at once, after one fast source in the paper's polygon, and in "
-        "no other region. The filter, which knows how the source moves, does nearly all: untrained, 19.5.",
+        "Three UAVs that are at their targets at once, after one fast source in the paper's "
+        "polygon, and in "
+        "no other region. The filter, which knows how the source moves, does nearly all: "
+        "untrained, 19.5.",
     ),
 }
 """What each policy is trained with, and for what it is good."""
@@ -71,7 +77,8 @@ BATCHES, WORLDS, SEED = 5, 200, 20_000
 
 
 def returns(name: str, law: tuple[str, ...]) -> dict[str, list[float]]:
-    """True mean returns of the policy in each batch, and of others where it flies as it was trained."""
+    """True mean returns of the policy in each batch, and of others where it flies as it was
+    trained."""
     found: dict[str, list[float]] = {}
     for seed in range(SEED, SEED + BATCHES):
         policy, env = damian.load(f"damian:{name}", *law, worlds=WORLDS, seed=seed)
@@ -89,7 +96,9 @@ def ship(name: str, run: Path) -> None:
     folder, (words, limits) = Path(damian.__file__).parent / "data" / name, POLICIES[name]
     folder.mkdir(exist_ok=True)
     actor = read_checkpoint(run / "checkpoint.pt", "checkpoint")["components"]["actor"]
-    half = {key: each.half() if isinstance(each, torch.Tensor) else each for key, each in actor.items()}
+    half = {
+        key: each.half() if isinstance(each, torch.Tensor) else each for key, each in actor.items()
+    }
     write_checkpoint(folder / "checkpoint.pt", {"components": {"actor": half}})
     settings = nested(stored_config(run, "checkpoint"))
     (folder / "config.yaml").write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
@@ -109,7 +118,9 @@ def ship(name: str, run: Path) -> None:
 def card(name: str, run: Path, words: str, limits: str, table: pd.DataFrame) -> str:
     """The card of a policy."""
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    scenario = (CONF / f"{shlex.split(words)[0].replace('=', '/')}.yaml").read_text(encoding="utf-8")
+    scenario = (CONF / f"{shlex.split(words)[0].replace('=', '/')}.yaml").read_text(
+        encoding="utf-8"
+    )
     task = " ".join(line[2:] for line in scenario.splitlines()[2:] if line.startswith("# "))
     cells = {
         (law, policy): f"{mean:.1f} ± {interval:.1f}"
@@ -142,13 +153,19 @@ def main(words: list[str] | None = None) -> None:
     """Train what has not been trained, and store it."""
     parser = ArgumentParser(description="Make the policies of the package.")
     parser.add_argument("names", nargs="*", default=[*POLICIES], help="policies to make")
-    parser.add_argument("--runs", type=Path, default=Path("runs/pretrained"), help="folder of the runs")
+    parser.add_argument(
+        "--runs", type=Path, default=Path("runs/pretrained"), help="folder of the runs"
+    )
     args = parser.parse_args(words)
     torch.set_num_threads(1)
     for name in args.names:
         run = args.runs / name
         if not (run / "result.csv").exists():
-            command = [Path(sys.executable).with_name("damian"), "train", *shlex.split(POLICIES[name][0])]
+            command = [
+                Path(sys.executable).with_name("damian"),
+                "train",
+                *shlex.split(POLICIES[name][0]),
+            ]
             subprocess.run([*command, "compile=true", f"hydra.run.dir={run}"], check=True)
         ship(name, run)
 

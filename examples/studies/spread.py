@@ -1,28 +1,30 @@
-"""Compare with a published table: MAPPO in PettingZoo's simple_spread_v3 or simple_tag_v3, observed late.
+"""Compare with a published table: MAPPO in PettingZoo's simple_spread_v3 or simple_tag_v3, observed
+late.
 
-    python examples/studies/spread.py                          (an hour on one core; --jobs 2 takes two)
-    python examples/studies/spread.py --game tag --methods undelayed naive registered+backupdate
-    python examples/studies/spread.py --delay 6 12 --out runs/spread_6_12
-    python examples/studies/spread.py --seeds 0 --frames 100000 --out runs/spread0
+    python examples/studies/spread.py
+    (an hour on one core; --jobs 2 takes two) python examples/studies/spread.py --game tag --methods
+    undelayed naive registered+backupdate python examples/studies/spread.py --delay 6 12 --out
+    runs/spread_6_12 python examples/studies/spread.py --seeds 0 --frames 100000 --out runs/spread0
 
-Three agents cover three landmarks, or catch a prey, in episodes of 25 steps; the return is the sum of all
-agents' rewards. An agent knows its own velocity and position at once; it sees each landmark, each other agent
-and the prey late, and begins with what it sees at the beginning. Methods: random actions; undelayed, trained
-without delay; and, trained while each of these messages takes 3 to 9 steps, naive, backupdate, and those
-whose actors also observe the ages of what they see and their own latest actions. Of these
+Three agents cover three landmarks, or catch a prey, in episodes of 25 steps; the return is the sum
+of all agents' rewards. An agent knows its own velocity and position at once; it sees each landmark,
+each other agent and the prey late, and begins with what it sees at the beginning. Methods: random
+actions; undelayed, trained without delay; and, trained while each of these messages takes 3 to 9
+steps, naive, backupdate, and those whose actors also observe the ages of what they see and their
+own latest actions. Of these
 
 - registered moves what is seen into the agent's present frame, by the agent's own way since then;
 - buffer, the same, holds it until it is as old as the longest delay in training (a jitter buffer);
 - timeline shows all that has arrived of the latest steps, registered, by when it was true
   (``ObservationTimeline``).
 
-With backupdate the critic learns from what has arrived since (``BackupdateStorage``); undelayed+registered
-acts as undelayed does, but is flown late with what is registered. Each policy is evaluated under several
-delays, by its most likely actions, in episodes that begin alike for all.
+With backupdate the critic learns from what has arrived since (``BackupdateStorage``);
+undelayed+registered acts as undelayed does, but is flown late with what is registered. Each policy
+is evaluated under several delays, by its most likely actions, in episodes that begin alike for all.
 
-The folder gets results.csv, a row for each method, delay and seed, the means as table.md beside those
-published (Fu et al. 2025, "Rainbow Delay Compensation", arXiv 2505.03586), and a JSON file for each
-method and seed.
+The folder gets results.csv, a row for each method, delay and seed, the means as table.md beside
+those published (Fu et al. 2025, "Rainbow Delay Compensation", arXiv 2505.03586), and a JSON file
+for each method and seed.
 """
 
 import csv
@@ -106,12 +108,19 @@ METHODS: dict[str, Method | None] = {
     "timeline+backupdate": Method(history=True, timeline=True, backupdate=True),
 }
 PUBLISHED = {"undelayed": (-33.1, -37.6, -48.8, -59.9, -67.2), "random": (-82.4,)}
-"""Published returns in simple_spread by method, under the first of the delays that are evaluated."""
+"""Published returns in simple_spread by method, under the first of the delays that are
+evaluated."""
 GAMES = {"spread": SimpleSpread, "tag": SimpleTag}
 
 WORLDS = 256  # an update learns from one episode of each
 MODEL = MlpConfig(hidden=[64, 64])
-LEARNER: dict[str, Any] = {"steps": HORIZON, "lr": 5e-3, "gamma": 0.9, "lmbda": 0.95, "minibatches": 8}
+LEARNER: dict[str, Any] = {
+    "steps": HORIZON,
+    "lr": 5e-3,
+    "gamma": 0.9,
+    "lmbda": 0.95,
+    "minibatches": 8,
+}
 LEARNER |= {"entropy_coeff": 0.003, "normalize_value": True}  # the bonus falls to 0 in the training
 SLOTS = 13  # of a timeline: as old as the longest delay that is evaluated
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
@@ -128,7 +137,8 @@ def make_env(
 
 
 def recompute(method: Method, steps: TensorDictBase, blocks: Tensor) -> Entries:
-    """What critics would have observed after steps [T, B], had these blocks [T, B, K, 2] arrived at once."""
+    """What critics would have observed after steps [T, B], had these blocks [T, B, K, 2] arrived at
+    once."""
     found = observed(steps[next_key(KINEMATICS)], blocks, method.registered)
     return {next_key(keys.GLOBAL_OBSERVATION): found}
 
@@ -172,14 +182,18 @@ def make_learner(env: TransformedEnv, method: Method, longest: int) -> Mappo:
     corrections += [Correction(with_timelines)] * len(corrections)
     size += WORLDS * sum(correction.lookback for correction in corrections)
     names = {"message_key": SEEN, "received_key": HELD, "delay_key": DELAYS, "age_key": AGES}
-    storage = BackupdateStorage(size, partial(recompute, method), longest, corrections=corrections, **names)
+    storage = BackupdateStorage(
+        size, partial(recompute, method), longest, corrections=corrections, **names
+    )
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
 
 def train(method: Method, seed: int, args: Namespace, bar: tqdm) -> nn.Module:
     """Train for at least ``args.frames`` environment steps; returns the policy."""
     frames, longest = args.frames, args.delay[1]
-    env = make_env(method, WORLDS, tuple(args.delay) if method.delayed else NONE, longest, args.game)
+    env = make_env(
+        method, WORLDS, tuple(args.delay) if method.delayed else NONE, longest, args.game
+    )
     set_seed(env, seed)
     learner, done = make_learner(env, method, longest), 0
     collector = Collector(
@@ -224,7 +238,9 @@ def run_method(name: str, seed: int, args: Namespace) -> dict[str, float]:
         with tqdm(total=args.frames, desc=f"seed {seed} {name}") as bar:
             actor = train(method, seed, args, bar)
     return {
-        named(delay): evaluate(make_env(method or Method(), args.episodes, delay, high, args.game), actor)
+        named(delay): evaluate(
+            make_env(method or Method(), args.episodes, delay, high, args.game), actor
+        )
         for delay in dict.fromkeys((*EVALUATED, (low, high)))
     }
 
@@ -241,7 +257,9 @@ def table(results: Results, args: Namespace) -> str:
         rows = csv.writer(file)
         rows.writerow(["method", "delay", "seed", "return"])
         for (method, seed), returns in results.items():
-            rows.writerows([method, delay, seed, f"{found:.2f}"] for delay, found in returns.items())
+            rows.writerows(
+                [method, delay, seed, f"{found:.2f}"] for delay, found in returns.items()
+            )
     trained, flown = named(args.delay), list(next(iter(results.values())))
 
     def mean(method: str, delay: str) -> float:
@@ -262,9 +280,12 @@ def table(results: Results, args: Namespace) -> str:
             lines.append([f"{method}, published", *map(str, returns), *blank])
     text = (
         f"# simple_{args.game}_v3, MAPPO, {args.frames} steps, delays of {trained}: returns\n\n"
-        f"Mean of {args.episodes} episodes and {len(args.seeds)} seeds (smallest and largest of a seed), by "
-        f"delay [steps]. Recovery under {trained}: (method - base) / (undelayed without delay - base); the "
-        f"base is undelayed, flown late.\n\n{markdown_table(['method', *flown, 'recovery'], lines)}\n"
+        f"Mean of {args.episodes} episodes and {len(args.seeds)} seeds (smallest and largest of a "
+        "seed), by "
+        f"delay [steps]. Recovery under {trained}: (method - base) / (undelayed without delay - "
+        "base); the "
+        "base is undelayed, flown "
+        f"late.\n\n{markdown_table(['method', *flown, 'recovery'], lines)}\n"
     )
     (args.out / "table.md").write_text(text, encoding="utf-8")
     return text
@@ -272,8 +293,12 @@ def table(results: Results, args: Namespace) -> str:
 
 def main(words: list[str] | None = None) -> None:
     """Train, evaluate and print the table."""
-    options = parser("MAPPO in games of PettingZoo with late observations.", list(METHODS), "runs/spread")
-    options.add_argument("--game", choices=GAMES, default="spread", help="simple_spread or simple_tag")
+    options = parser(
+        "MAPPO in games of PettingZoo with late observations.", list(METHODS), "runs/spread"
+    )
+    options.add_argument(
+        "--game", choices=GAMES, default="spread", help="simple_spread or simple_tag"
+    )
     options.add_argument(
         "--delay",
         type=int,
@@ -282,7 +307,9 @@ def main(words: list[str] | None = None) -> None:
         metavar=("LOW", "HIGH"),
         help="delays in training [steps]",
     )
-    options.add_argument("--frames", type=int, default=1_000_000, help="training steps of each method")
+    options.add_argument(
+        "--frames", type=int, default=1_000_000, help="training steps of each method"
+    )
     options.add_argument("--episodes", type=int, default=1000, help="episodes of each evaluation")
     args = options.parse_args(words)
     print(table(carried_out(args, run_method), args))

@@ -1,4 +1,5 @@
-"""What the studies of this folder share: their options, and runs by method and seed, each made once."""
+"""What the studies of this folder share: their options, and runs by method and seed, each made
+once."""
 
 import json
 import multiprocessing
@@ -16,15 +17,24 @@ Results = dict[tuple[str, int], dict[str, Any]]
 def parser(description: str, methods: Sequence[str], folder: str) -> ArgumentParser:
     """The command line of a study, with the options that all of them have."""
     found = ArgumentParser(description=description, formatter_class=ArgumentDefaultsHelpFormatter)
-    found.add_argument("--methods", nargs="+", choices=methods, default=list(methods), help="ways to learn")
-    found.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="seeds of each method")
+    found.add_argument(
+        "--methods", nargs="+", choices=methods, default=list(methods), help="ways to learn"
+    )
+    found.add_argument(
+        "--seeds", nargs="+", type=int, default=[0, 1, 2], help="seeds of each method"
+    )
     found.add_argument("--out", type=Path, default=Path(folder), help="folder of the results")
-    found.add_argument("--jobs", type=int, default=1, help="number of processes, each with one thread")
+    found.add_argument(
+        "--jobs", type=int, default=1, help="number of processes, each with one thread"
+    )
     return found
 
 
-def carried_out(args: Namespace, run_method: Callable[[str, int, Namespace], dict[str, Any]]) -> Results:
-    """Carry out every method with every seed, and keep each result in a file; one that has its file is read.
+def carried_out(
+    args: Namespace, run_method: Callable[[str, int, Namespace], dict[str, Any]]
+) -> Results:
+    """Carry out every method with every seed, and keep each result in a file; one that has its file
+    is read.
 
     Args:
         args: of the command line.
@@ -38,12 +48,15 @@ def carried_out(args: Namespace, run_method: Callable[[str, int, Namespace], dic
     }
     args.out.mkdir(parents=True, exist_ok=True)
     stored = {
-        run: json.loads(file.read_text(encoding="utf-8")) for run, file in files.items() if file.exists()
+        run: json.loads(file.read_text(encoding="utf-8"))
+        for run, file in files.items()
+        if file.exists()
     }
     for run, found in stored.items():
         if found["settings"] != settings:
             sys.exit(
-                f"{files[run]} has other settings, {found['settings']}: choose another folder with --out"
+                f"{files[run]} has other settings, {found['settings']}: choose another folder with "
+                "--out"
             )
     todo = [run for run in files if run not in stored]
 

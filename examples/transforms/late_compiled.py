@@ -1,4 +1,5 @@
-"""A step with all of its delays, compiled into one graph: of any environment in PyTorch, and of the UAVs."""
+"""A step with all of its delays, compiled into one graph: of any environment in PyTorch, and of the
+UAVs."""
 
 from typing import Any
 

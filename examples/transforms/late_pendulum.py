@@ -1,4 +1,5 @@
-"""A Gymnasium environment whose observations, actions and rewards are late, and an agent that knows of it."""
+"""A Gymnasium environment whose observations, actions and rewards are late, and an agent that knows
+of it."""
 
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 

@@ -1,4 +1,5 @@
-"""A replay buffer or a dataset of undelayed steps becomes a delayed one: a function to copy, and its use.
+"""A replay buffer or a dataset of undelayed steps becomes a delayed one: a function to copy, and
+its use.
 
 python examples/transforms/late_replay_buffer.py
 """
@@ -27,26 +28,30 @@ _TRAJECTORY = ("collector", "traj_ids")
 def delay_trajectories(
     data: TensorDictBase, transform: Transform, *, action_spec: TensorSpec | None = None
 ) -> TensorDictBase:
-    """Apply transforms to stored steps, as if the environment had had them when the steps were collected.
+    """Apply transforms to stored steps, as if the environment had had them when the steps were
+    collected.
 
-    The result equals, bit for bit, what the same transforms with the same seeds give in the environment, if
-    the actions are the same. A row of ``data`` is a world, and may contain several episodes. A step begins an
-    episode if it is the first of its row, if the step before it is done, if the number ``("collector",
-    "traj_ids")`` says so, or if an entry differs from the one under ``"next"`` one step before. The message
-    of such a step has no delay. Rewards in transit where the data ends or is cut are not paid.
+    The result equals, bit for bit, what the same transforms with the same seeds give in the
+    environment, if the actions are the same. A row of ``data`` is a world, and may contain several
+    episodes. A step begins an episode if it is the first of its row, if the step before it is done,
+    if the number ``("collector", "traj_ids")`` says so, or if an entry differs from the one under
+    ``"next"`` one step before. The message of such a step has no delay. Rewards in transit where
+    the data ends or is cut are not paid.
 
     Args:
-        data: steps as TorchRL stores them, [T] or [*, T]; TensorDicts of agents have batch size [*, T, N].
-        transform: a transform or a ``Compose``; it is copied. ``InputError`` if it changes what happened, as
-            ``ActionDelay`` does.
-        action_spec: ``env.full_action_spec``, which only ``ActionHistory`` needs, for the range of the
-            actions.
+        data: steps as TorchRL stores them, [T] or [*, T]; TensorDicts of agents have batch size
+            [*, T, N].
+        transform: a transform or a ``Compose``; it is copied. ``InputError`` if it changes what
+            happened, as ``ActionDelay`` does.
+        action_spec: ``env.full_action_spec``, which only ``ActionHistory`` needs, for the range of
+            the actions.
     """
     leaves = leaf_transforms(transform)
     for leaf in leaves:
         if leaf.out_keys_inv or any(last_part(key) in ENDS for key in leaf.out_keys):
             raise InputError(
-                f"transform: {type(leaf).__name__} changes which actions are executed or when episodes end, "
+                f"transform: {type(leaf).__name__} changes which actions are executed or when "
+                "episodes end, "
                 "but stored steps show what followed: use it where the steps are collected"
             )
     playback = _Playback(data, _read_action_specs(data, leaves, action_spec))
@@ -72,7 +77,9 @@ class _Playback(EnvBase):
         first, after = self._steps[0], self._steps[0]["next"]
         self._outputs = _output_keys(first)
         ends = [key for key in _leaves(after) if last_part(key) in ENDS]
-        self._inputs = [key for key in _leaves(first.exclude("next")) if key not in [*self._outputs, *ends]]
+        self._inputs = [
+            key for key in _leaves(first.exclude("next")) if key not in [*self._outputs, *ends]
+        ]
         rewards = [key for key in _leaves(after) if key not in [*self._outputs, *ends]]
         self.observation_spec = _specs_of(first, self._outputs)
         self.reward_spec = _specs_of(after, rewards)
@@ -80,7 +87,8 @@ class _Playback(EnvBase):
         self.action_spec = action_spec
 
     def add_inputs(self, outputs: TensorDictBase) -> TensorDictBase:
-        """The outputs before a step, and what is stored beside them: actions, and what the policy wrote."""
+        """The outputs before a step, and what is stored beside them: actions, and what the policy
+        wrote."""
         return outputs.update(self._steps[self._time].select(*self._inputs))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
@@ -118,7 +126,9 @@ def _any(data: TensorDictBase, flag: Tensor) -> Tensor:
 def _output_keys(data: TensorDictBase) -> list[NestedKey]:
     """Keys of the entries, ends excepted, that the data has both before and after each step."""
     after = _leaves(data["next"])
-    return [key for key in _leaves(data.exclude("next")) if key in after and last_part(key) not in ENDS]
+    return [
+        key for key in _leaves(data.exclude("next")) if key in after and last_part(key) not in ENDS
+    ]
 
 
 def _leaves(tensordict: TensorDictBase) -> list[NestedKey]:
@@ -128,17 +138,26 @@ def _leaves(tensordict: TensorDictBase) -> list[NestedKey]:
 def _read_action_specs(
     data: TensorDictBase, transforms: Sequence[Transform], action_spec: TensorSpec | None
 ) -> Composite:
-    """Specs of the actions of one step of the data, from those of an environment of any number of worlds."""
+    """Specs of the actions of one step of the data, from those of an environment of any number of
+    worlds."""
     step, n_batch = data.exclude("next").unbind(-1)[0], data.dim() - 1
-    keys = [transform.action_key for transform in transforms if isinstance(transform, ActionTransform)]
+    keys = [
+        transform.action_key for transform in transforms if isinstance(transform, ActionTransform)
+    ]
     specs = _specs_of(step, [key for key in _leaves(step) if key in keys])
     for key in keys:
         if action_spec is None:
-            raise InputError(f"action_spec: it is needed for the range of {key}: pass env.full_action_spec")
+            raise InputError(
+                f"action_spec: it is needed for the range of {key}: pass env.full_action_spec"
+            )
         spec: Any = action_spec[key] if isinstance(action_spec, Composite) else action_spec
         action = step.get(key)
-        n_worlds = len(spec.shape) - len(action.shape[n_batch:])  # leading dimensions of the spec alone
-        specs[key] = spec[(0,) * n_worlds].expand(action.shape) if n_worlds else spec.expand(action.shape)
+        n_worlds = len(spec.shape) - len(
+            action.shape[n_batch:]
+        )  # leading dimensions of the spec alone
+        specs[key] = (
+            spec[(0,) * n_worlds].expand(action.shape) if n_worlds else spec.expand(action.shape)
+        )
     return specs
 
 
@@ -150,7 +169,9 @@ def _specs_of(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Composit
 
 if __name__ == "__main__":
     buffer = ReplayBuffer(storage=LazyTensorStorage(1000), batch_size=32)
-    buffer.extend(GymEnv("CartPole-v1").rollout(500, break_when_any_done=False))  # many episodes in a row
+    buffer.extend(
+        GymEnv("CartPole-v1").rollout(500, break_when_any_done=False)
+    )  # many episodes in a row
 
     delays = Compose(ObservationDelay(Uniform(1, 4), seed=0), RewardDelay(2, seed=1))
     steps = delay_trajectories(buffer[:], delays)

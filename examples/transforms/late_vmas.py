@@ -11,5 +11,7 @@ delays = Compose(
 )
 env = TransformedEnv(VmasEnv("balance", num_envs=32, n_agents=3), delays)
 set_seed(env, 0)
-age = env.rollout(50, break_when_any_done=False)["agents", "age"]  # [32 worlds, 50 steps, 3 agents, 1]
+age = env.rollout(50, break_when_any_done=False)[
+    "agents", "age"
+]  # [32 worlds, 50 steps, 3 agents, 1]
 print(f"mean age of each agent's observation: {age.mean((0, 1, 3)).tolist()} steps")

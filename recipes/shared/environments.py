@@ -13,7 +13,8 @@ from ..cli import settings
 
 
 def compose_scenario(*overrides: str) -> ScenarioConfig:
-    """The scenario of ``damian train`` with overrides such as ``scenario=tracking``, ``agents=5``."""
+    """The scenario of ``damian train`` with overrides such as ``scenario=tracking``,
+    ``agents=5``."""
     return settings(*overrides)
 
 
@@ -22,8 +23,9 @@ def gymnasium_env(
 ) -> UavGymEnv | UavVectorEnv:
     """A task with one UAV, for ``gymnasium.make("damian/Spotting-v0", overrides=["delay.obs=3"])``.
 
-    With ``num_envs`` it is many worlds, as ``gymnasium.make_vec("damian/Spotting-v0", num_envs=1024)`` makes
-    them. ``options`` are further ones of ``UavGymEnv`` (``seed``, ``render_mode``, ``view``), or ``seed``.
+    With ``num_envs`` it is many worlds, as ``gymnasium.make_vec("damian/Spotting-v0",
+    num_envs=1024)`` makes them. ``options`` are further ones of ``UavGymEnv``
+    (``seed``, ``render_mode``, ``view``), or ``seed``.
     """
     scenario = compose_scenario(f"scenario={task}", "agents=1", *overrides)
     if num_envs is None:

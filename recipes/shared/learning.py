@@ -1,4 +1,5 @@
-"""The parts of a training: environment, learner, replay buffer, and batches between ticks of its clock."""
+"""The parts of a training: environment, learner, replay buffer, and batches between ticks of its
+clock."""
 
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -33,7 +34,8 @@ from ..config import TrainConfig
 from .settings import backupdates, learning_setup, measures_hindsight
 
 BASE_MEMORY, COPIES = 0.6, 2.6
-"""Memory of the program [GiB], and how often it holds each step of the batch and of the buffer at once."""
+"""Memory of the program [GiB], and how often it holds each step of the batch and of the buffer at
+once."""
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
@@ -41,7 +43,10 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     triggered = config.clock.trigger is not None
     messages = measures_hindsight(config.make_delays()) or triggered
     privileged = config.critic == "privileged"
-    reads = {*config.learner.reads} - {"hindsight", "timeline"}  # from the storage, and delay.messages
+    reads = {*config.learner.reads} - {
+        "hindsight",
+        "timeline",
+    }  # from the storage, and delay.messages
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config, config.worlds, config.seed, config.device, extras)
     if config.compiles:
@@ -51,7 +56,8 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
 
 
 def own_code(learner: LearnerConfig) -> AbstractContextManager[None]:
-    """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
+    """A context that names a learner of the user's own in errors; a built-in one keeps its
+    traceback."""
     built_in = type(learner).__module__ == LearnerConfig.__module__
     return nullcontext() if built_in else naming_errors(learner.name)
 
@@ -68,14 +74,17 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
 
 
 def require_delayed_talk(config: TrainConfig, env: DelayedEnv, learner: Learner) -> None:
-    """Refuse an actor by which UAVs read at once in each other's rows what these know late or never."""
+    """Refuse an actor by which UAVs read at once in each other's rows what these know late or
+    never."""
     own, links = config.observation.own and env.delays.obs.late, config.links.kind
     if config.learner.talks or not (own or links != "server"):
         return
     known = "observation.own=true" if own else f"links={links}"
     should = (
-        f"has an actor that reads other UAVs' rows, which with {known} hold what each knows at once: attend "
-        "over blocks of a UAV's own row (docs/extending.md), or give learner.talks=true to let UAVs talk so"
+        f"has an actor that reads other UAVs' rows, which with {known} hold what each knows at "
+        "once: attend "
+        "over blocks of a UAV's own row (docs/extending.md), or give learner.talks=true to let "
+        "UAVs talk so"
     )
     with own_code(config.learner):
         talk = undelayed_talk(learner.actor, env)
@@ -83,7 +92,8 @@ def require_delayed_talk(config: TrainConfig, env: DelayedEnv, learner: Learner)
 
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
-    """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
+    """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct
+    it."""
     setup = learning_setup(config, env.delays)
     with own_code(config.learner):
         size = config.learner.buffer_size(setup)
@@ -92,7 +102,10 @@ def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     if not setup.backupdate:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
     least = setup.least_buffer
-    should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
+    should = (
+        f"is too little for back-updating, which needs {least}: a period and twice the longest "
+        "delay"
+    )
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
     storage = corrected_storage(config, env, config.corrected, size, setup.worlds)
     return ReplayBuffer(storage=storage)
@@ -101,13 +114,16 @@ def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
 def corrected_storage(
     config: TrainConfig, env: DelayedEnv, corrected: Collection[str], size: int, worlds: int
 ) -> BackupdateStorage:
-    """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct steps."""
+    """A storage for ``size`` steps over all ``worlds``, in which late messages and rewards correct
+    steps."""
     late_messages = env.delays.obs.late
     corrected = corrected if late_messages else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
-    # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
-    # The storage then has to keep the newest one.
-    hindsight = "hindsight" in config.learner.reads or (late_messages and config.delay.order == "arrival")
+    # With this order the server may hold an older message than it had before, and a UAV in flight
+    # sends none. The storage then has to keep the newest one.
+    hindsight = "hindsight" in config.learner.reads or (
+        late_messages and config.delay.order == "arrival"
+    )
     return BackupdateStorage(
         size + sum(correction.lookback for correction in corrections) * worlds,
         server_recompute(env.server, corrected) if late_messages else None,
@@ -141,7 +157,8 @@ def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns 
 def make_collector(
     env: TransformedEnv, actor: torch.nn.Module, frames: int, compile: bool = False
 ) -> Collector:
-    """An endless collector of batches of ``frames`` environment steps; ``compile``: with a compiled actor."""
+    """An endless collector of batches of ``frames`` environment steps; ``compile``: with a compiled
+    actor."""
     add_recurrent_state(env, actor)
     return Collector(
         env,
@@ -168,14 +185,23 @@ def ticks(collector: Collector, clock: SystemClock, server: Server) -> Iterator[
 
 
 def read_by(config: TrainConfig, delays: ScenarioDelays, batch: TensorDictBase) -> TensorDictBase:
-    """The entries of a batch [B, T] for the learner, whose replay buffer would keep messages in vain."""
+    """The entries of a batch [B, T] for the learner, whose replay buffer would keep messages in
+    vain."""
     if backupdates(config, delays) or "message" in config.learner.reads:
         return batch
-    sent = (keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.REWARD_DELAY, keys.EARNED_REWARD)
+    sent = (
+        keys.MESSAGE,
+        keys.MESSAGE_SENT,
+        keys.RECEIVED,
+        keys.DELAY,
+        keys.REWARD_DELAY,
+        keys.EARNED_REWARD,
+    )
     return batch.exclude(*sent, *map(keys.next_key, sent))
 
 
 def spotting(batch: TensorDictBase, server: Server) -> torch.Tensor:
-    """Which UAVs spot the source at the end of a batch [B, T], by what the server holds, [B, N] bool."""
+    """Which UAVs spot the source at the end of a batch [B, T], by what the server holds, [B, N]
+    bool."""
     after = cast(TensorDictBase, batch["next"][:, -1])
     return server.messages(after.get(keys.RECEIVED, after[keys.MESSAGE])).spotted

@@ -69,10 +69,13 @@ class Run:
     @property
     def _same_policy(self) -> bool:
         policy = read_record(self.folder).get(POLICY)
-        return policy is None or policy == digest(checkpoint_file(Path(str(self.config.checkpoint))))
+        return policy is None or policy == digest(
+            checkpoint_file(Path(str(self.config.checkpoint)))
+        )
 
     def check(self) -> None:
-        """Check that the folder has no links, and is empty or holds a run with the same settings."""
+        """Check that the folder has no links, and is empty or holds a run with the same
+        settings."""
         check_no_links(self.folder)
         if not (self.folder / CONFIG).exists():
             return
@@ -103,7 +106,9 @@ class Run:
             if (folder / CONFIG).exists() and (folder / CHECKPOINT).exists() and self._same_policy:
                 config = replace(config, resume=str(folder))
             if not config.resume:
-                (folder / RESULTS).unlink(missing_ok=True)  # those of a policy that is not there any more
+                (folder / RESULTS).unlink(
+                    missing_ok=True
+                )  # those of a policy that is not there any more
             remove_unfinished(folder)
             with timed(folder):
                 self.work(config, folder)
@@ -146,9 +151,11 @@ def errors_kept_in(folder: Path, words: Sequence[str], program: str = "train") -
 
 @contextmanager
 def run_settings(given: DictConfig, words: Sequence[str], program: str = "train") -> Iterator[Any]:
-    """The settings of a run, from what Hydra has composed and, if the words name one, from a stored run.
+    """The settings of a run, from what Hydra has composed and, if the words name one, from a stored
+    run.
 
-    If they name a file of settings, only code that the words name too is imported while those are in use.
+    If they name a file of settings, only code that the words name too is imported while those are
+    in use.
     """
     values = plain(given, words, program)
     from_file = any(values.get(key) for key in ("checkpoint", "resume", "journal"))
@@ -185,13 +192,15 @@ def changed_settings(config: TrainConfig, folder: Path, key: str) -> Iterator[tu
 
 
 CROSSES_ZONES = (
-    "with motion=instant nobody lands in a no-fly zone, but ways cross it (motion=polynomial: around it)"
+    "with motion=instant nobody lands in a no-fly zone, but ways cross it (motion=polynomial: "
+    "around it)"
 )
 """What is said of jumps, which take no way at all."""
 
 
 def seed_generators(seed: int) -> None:
-    """Seed the global random generators of torch, NumPy and Python; your own components may use each."""
+    """Seed the global random generators of torch, NumPy and Python; your own components may use
+    each."""
     for set_seed in (torch.manual_seed, np.random.seed, random.seed):
         set_seed(seed)
 
@@ -207,7 +216,9 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
         entries[POLICY] = digest(checkpoint_file(Path(config.checkpoint)))
     write_record(folder, command(), config.resume is not None, **entries)
-    write_atomically(folder / CONFIG, yaml.safe_dump(nested(config), sort_keys=False, allow_unicode=True))
+    write_atomically(
+        folder / CONFIG, yaml.safe_dump(nested(config), sort_keys=False, allow_unicode=True)
+    )
 
 
 def run_folder(written: Path) -> Path:
@@ -216,10 +227,11 @@ def run_folder(written: Path) -> Path:
 
 
 def stored_values(folder: Path, key: str) -> dict[str, Any]:
-    """The settings in a run folder as plain data: no text in them is resolved, and no code is imported.
+    """The settings in a run folder as plain data: no text in them is resolved, and no code is
+    imported.
 
-    ``key`` is the setting that names the folder. Links in the folder are refused: the folder may come from
-    anybody, and nothing outside of it is read, written or deleted for what it says.
+    ``key`` is the setting that names the folder. Links in the folder are refused: the folder may
+    come from anybody, and nothing outside of it is read, written or deleted for what it says.
     """
     file = folder / CONFIG
     if not file.is_file():
@@ -251,9 +263,15 @@ COMMON = {each.name for each in fields(TrainConfig)}
 
 def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> TrainConfig:
     """The settings of a run to resume; only ``frames`` and ``episodes`` may change."""
-    allowed, stored = ("resume", "frames", "episodes", "trust"), read_record(folder).get(OVERRIDES) or ()
+    allowed, stored = (
+        ("resume", "frames", "episodes", "trust"),
+        read_record(folder).get(OVERRIDES) or (),
+    )
     if refused := [word for word in words if key_of(word) not in allowed and word not in stored]:
-        problem = "a resumed run keeps its configuration; only frames= and episodes= may change; checkpoint="
+        problem = (
+            "a resumed run keeps its configuration; only frames= and episodes= may change; "
+            "checkpoint="
+        )
         problem += f"{folder} {refused[0]} begins a new run with its policy"
         raise InputError(f"{refused[0]}: {problem}")
     config = stored_config(folder, "resume")
@@ -264,8 +282,8 @@ def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> Tr
 def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = "train") -> Any:
     """The settings of a run that flies, or begins with, the policy of a stored run.
 
-    Words lie over what is stored: a group's option replaces the settings that its options set, a key its
-    value. What is not mentioned stays, and so do the histories that the policy observes.
+    Words lie over what is stored: a group's option replaces the settings that its options set, a
+    key its value. What is not mentioned stays, and so do the histories that the policy observes.
     """
     stored = stored_config(run_folder(Path(values["checkpoint"])), "checkpoint")
     merged = nested(stored)
@@ -285,14 +303,19 @@ def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = 
 
 
 def reach(key: str, program: str) -> set[str]:
-    """The settings, and whole sections, that a word sets: of a group, those that any of its options sets.
+    """The settings, and whole sections, that a word sets: of a group, those that any of its options
+    sets.
 
     A scenario says nothing of the networks: they are those of the policy.
     """
     known, found = known_settings(program), {key} & known_settings(program).keys()
     for written, chosen in options_in(key):
-        found |= {each for each, setting in known.items() if not setting.is_section and has(written, each)}
-        found |= {name.removeprefix("override /") for name in chosen if name.startswith("override /")}
+        found |= {
+            each for each, setting in known.items() if not setting.is_section and has(written, each)
+        }
+        found |= {
+            name.removeprefix("override /") for name in chosen if name.startswith("override /")
+        }
     return found - {"model"} if key == "scenario" else found or {key}
 
 
@@ -302,7 +325,9 @@ def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
     for key, value in new.items():
         if value != old[key]:
             trained, asked = show(old[key]), show(value)
-            raise InputError(f"{key}: the policy was trained with {trained}, so it cannot fly with {asked}")
+            raise InputError(
+                f"{key}: the policy was trained with {trained}, so it cannot fly with {asked}"
+            )
 
 
 def any_number_of_uavs(config: TrainConfig) -> bool:
@@ -318,11 +343,19 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
     own_actor = type(learner).make_actor is not LearnerConfig.make_actor
     sees_all = learner.actor_follows_critic or not observation.ctde
     discrete = config.actions.kind == "discrete"
-    keys = ["observation.ctde", "observation.local_features", "observation.belief", "observation.age"]
+    keys = [
+        "observation.ctde",
+        "observation.local_features",
+        "observation.belief",
+        "observation.age",
+    ]
     keys += ["observation.timeline", "delay.history", "delay.messages", "actions.kind"]
     return {
         "learner": learner.name if own_actor else "an actor as mappo and sac have",
-        **{key: settings[key] for key in (*keys, *(key for key in settings if key.startswith("model.")))},
+        **{
+            key: settings[key]
+            for key in (*keys, *(key for key in settings if key.startswith("model.")))
+        },
         "observation.global_features": [*observation.global_features] * sees_all,
         "source.count, of a belief": bool(observation.belief) and config.source.count,
         "agents": "any number of UAVs" if any_number_of_uavs(config) else config.agents,

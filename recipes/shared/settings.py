@@ -1,4 +1,5 @@
-"""What follows from the settings of a training: its delays, what a learner needs, and what does not fit."""
+"""What follows from the settings of a training: its delays, what a learner needs, and what does not
+fit."""
 
 from damian import keys
 from damian.common import checks
@@ -74,7 +75,9 @@ def check_learning(config: TrainConfig) -> None:
     _check_backupdate(config, delays.obs.late)
     messages, name = config.delay.messages, config.learner.name
     problem = f"is not read by learner={name}, whose reads have no timeline: leave it out"
-    checks.require(not messages or "timeline" in config.learner.reads, "delay.messages", messages, problem)
+    checks.require(
+        not messages or "timeline" in config.learner.reads, "delay.messages", messages, problem
+    )
 
 
 def _check_backupdate(config: TrainConfig, late_messages: bool) -> None:
@@ -84,8 +87,13 @@ def _check_backupdate(config: TrainConfig, late_messages: bool) -> None:
     unable = "hindsight" in config.learner.reads and no_messages
     checks.require(not unable, "learner", config.learner.name, problem)
     onboard = "actor" in config.corrected and config.links.kind != "server"
-    problem = f"does not go with links={config.links.kind}: an actor sees what links bring, not the server"
+    problem = (
+        f"does not go with links={config.links.kind}: an actor sees what links bring, not the "
+        "server"
+    )
     checks.require(not onboard, "corrected", config.corrected, problem)
     for key, default in (("settle", False), ("corrected", ["reward", "critic"])):
         alone = getattr(config, key) != default and not config.backupdate
-        checks.require(not alone, key, getattr(config, key), "means nothing without backupdate=true")
+        checks.require(
+            not alone, key, getattr(config, key), "means nothing without backupdate=true"
+        )

@@ -1,7 +1,8 @@
-"""Many runs, of a sweep or of a comparison: several at a time, and the tables of what they have found.
+"""Many runs, of a sweep or of a comparison: several at a time, and the tables of what they have
+found.
 
-The rows of all evaluations of a comparison and its learning curves are two CSV files, which are enough for
-all its tables and figures, without the folders of the runs.
+The rows of all evaluations of a comparison and its learning curves are two CSV files, which are
+enough for all its tables and figures, without the folders of the runs.
 """
 
 import json
@@ -47,7 +48,9 @@ MARKDOWN, FIGURE = "table.md", "figure.png"
 def perform_all(runs: Sequence[Run], processes: int) -> list[Run]:
     """Carry out the runs that are not finished, stage after stage; returns those that failed."""
     todo = [run for run in runs if not run.finished]
-    with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
+    with tqdm(
+        total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo
+    ) as bar:
         for stage in sorted({run.stage for run in todo}):
             of_stage = [run for run in todo if run.stage == stage]
             for _ in each_in_processes(_carry_out, of_stage, processes):
@@ -69,8 +72,8 @@ def _carry_out(run: Run) -> None:
         except SystemExit:  # a signal has stopped the training
             raise KeyboardInterrupt from None
         finally:
-            # Torch compiles a function at most eight times in a process. Policies with different observations
-            # share one, so that the ninth would be slow without saying so.
+            # Torch compiles a function at most eight times in a process. Policies with different
+            # observations share one, so that the ninth would be slow without saying so.
             torch.compiler.reset()
 
 
@@ -81,10 +84,13 @@ def labelled_rows(folder: Path, labels: Mapping[str, Any]) -> pd.DataFrame:
 
 
 class SweepReport(Callback):
-    """Reports on a sweep when all of its runs have ended, wherever they were; exit code 1 if one failed."""
+    """Reports on a sweep when all of its runs have ended, wherever they were; exit code 1 if one
+    failed."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        str(config.hydra.sweep.subdir)  # the names of the runs' folders need the words of the whole sweep
+        str(
+            config.hydra.sweep.subdir
+        )  # the names of the runs' folders need the words of the whole sweep
         with one_line_errors():
             check_no_links(short(Path(config.hydra.sweep.dir)))  # where Hydra writes, too
 
@@ -97,23 +103,32 @@ class SweepReport(Callback):
 
 
 def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
-    """The settings in which the finished runs in a folder differ, and a row for each policy of each run."""
+    """The settings in which the finished runs in a folder differ, and a row for each policy of each
+    run."""
     records = {}
     for file in sorted(folder.rglob(RESULTS)):
         check_no_links(file.parent)
         records[file.parent] = read_record(file.parent)
     if not records:
         raise InputError(f"{folder}: there is no {RESULTS} in it, so no run has finished there")
-    runs = sorted(records, key=lambda run: records[run].get(JOB, 0))  # as the command line names them
+    runs = sorted(
+        records, key=lambda run: records[run].get(JOB, 0)
+    )  # as the command line names them
     words = [records[run].get(OVERRIDES, []) for run in runs]
-    given = pd.DataFrame([{key_of(x): x.partition("=")[2] for x in each} for each in words]).fillna("")
+    given = pd.DataFrame([{key_of(x): x.partition("=")[2] for x in each} for each in words]).fillna(
+        ""
+    )
     given = given[[key for key in given if given[key].nunique() > 1 and key != "seed"]]
     for key in given:
         with suppress(ValueError):  # a setting that is no number
             given[key] = pd.to_numeric(given[key])
     tables = []
     for run, settings in zip(runs, given.to_dict("records"), strict=True):
-        labels = {**settings, "seed": records[run].get(SEED), "folder": str(run.relative_to(folder))}
+        labels = {
+            **settings,
+            "seed": records[run].get(SEED),
+            "folder": str(run.relative_to(folder)),
+        }
         tables.append(labelled_rows(run, labels))
     return [*given], pd.concat(tables, ignore_index=True)
 
@@ -123,7 +138,10 @@ def report(folder: Path) -> str:
     failed = [file.parent for file in sorted(folder.rglob(FAILED))]
     for each in (folder, *failed):
         check_no_links(each)
-    errors = [[str(run.relative_to(folder)), json.loads(read_text(run / FAILED))["error"]] for run in failed]
+    errors = [
+        [str(run.relative_to(folder)), json.loads(read_text(run / FAILED))["error"]]
+        for run in failed
+    ]
     parts, rows = [], pd.DataFrame(errors, columns=["folder", "error"])
     if any(folder.rglob(RESULTS)) or not failed:
         groups, finished = sweep_rows(folder)
@@ -139,9 +157,12 @@ def report(folder: Path) -> str:
 
 
 def compared(folders: Sequence[Path], score: str) -> str:
-    """The table of two folders, of runs or sweeps, with the difference of the second to the first."""
+    """The table of two folders, of runs or sweeps, with the difference of the second to the
+    first."""
     found = [sweep_rows(folder) for folder in folders]
-    rows = pd.concat([rows.assign(folder=str(path)) for path, (_, rows) in zip(folders, found, strict=True)])
+    rows = pd.concat(
+        [rows.assign(folder=str(path)) for path, (_, rows) in zip(folders, found, strict=True)]
+    )
     shared = [key for key in found[0][0] if key in found[1][0]]
     return as_table(means(rows, ["folder", *shared], score), ["folder", *shared], score)
 
@@ -162,7 +183,9 @@ class Results(NamedTuple):
 NO_RESULTS = Results(pd.DataFrame(columns=RUN), pd.DataFrame(columns=CURVE))
 
 
-def results_of(runs: Sequence[Run], methods: Mapping[str, Method], kept: Results = NO_RESULTS) -> Results:
+def results_of(
+    runs: Sequence[Run], methods: Mapping[str, Method], kept: Results = NO_RESULTS
+) -> Results:
     """The results of finished runs, and the kept ones of the others."""
     again = pd.MultiIndex.from_frame(pd.DataFrame(map(names_of, runs), columns=RUN))
     others = [old[~pd.MultiIndex.from_frame(old[RUN]).isin(again)] for old in kept]
@@ -200,13 +223,17 @@ def _of_run(run: Run, methods: Mapping[str, Method]) -> Results:
 
 
 def stored_results(folder: Path, key: str = "folder") -> Results:
-    """Read the results that a folder stores, but no curves of a version that drew perceived returns.
+    """Read the results that a folder stores, but no curves of a version that drew perceived
+    returns.
 
     Raises:
         InputError: it is not the folder of a comparison; ``key`` is the setting that names it.
     """
     is_whole = all((folder / name).is_file() for name in (ROWS, POINTS))
-    problem = f"has no {ROWS} beside {POINTS}: give the folder of damian compare, not one of a run or a sweep"
+    problem = (
+        f"has no {ROWS} beside {POINTS}: give the folder of damian compare, not one of a run or a "
+        "sweep"
+    )
     checks.require(is_whole, key, folder, problem)
     check_no_links(folder)
     rows, points = (read_results(folder / name) for name in (ROWS, POINTS))

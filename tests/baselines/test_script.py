@@ -1,4 +1,5 @@
-"""The scripted policy: its choices from the server's messages, and its return beside the random policy's."""
+"""The scripted policy: its choices from the server's messages, and its return beside the random
+policy's."""
 
 import math
 from dataclasses import replace
@@ -32,9 +33,14 @@ SEARCH = RewardConfig(spotted=0.0, spotting_agents=1.0)
 
 
 def field(**changed) -> DelayedEnv:
-    """Three UAVs across a large square, and a source in a corner that none of them hears at first."""
+    """Three UAVs across a large square, and a source in a corner that none of them hears at
+    first."""
     region = RegionConfig(
-        kind="vertices", vertices=FIELD, lattice_step=32.0, initial_conditions=4, start_positions=STARTS
+        kind="vertices",
+        vertices=FIELD,
+        lattice_step=32.0,
+        initial_conditions=4,
+        start_positions=STARTS,
     )
     sections = {
         "region": region,
@@ -46,7 +52,8 @@ def field(**changed) -> DelayedEnv:
 
 
 def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
-    """Landing points to which the policy sends the UAVs of the first world, if all are free, [N, 2]."""
+    """Landing points to which the policy sends the UAVs of the first world, if all are free,
+    [N, 2]."""
     action = script_policy(env)(td)["agents", "action"][0]
     worlds = env.uav_env
     if worlds.scenario.actions.kind == "discrete":
@@ -58,8 +65,11 @@ def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
     return points[torch.cdist(target, points).argmin(-1)]
 
 
-def detection(env: DelayedEnv, place: list[float], ago: float = 0.0, now: float = 9.0) -> TensorDictBase:
-    """A reset's output, changed to time ``now`` [s], with the second UAV's detection ``ago`` [s] earlier."""
+def detection(
+    env: DelayedEnv, place: list[float], ago: float = 0.0, now: float = 9.0
+) -> TensorDictBase:
+    """A reset's output, changed to time ``now`` [s], with the second UAV's detection ``ago`` [s]
+    earlier."""
     td = env.reset()
     held = sent_messages(td)
     second = torch.tensor([False, True, False])
@@ -107,11 +117,15 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
     torch.manual_seed(seed)
     places, times = 400 * torch.rand(2, 2, 3, 2), 8.0 + torch.randint(2, (2, 3))
     detected = torch.minimum(torch.tensor([-1.0, 0.0, 5.0, 9.0])[torch.randint(4, (2, 3))], times)
-    held = sent_messages(env.reset())._replace(time=times, position=places[0], spotted=detected == times)
+    held = sent_messages(env.reset())._replace(
+        time=times, position=places[0], spotted=detected == times
+    )
     in_flight = torch.rand(2, 3) < 0.3
     target = places[0] + 30 * in_flight.unsqueeze(-1)
     held = held._replace(
-        detected_time=detected.unsqueeze(-1), detected_position=places[1].unsqueeze(-2), target=target
+        detected_time=detected.unsqueeze(-1),
+        detected_position=places[1].unsqueeze(-2),
+        target=target,
     )
     ground = policy.points[[0, 0]]
     likely, recent = policy.believe(held, ground, torch.full((2, 1), 9.0))
@@ -119,10 +133,16 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
         ages = [9 - time if time >= 0 else math.inf for time in detected[world].tolist()]
         confidence = TRUST * (1.0 if min(ages) == 0 else 0.7)
         uavs = zip(places[0, world], times[world], spots, in_flight[world], strict=True)
-        silent = [place for place, time, spot, flies in uavs if time == 9 and not spot and not flies]
+        silent = [
+            place for place, time, spot, flies in uavs if time == 9 and not spot and not flies
+        ]
         expected = []
         for place in ground[world].tolist():
-            log = math.log(1 - confidence) if any(math.dist(p, place) <= radius for p in silent) else 0.0
+            log = (
+                math.log(1 - confidence)
+                if any(math.dist(p, place) <= radius for p in silent)
+                else 0.0
+            )
             for age, detected_at in zip(ages, places[1, world].tolist(), strict=True):
                 outside = max(math.dist(detected_at, place) - radius, 0.0)
                 if age < math.inf:
@@ -136,9 +156,14 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
 
 @pytest.mark.parametrize("obs", [0, 3])
 def test_uavs_choose_one_after_the_other_where_their_footprints_hold_most_new_ground(obs):
-    observation = ObservationConfig(global_features=["coverage"], local_features=[], own=obs > 0, window=3)
+    observation = ObservationConfig(
+        global_features=["coverage"], local_features=[], own=obs > 0, window=3
+    )
     scenario = everything(
-        reward=COVER, observation=observation, episode=EpisodeConfig(max_steps=9), delay=DelayConfig(obs=obs)
+        reward=COVER,
+        observation=observation,
+        episode=EpisodeConfig(max_steps=9),
+        delay=DelayConfig(obs=obs),
     )
     env = make_env(scenario, 8, extras=["message"])
     policy, radius = Coverer(env.uav_env), env.uav_env.simulation.radius
@@ -164,7 +189,9 @@ def test_uavs_choose_one_after_the_other_where_their_footprints_hold_most_new_gr
             claimed.append(ends[torch.where(best, flown, torch.inf).argmin()])
 
 
-def ends_and_gains(env: DelayedEnv, region: int, start: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
+def ends_and_gains(
+    env: DelayedEnv, region: int, start: Tensor, weight: Tensor
+) -> tuple[Tensor, ...]:
     """Where each action leads [A, 2], the weight in the footprint there, and the way [m], [A]."""
     simulation = env.uav_env.simulation
     points = simulation.airspace.points[region]
@@ -178,7 +205,8 @@ def ends_and_gains(env: DelayedEnv, region: int, start: Tensor, weight: Tensor) 
 def check_choice(
     env: DelayedEnv, region: int, start: Tensor, weight: Tensor, legal: Tensor, action: Tensor
 ) -> None:
-    """Check that a legal action leads to where the footprint holds most weight, by the shortest flight."""
+    """Check that a legal action leads to where the footprint holds most weight, by the shortest
+    flight."""
     _, gain, flown = ends_and_gains(env, region, start, weight)
     best = legal & (gain == gain[legal].max())
     assert best[action]
@@ -193,7 +221,9 @@ def distances(some: Tensor, others: Tensor) -> Tensor:
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("obs", [0, 2])
-def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_other_worlds(kind, motion, obs):
+def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_other_worlds(
+    kind, motion, obs
+):
     env = make_env(everything(motion, kind, delay=DelayConfig(obs=obs)), 16, extras=["message"])
     policy = script_policy(env)
     rollout = env.rollout(8, policy, break_when_any_done=False)

@@ -27,7 +27,9 @@ def believing(own: bool = False, **changed) -> DelayedEnv:
     sections = {
         "region": region,
         "observation": ObservationConfig(belief=["belief_moments"], own=own),
-        "actions": ActionConfig("discrete", [37.5 * n for n in range(9)], [22.5 * n for n in range(16)]),
+        "actions": ActionConfig(
+            "discrete", [37.5 * n for n in range(9)], [22.5 * n for n in range(16)]
+        ),
     }
     return make_env(square(**(sections | changed)), 1, extras=["message"])
 
@@ -36,7 +38,9 @@ def believing(own: bool = False, **changed) -> DelayedEnv:
 def test_all_uavs_fly_to_where_they_detect_the_source(own):
     env = believing(own=own)
     td, centres = env.reset(), env.server.grid.centres
-    cell = (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()  # the source certainly is there
+    cell = (
+        (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()
+    )  # the source certainly is there
     td[keys.BELIEF] = torch.nn.functional.one_hot(cell, len(centres)).float().view(1, 1, -1)
     if own:
         td[keys.OWN_BELIEF] = td[keys.BELIEF].unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()
@@ -52,5 +56,7 @@ def test_without_a_belief_or_a_reward_for_the_source_the_script_keeps_its_own_ma
         "none": believing(observation=ObservationConfig()),
         "coverage": believing(reward=RewardConfig(spotted=0.0, coverage=1.0)),
     }
-    searches = {name: isinstance(script_policy(env).module, Searcher) for name, env in scripts.items()}
+    searches = {
+        name: isinstance(script_policy(env).module, Searcher) for name, env in scripts.items()
+    }
     assert searches == {"belief": True, "late": True, "none": False, "coverage": False}

@@ -40,7 +40,9 @@ def test_the_comparison_has_a_row_for_each_method_and_a_figure(presets, tmp_path
     (tmp_path / "runs").mkdir()
     text = bench.comparison(presets, TINY)
     names = [*rivals(1), *methods(presets, 1, (BARE, WHOLE), ("eager",))]
-    assert [line.split(" | ")[0] for line in text.strip().splitlines()[4:]] == [f"| {name}" for name in names]
+    assert [line.split(" | ")[0] for line in text.strip().splitlines()[4:]] == [
+        f"| {name}" for name in names
+    ]
     assert (tmp_path / "runs" / "bench.png").exists()
 
 

@@ -22,5 +22,13 @@ def test_a_failed_check_is_one_line(message):
 
 
 def test_times_are_converted_to_seconds():
-    times = {"2s": 2.0, "133ms": 0.133, "0.5m": 30.0, "2min": 120.0, "1h": 3600.0, "1e2s": 100.0, 0.2: 0.2}
+    times = {
+        "2s": 2.0,
+        "133ms": 0.133,
+        "0.5m": 30.0,
+        "2min": 120.0,
+        "1h": 3600.0,
+        "1e2s": 100.0,
+        0.2: 0.2,
+    }
     assert [checks.seconds("key", time) for time in times] == [*times.values()]

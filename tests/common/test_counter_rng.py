@@ -1,4 +1,5 @@
-"""Random numbers as a function of key and counters: the hash, uniformity, and streams of their own."""
+"""Random numbers as a function of key and counters: the hash, uniformity, and streams of their
+own."""
 
 import pytest
 import torch
@@ -18,18 +19,27 @@ def test_the_hash_agrees_with_a_plain_python_implementation():
         return (x ^ x >> 27) * 0x94D049BB133111EB & mask
 
     generator = torch.Generator().manual_seed(0)
-    keys, first, second = (torch.randint(-(2**63), 2**63 - 1, (500,), generator=generator) for _ in range(3))
+    keys, first, second = (
+        torch.randint(-(2**63), 2**63 - 1, (500,), generator=generator) for _ in range(3)
+    )
     found = counter_rng.bits64(keys, first, second)
-    numbers = zip(*((x % 2**64 for x in column.tolist()) for column in (keys, first, second)), strict=True)
-    before = [(key ^ key >> 31, other) for key, other in ((mixed(k, one), o) for k, one, o in numbers)]
+    numbers = zip(
+        *((x % 2**64 for x in column.tolist()) for column in (keys, first, second)), strict=True
+    )
+    before = [
+        (key ^ key >> 31, other) for key, other in ((mixed(k, one), o) for k, one, o in numbers)
+    ]
     expected = [mixed(key, other) for key, other in before]
     assert [x % 2**64 for x in found.tolist()] == [x ^ x >> 31 for x in expected]
     assert counter_rng.bits(keys, first, second).tolist() == [x >> 32 for x in expected]
-    assert counter_rng.uniform(keys, first, second).tolist() == [(x >> 40) / 2**24 for x in expected]
+    assert counter_rng.uniform(keys, first, second).tolist() == [
+        (x >> 40) / 2**24 for x in expected
+    ]
 
 
 def chi_square(draws, n_bins=64):
-    """Pearson's statistic of uniform draws, standardised: about normal(0, 1) if they are uniform."""
+    """Pearson's statistic of uniform draws, standardised: about normal(0, 1) if they are
+    uniform."""
     counts = torch.histc(draws.double(), bins=n_bins, min=0, max=1)
     expected = draws.numel() / n_bins
     statistic = ((counts - expected).square() / expected).sum().item()
@@ -56,8 +66,12 @@ def test_each_stream_is_uniform_and_its_draws_do_not_follow_from_earlier_ones(ke
 
 
 def test_no_stream_is_a_section_of_another():
-    """Streams that are sections of one sequence share runs of numbers; streams of their own share none."""
+    """Streams that are sections of one sequence share runs of numbers; streams of their own share
+    none."""
     keys = counter_rng.world_seeds(0, 4096)
     assert overlaps(counter_rng.bits64(keys.unsqueeze(-1), torch.arange(500))) == 0
     shifted = torch.arange(4096) * 100  # what the check would find otherwise
-    assert overlaps(counter_rng.bits64(torch.tensor(0), shifted.unsqueeze(-1) + torch.arange(500))) > 1000
+    assert (
+        overlaps(counter_rng.bits64(torch.tensor(0), shifted.unsqueeze(-1) + torch.arange(500)))
+        > 1000
+    )

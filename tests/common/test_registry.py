@@ -28,7 +28,9 @@ def test_a_registered_component_is_found_by_its_name_and_read_with_its_parameter
     assert registry.get("plain", "greeting")() == "hello"
     assert list(registry) == ["plain"]
     assert "plain" in registry
-    path, function, parameters = registry.read({"greeting": "plain", "to": "all"}, "key", "greeting")
+    path, function, parameters = registry.read(
+        {"greeting": "plain", "to": "all"}, "key", "greeting"
+    )
     assert (path, function(), parameters) == ("plain", "hello", {"to": "all"})
     check_parameters(polite, {"to": "all"}, path, "key")
 
@@ -70,10 +72,16 @@ def test_an_installed_package_registers_names_by_its_entry_point(tmp_path, monke
 
 REFUSED = {
     "key: rude is not one of plain, nor a path such as": lambda: greetings().get("rude", "key"),
-    "key: nowhere:x: No module named 'nowhere'; nowhere must": lambda: greetings().get("nowhere:x", "key"),
+    "key: nowhere:x: No module named 'nowhere'; nowhere must": lambda: greetings().get(
+        "nowhere:x", "key"
+    ),
     "key: math:pi is not a function": lambda: greetings().get("math:pi", "key"),
-    "key: math:pi is not an int": lambda: Registry("int", int, "is not an int").get("math:pi", "key"),
-    "key.too: 1 is not a parameter of plain": lambda: check_parameters(polite, {"too": 1}, "plain", "key"),
+    "key: math:pi is not an int": lambda: Registry("int", int, "is not an int").get(
+        "math:pi", "key"
+    ),
+    "key.too: 1 is not a parameter of plain": lambda: check_parameters(
+        polite, {"too": 1}, "plain", "key"
+    ),
 }
 
 
@@ -88,5 +96,7 @@ def test_what_cannot_be_used_is_said_in_one_line(message):
 def test_an_import_that_fails_inside_the_module_blames_its_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "blame.py").write_text("\n\nimport no_such_package\n")
-    with pytest.raises(InputError, match=r"importing it raised ModuleNotFound.*: .* \(blame\.py, line 3\)"):
+    with pytest.raises(
+        InputError, match=r"importing it raised ModuleNotFound.*: .* \(blame\.py, line 3\)"
+    ):
         greetings().get("blame:formal", "greeting")

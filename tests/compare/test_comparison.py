@@ -34,7 +34,9 @@ def row(task: str, delay: str, method: str, seed: int, value: float, policy: str
     )
 
 
-def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
+def rows_of(
+    task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0
+) -> list[dict]:
     """Rows of every method, seed and policy, from the values of the methods by seed."""
     return [
         row(task, "none" if method == "best" else delay, method, seed, x, policy)
@@ -47,14 +49,24 @@ def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float
 def comparison(
     rows: list[dict] | pd.DataFrame, methods: dict[str, Method] = METHODS, curves: list = ()
 ) -> Comparison:
-    columns = ["task", "delay", "method", "seed", "frames", "hindsight_return", "perceived_success_rate"]
+    columns = [
+        "task",
+        "delay",
+        "method",
+        "seed",
+        "frames",
+        "hindsight_return",
+        "perceived_success_rate",
+    ]
     return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), methods)
 
 
 def compared(found: Comparison) -> dict[str, dict]:
     """Lines of the delayed methods of a table by method."""
     table = found.table
-    lines = table[(table["delay"] != "none") & (table["policy"] == TRAINED) | (table["method"] == "prior")]
+    lines = table[
+        (table["delay"] != "none") & (table["policy"] == TRAINED) | (table["method"] == "prior")
+    ]
     return {line["method"]: line for line in lines.to_dict("records")}
 
 
@@ -66,12 +78,16 @@ def test_a_table_from_before_a_metric_existed_has_an_empty_column(tmp_path):
     write_csv(tmp_path / "results.csv", stored)
     rows = read_results(tmp_path / "results.csv").assign(**{"lab:other": 2.0})
     assert rows["lost"].isna().all()
-    (line,) = [line for line in comparison(rows).table.to_dict("records") if line["policy"] == RANDOM][:1]
+    (line,) = [
+        line for line in comparison(rows).table.to_dict("records") if line["policy"] == RANDOM
+    ][:1]
     assert (line["return"], line["lab:other"]) == (0.0, 2.0)
     assert np.isnan(line["lost"])
     lines = means(rows, [], "perceived_steps")
     assert {"lab:other", "perceived_steps"} <= {*lines}
-    with pytest.raises(InputError, match="score: lab:unknown is not stored, only success_rate, steps"):
+    with pytest.raises(
+        InputError, match="score: lab:unknown is not stored, only success_rate, steps"
+    ):
         means(rows, [], "lab:unknown")
 
 
@@ -85,7 +101,9 @@ def test_recovery_counts_from_the_stronger_naive_method_by_means_over_seeds():
     assert aware["J_norm"] == 7.5 / 10
     assert aware["recovery"] == (7.5 - 4) / (10 - 4)
     assert aware["improvement"] == 1
-    assert np.isnan([aware["J_norm_low"], aware["recovery_high"]]).all()  # two seeds give no interval
+    assert np.isnan(
+        [aware["J_norm_low"], aware["recovery_high"]]
+    ).all()  # two seeds give no interval
     assert lines["blind"]["J_norm"] == 3 / 10
     assert np.isnan(
         [lines[naive][name] for naive in ("blind", "flown") for name in ("recovery", "improvement")]
@@ -95,10 +113,14 @@ def test_recovery_counts_from_the_stronger_naive_method_by_means_over_seeds():
 def test_a_method_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
     rows = rows_of("t", "late", THREE)
     alone = compared(comparison(rows))
-    lines = compared(comparison([row for row in rows if (row["method"], row["seed"]) != ("aware", 2)]))
+    lines = compared(
+        comparison([row for row in rows if (row["method"], row["seed"]) != ("aware", 2)])
+    )
     assert lines["aware"]["compared_seeds"] == 2
     assert str(lines["blind"]) == str(alone["blind"])  # an unfinished method changes no other one
-    lines = compared(comparison([row for row in rows if (row["method"], row["seed"]) != ("blind", 0)]))
+    lines = compared(
+        comparison([row for row in rows if (row["method"], row["seed"]) != ("blind", 0)])
+    )
     assert [lines[method]["compared_seeds"] for method in ("blind", "flown", "aware")] == [2] * 3
 
 
@@ -116,7 +138,11 @@ def test_a_table_has_every_method_and_policy_with_intervals_and_its_regime():
         ("late", RANDOM, RANDOM),
     ]
     cells = table.loc[7]
-    assert [cells[name] for name in ("method", "regime", "policy")] == ["aware", "late data", TRAINED]
+    assert [cells[name] for name in ("method", "regime", "policy")] == [
+        "aware",
+        "late data",
+        TRAINED,
+    ]
     assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
     assert cells["return_low"] < cells["return"] < cells["return_high"]
     assert cells["improvement"] == cells["improvement_high"] == 1
@@ -127,7 +153,9 @@ def test_a_recovery_is_from_the_naive_method_of_the_same_track_if_the_delay_cost
     scores = SCORES | {"flown": [9.0, 9.5]}  # as good as undelayed
     lines = compared(comparison(rows_of("t", "late", scores)))
     assert shown(lines["aware"], "recovery") == "-"
-    methods = METHODS | {"flown": Method(naive=True, policy_of="best")}  # not the reference of late data
+    methods = METHODS | {
+        "flown": Method(naive=True, policy_of="best")
+    }  # not the reference of late data
     lines = compared(comparison(rows_of("t", "late", scores), methods))
     assert lines["aware"]["recovery"] == pytest.approx((7.5 - 3) / (10 - 3))
     assert np.isnan(lines["flown"]["recovery"])  # the strongest naive method of its track
@@ -143,14 +171,17 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_a_method_of_i
     assert [*lines["method"]] == ["aware", "prior"]
     assert (lines["return"] == 2.5).all()
     aware, prior = lines.to_dict("records")
-    assert aware["compared_seeds"] == 0  # only the trained policy of a method is compared with others
+    assert (
+        aware["compared_seeds"] == 0
+    )  # only the trained policy of a method is compared with others
     assert prior["J_norm"] == pytest.approx(2.5 / 10)
     assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
 
 
 def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_method():
-    # Straight learning curves over 100 steps: the mean of the naive one ends with 4, of the aware one with 8.
-    # The mean over the last tenth of the steps lags a straight curve by a twentieth of them, 5 steps.
+    # Straight learning curves over 100 steps: the mean of the naive one ends with 4, of the aware
+    # one with 8. The mean over the last tenth of the steps lags a straight curve by a twentieth of
+    # them, 5 steps.
     ends = {
         ("t", "late", "blind"): [3.0, 5.0],
         ("t", "late", "aware"): [3.0, 13.0],
@@ -164,7 +195,10 @@ def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_method
     ]
     lines = markdown(comparison(rows_of("t", "late", SCORES), METHODS, points), []).splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.endswith("of *blind*, 3.8:")) :]
-    rows = {method: numbers for method, *numbers in (line.strip("| ").split(" | ") for line in table[4:7])}
+    rows = {
+        method: numbers
+        for method, *numbers in (line.strip("| ").split(" | ") for line in table[4:7])
+    }
     assert rows["best"] == ["15", "15", "15"]
     assert rows["aware"] == ["53", "34", "never"]
     assert rows["blind"] == ["100", "81", "never"]

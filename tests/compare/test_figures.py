@@ -1,4 +1,5 @@
-"""Figures of comparisons and sweeps: colours that everybody can tell apart, and what stands where."""
+"""Figures of comparisons and sweeps: colours that everybody can tell apart, and what stands
+where."""
 
 import itertools
 
@@ -14,7 +15,11 @@ from damian.compare.paired import means
 TO_CONES = [[0.41222, 0.53633, 0.05145], [0.21190, 0.68070, 0.10740], [0.08830, 0.28172, 0.62998]]
 TO_LAB = [[0.21045, 0.79362, -0.00407], [1.97800, -2.42859, 0.45059], [0.02590, 0.78277, -0.80868]]
 """Björn Ottosson (2020), "A perceptual color space for image processing" (OKLab)."""
-DEUTERANOPIA = [[0.36732, 0.86065, -0.22797], [0.28009, 0.67250, 0.04741], [-0.01182, 0.04294, 0.96888]]
+DEUTERANOPIA = [
+    [0.36732, 0.86065, -0.22797],
+    [0.28009, 0.67250, 0.04741],
+    [-0.01182, 0.04294, 0.96888],
+]
 """What is seen without green receptors, in linear RGB (Machado, Oliveira and Fernandes 2009)."""
 
 
@@ -24,7 +29,9 @@ def oklab(colour: str, seen: np.ndarray) -> np.ndarray:
     return np.array(TO_LAB) @ np.cbrt(np.array(TO_CONES) @ (seen @ linear).clip(0, 1))
 
 
-@pytest.mark.parametrize("seen", [np.eye(3), np.array(DEUTERANOPIA)], ids=["all receptors", "deuteranopia"])
+@pytest.mark.parametrize(
+    "seen", [np.eye(3), np.array(DEUTERANOPIA)], ids=["all receptors", "deuteranopia"]
+)
 def test_colours_of_methods_are_far_apart(seen):
     places = [oklab(colour, seen) for colour in METHOD_COLOURS]
     pairs = itertools.combinations(places, 2)
@@ -55,9 +62,14 @@ def test_a_sweep_has_a_panel_for_each_value_with_the_other_panels_in_grey(tmp_pa
     assert (first.get_title(), second.get_title()) == ("aware=none", "aware=timeline")
     assert first.get_xlabel() == "delay.obs"
     trained, (error,) = first.containers[0][0], first.containers[0][2]
-    found = {line.get_label(): line.get_xydata().tolist() for line in first.lines if line is not trained}
+    found = {
+        line.get_label(): line.get_xydata().tolist() for line in first.lines if line is not trained
+    }
     assert found == {"other panels": [[4, 7]], "script": [[0, -1], [4, -8]]}
     assert trained.get_xydata().tolist() == [[0, 9], [4, 2]]
     low, high = error.get_segments()[1][:, 1]
     assert low < 2 < high
-    assert [label.get_text() for label in drawn[1].axes[0].get_xticklabels()] == ["none", "timeline"]
+    assert [label.get_text() for label in drawn[1].axes[0].get_xticklabels()] == [
+        "none",
+        "timeline",
+    ]

@@ -63,7 +63,9 @@ def test_95_percent_intervals_contain_the_truth_in_95_percent_of_all_experiments
 
 @pytest.mark.parametrize("n_seeds", [3, 5, 10])
 @pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 3.0])
-def test_the_interval_of_an_improvement_contains_the_truth_in_95_percent_of_all_experiments(n_seeds, shift):
+def test_the_interval_of_an_improvement_contains_the_truth_in_95_percent_of_all_experiments(
+    n_seeds, shift
+):
     ours, theirs = np.random.default_rng(1).normal(size=(2, 2000, n_seeds))
     found = probability_of_improvement(ours + shift, theirs)
     truth = (1 + math.erf(shift / 2)) / 2  # of two normal scores whose means differ by ``shift``
@@ -79,7 +81,9 @@ RLIABLE = [(4, 0.5208333333333334), (8, 0.515625), (12, 0.44675925925925924)]
 @pytest.mark.parametrize(("n_seeds", "improvement"), RLIABLE)
 def test_the_probability_of_improvement_is_that_of_rliable(n_seeds, improvement):
     ours, theirs = np.random.default_rng(n_seeds).normal(size=(2, n_seeds, 3))
-    assert probability_of_improvement(ours.T, theirs.T).mean() == pytest.approx(improvement, abs=1e-12)
+    assert probability_of_improvement(ours.T, theirs.T).mean() == pytest.approx(
+        improvement, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(("n_nans", "ends"), [(0, (2, 97)), (1, (1, 98)), (10, (-np.inf, np.inf))])

@@ -22,11 +22,17 @@ def delays(**settings) -> ScenarioDelays:
 
 
 INVALID_LAWS = [
-    (-1, ": -1 is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7"),
+    (
+        -1,
+        ": -1 is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7",
+    ),
     ("3x", ": 3x is not a delay"),
     ("3h", f": 3h is more than {LONGEST} steps"),
     ({"law": "gauss"}, ".law: gauss is not one of constant, uniform, geometric, burst, trace"),
-    ({"law": "uniform", "high": 2.5}, ".high: 2.5 is neither a number of steps >= 0 (3) nor a time (3s"),
+    (
+        {"law": "uniform", "high": 2.5},
+        ".high: 2.5 is neither a number of steps >= 0 (3) nor a time (3s",
+    ),
     ({"law": "uniform", "low": 4, "high": 2}, ".low: 4 and high=2 are not two steps or two times"),
     ({"law": "burst", "bad": {"law": "burst"}}, ".bad: {'law': 'burst'} is not a memoryless law"),
     ({"law": "distance", "speed": math.nan}, ".speed: nan m/s is not above 0 m/s"),
@@ -96,7 +102,9 @@ def test_a_law_that_forgets_the_loss_is_refused():
 def test_a_law_that_reads_what_there_is_not_is_refused():
     with pytest.raises(InputError, match="has no key for position, which the delay law reads"):
         ObservationDelay(Crowd())
-    with pytest.raises(InputError, match=r"delay.act: .* reads altitude, but a law can read only position"):
+    with pytest.raises(
+        InputError, match=r"delay.act: .* reads altitude, but a law can read only position"
+    ):
         delays(act=Crowd("altitude"))
     env = delayed(ActionDelay(Crowd("seen"), ACTION, context_keys={"seen": "speed"}))
     with pytest.raises(InputError, match=r"ActionDelay: .*speed.* is not among the keys"):

@@ -13,7 +13,12 @@ from damian.delays.laws import sampler_of
 
 UNIFORM = {"law": "uniform", "low": 3, "high": 7}
 BURST = {"law": "burst", "enter": 0.05, "leave": 0.2, "good": 1, "bad": UNIFORM, "bad_loss": 0.3}
-LAWS = [3, UNIFORM, {**UNIFORM, "probability": 0.15}, {"law": "geometric", "mean": 2.5, "longest": 6}]
+LAWS = [
+    3,
+    UNIFORM,
+    {**UNIFORM, "probability": 0.15},
+    {"law": "geometric", "mean": 2.5, "longest": 6},
+]
 LOSSES = {**BURST, "good": 0, "bad": 0, "bad_loss": 1.0}
 
 
@@ -37,7 +42,9 @@ def check_alike(found, law) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("law", "loss"), [*product(LAWS, (0.0, 0.1)), (BURST, 0.0), (LOSSES, 0.0)], ids=str)
+@pytest.mark.parametrize(
+    ("law", "loss"), [*product(LAWS, (0.0, 0.1)), (BURST, 0.0), (LOSSES, 0.0)], ids=str
+)
 def test_a_law_is_found_again(law, loss, seed):
     best, own = fit_laws(drawn(law, loss, seed))
     check_alike(best.written, law)

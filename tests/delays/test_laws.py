@@ -1,4 +1,5 @@
-"""Delay laws: frequencies of delays and losses, playback of traces, and how a setting becomes a law."""
+"""Delay laws: frequencies of delays and losses, playback of traces, and how a setting becomes a
+law."""
 
 import math
 from importlib.resources import files
@@ -23,7 +24,8 @@ def sample(sampler: Sampler, n_streams: int = STREAMS, n_steps: int = STEPS) -> 
 
 
 def check_chances(sampler: Sampler, chances: dict[int, float], delays: Tensor) -> None:
-    """Compare the frequencies of delays with exact probabilities, within five deviations of chi-square.
+    """Compare the frequencies of delays with exact probabilities, within five deviations of
+    chi-square.
 
     If the probabilities sum to less than 1, the rest is the probability of a loss.
     """
@@ -51,7 +53,11 @@ LAWS: dict[str, tuple[Law, float, dict[int, float]]] = {
     "the paper's": (PAPER, 1.0, {0: 0.85} | dict.fromkeys((4, 5, 6, 7), 0.0375)),
     "the paper's at a coarser step": (PAPER, 2.0, {0: 0.85, 2: 0.0375, 3: 0.075, 4: 0.0375}),
     "uniform within a step": (Uniform("0.5s", "2s"), 1.0, {1: 1 / 3, 2: 2 / 3}),
-    "geometric": (Geometric(2, 6), 1.0, {k: 2**k / 3 ** (k + 1) for k in range(6)} | {6: (2 / 3) ** 6}),
+    "geometric": (
+        Geometric(2, 6),
+        1.0,
+        {k: 2**k / 3 ** (k + 1) for k in range(6)} | {6: (2 / 3) ** 6},
+    ),
     "a burst that never ends": (Burst(leave=0.0, bad=2, bad_loss=0.25), 1.0, {2: 0.75}),
 }
 
@@ -61,7 +67,9 @@ LAWS: dict[str, tuple[Law, float, dict[int, float]]] = {
 def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
     law, dt, chances = LAWS[name]
     sampler = law.sampler(dt, loss)
-    check_chances(sampler, {k: chance * (1 - loss) for k, chance in chances.items()}, sample(sampler))
+    check_chances(
+        sampler, {k: chance * (1 - loss) for k, chance in chances.items()}, sample(sampler)
+    )
     if loss == 0 and not isinstance(law, Burst):
         only = next(iter(chances)) if [*chances.values()] == [1.0] else None
         assert sampler.constant_delay == only
@@ -94,7 +102,9 @@ def test_a_channel_changes_state_with_its_probabilities_so_that_a_burst_lasts_1_
 def test_losses_of_the_channel_state_and_general_losses_combine():
     law = Burst(enter=0.5, leave=0.5, good=1, bad=PAPER, good_loss=0.1, bad_loss=0.5)
     sampler, kept = law.sampler(loss=0.2), 0.5 * 0.8
-    chances = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys((4, 5, 6, 7), 0.0375 * 0.5 * kept)
+    chances = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys(
+        (4, 5, 6, 7), 0.0375 * 0.5 * kept
+    )
     # Transition probabilities of 1/2 make the states of successive steps independent.
     check_chances(sampler, chances, sample(sampler))
 
@@ -130,7 +140,9 @@ def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
     sampler = trace(tmp_path, *rows, header="when,delay").sampler(dt=1.5)
     assert (sampler.longest, sampler.lost, sampler.constant_delay) == (4, 5, None)
     first = sample(sampler, 100, 5).T.tolist()
-    assert {tuple(row) for row in first} == {tuple(([2, 5, 3, 0, 4] * 2)[k : k + 5]) for k in range(5)}
+    assert {tuple(row) for row in first} == {
+        tuple(([2, 5, 3, 0, 4] * 2)[k : k + 5]) for k in range(5)
+    }
 
 
 @pytest.mark.parametrize(
@@ -140,7 +152,10 @@ def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
         ("3s", Constant("3s")),
         (Uniform(1, 2), Uniform(1, 2)),
         ({"law": "geometric", "mean": 1.5, "longest": "9"}, Geometric(1.5, 9)),
-        ({"law": "burst", "bad": {"law": "uniform", "high": 3}}, Burst(bad={"law": "uniform", "high": 3})),
+        (
+            {"law": "burst", "bad": {"law": "uniform", "high": 3}},
+            Burst(bad={"law": "uniform", "high": 3}),
+        ),
     ],
 )
 def test_a_law_is_given_as_steps_a_time_or_a_mapping(setting, law):

@@ -27,7 +27,10 @@ def table(numbered: bool = True, period: float = 1.0, uavs: int = 2, start: floa
                 time = start + i * period
                 rows.append((time + delay, f"u{uav}", time, i if numbered else "NA"))
     rows.append(rows[3])
-    lines = [f"{uav},{time},{received},53.1,-4.5,{number}" for received, uav, time, number in sorted(rows)]
+    lines = [
+        f"{uav},{time},{received},53.1,-4.5,{number}"
+        for received, uav, time, number in sorted(rows)
+    ]
     return "\n".join(["ID,time,receive time,lat,lon,sequence", *lines])
 
 
@@ -52,7 +55,9 @@ def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, period):
     rows = trace_rows(fitted)
     found = [None if row == "lost" else float(row.removesuffix("s")) for row in rows]
     assert found == [None if d is None else pytest.approx(d, abs=1e-6) for d in DELAYS * 2]
-    assert summary(fitted).startswith(f"22 messages of 2 UAVs over {10 * period:.0f} s; lost: 6 (27.3%)")
+    assert summary(fitted).startswith(
+        f"22 messages of 2 UAVs over {10 * period:.0f} s; lost: 6 (27.3%)"
+    )
 
 
 def test_without_numbers_no_loss_can_be_seen(log):
@@ -90,27 +95,39 @@ def test_numbered_reports_of_one_second_are_different_messages_also_without_plac
 
 
 @pytest.mark.parametrize(("shift", "said"), [(-2.0, "1.5 s before"), (3600.0, "3.6e+03 s after")])
-def test_clocks_that_differ_are_named_before_anything_is_written(log, tmp_path, capsys, shift, said):
-    lines = [f"{uav},{i},{i + 0.5 + own}" for i in range(10, 30) for uav, own in (("A", 0), ("B", shift))]
+def test_clocks_that_differ_are_named_before_anything_is_written(
+    log, tmp_path, capsys, shift, said
+):
+    lines = [
+        f"{uav},{i},{i + 0.5 + own}" for i in range(10, 30) for uav, own in (("A", 0), ("B", shift))
+    ]
     path = log("\n".join(["ID,time,receive time", *lines]))
     with pytest.raises(SystemExit):
         main(["fit", f"log={path}", f"hydra.run.dir={tmp_path / 'run'}"])
     (line,) = capsys.readouterr().err.splitlines()
-    start = f"error: {path}: the clocks of B and of the receiver differ: receive times are in the median"
+    start = (
+        f"error: {path}: the clocks of B and of the receiver differ: receive times are in the "
+        "median"
+    )
     assert line.startswith(f"{start} {said} times; correct one of them")
     assert not (tmp_path / "run" / "trace.csv").exists()
 
 
 def test_a_few_messages_that_came_in_before_their_time_are_named(log):
     few = log("\n".join(["ID,time,receive time", "A,0,0.5", "A,1,0.8", "A,2,2.5"]))
-    told = "1 came in before their time, because clocks differ, and count as 0 s late; the earliest by 0.2 s"
+    told = (
+        "1 came in before their time, because clocks differ, and count as 0 s late; the earliest "
+        "by 0.2 s"
+    )
     assert summary(fitted_log(few)).endswith(told)
 
 
 def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys, monkeypatch):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure.axes[0]))
-    lines = [f"A,{i},{i + (5.5 if i % 25 < 5 else 0.5)},53.1,-4.5,{i}" for i in range(500) if i % 25]
+    lines = [
+        f"A,{i},{i + (5.5 if i % 25 < 5 else 0.5)},53.1,-4.5,{i}" for i in range(500) if i % 25
+    ]
     path = log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))
     main(["fit", f"log={path}", f"hydra.run.dir={tmp_path / 'run'}"])
     *_, law, _, bad, _ = capsys.readouterr().out.splitlines()
@@ -133,11 +150,14 @@ def test_the_law_of_the_delays_is_a_setting_and_a_picture(log, tmp_path, capsys,
 @pytest.mark.parametrize(
     ("row", "said"),
     [
-        ("A,noon,3,1", "line 3: time: 'noon' is neither seconds nor a date of ISO 8601"),
-        ("A,1.7e12,3,1", "line 3: time: 1.7e12: give seconds since 1970, no milliseconds or microseconds"),
-        ("A,1,NA,1", "line 3: it needs ID, time and receive time, or ID, time and AoI"),
-        ("NA,1,2,1", "line 3: it needs ID, time and receive time, or ID, time and AoI"),
-        ("A,1,2,one", "line 3: sequence: 'one' is not the number of a report"),
+        ("A,noon,3,1", "line 3: time: 'noon' is neither a number nor a date of ISO 8601"),
+        (
+            "A,1.7e12,3,1",
+            "line 3: time: 1.7e12: give seconds since 1970, no milliseconds or microseconds",
+        ),
+        ("A,1,NA,1", "line 3: it needs ID, and two of time, receive time and AoI"),
+        ("NA,1,2,1", "line 3: it needs ID, and two of time, receive time and AoI"),
+        ("A,1,2,one", "line 3: number: 'one' is neither a number nor a date of ISO 8601"),
     ],
 )
 def test_what_is_no_report_is_refused_with_its_line(log, row, said):
@@ -148,4 +168,7 @@ def test_what_is_no_report_is_refused_with_its_line(log, row, said):
 
 
 def test_the_age_of_a_report_tells_when_it_came_in(log):
-    assert trace_rows(fitted_log(log("ID,time,AoI\nA,1,0.5\nA,2,0.25\n"))) == ["0.500000s", "0.250000s"]
+    assert trace_rows(fitted_log(log("ID,time,AoI\nA,1,0.5\nA,2,0.25\n"))) == [
+        "0.500000s",
+        "0.250000s",
+    ]

@@ -1,4 +1,5 @@
-"""Samplers of laws that hold delays or read the context: frequencies, rounding, and what they tell."""
+"""Samplers of laws that hold delays or read the context: frequencies, rounding, and what they
+tell."""
 
 import math
 
@@ -15,7 +16,8 @@ SENDERS = 20_000
 
 
 def require_share(found: Tensor, expected: float) -> None:
-    """Is the share of true flags as expected, within five standard deviations of a binomial distribution?"""
+    """Is the share of true flags as expected, within five standard deviations of a binomial
+    distribution?"""
     deviation = math.sqrt(max(expected * (1 - expected), 1e-9) / found.numel())
     assert abs(found.double().mean().item() - expected) < 5 * deviation
 
@@ -24,7 +26,8 @@ def require_share(found: Tensor, expected: float) -> None:
 
 
 class Doubling(Sampler):
-    """The state is a float, which doubles with every message: 0.4, 0.8, 1.6, ... steps, rounded down."""
+    """The state is a float, which doubles with every message: 0.4, 0.8, 1.6, ... steps, rounded
+    down."""
 
     def __init__(self) -> None:
         super().__init__(3, loses=False)
@@ -54,13 +57,20 @@ def context_of(uniform: Tensor, dt: float = 1.0, **entries: Tensor) -> MessageCo
     return MessageContext(zero, zero - 1, zero + 1, zero.float(), uniform, dt, entries)
 
 
-@pytest.mark.parametrize(("loses", "expected"), [(True, [6, 5, 6, 3, 5, 0]), (False, [0, 5, 0, 3, 5, 0])])
+@pytest.mark.parametrize(
+    ("loses", "expected"), [(True, [6, 5, 6, 3, 5, 0]), (False, [0, 5, 0, 3, 5, 0])]
+)
 def test_delays_are_rounded_up_and_cut_and_negative_ones_are_lost(loses, expected):
     values = torch.tensor([math.nan, math.inf, -0.5, 2.1, 99.0, 0.0])
     sampler = ContextSampler(lambda _: values, 5, loses=loses)
     delay, _ = sampler(torch.arange(6), torch.tensor(1), torch.zeros(6), context_of(torch.rand(6)))
     assert delay.tolist() == expected
-    assert (sampler.longest, sampler.lost, sampler.constant_delay, sampler.loses) == (5, 6, None, loses)
+    assert (sampler.longest, sampler.lost, sampler.constant_delay, sampler.loses) == (
+        5,
+        6,
+        None,
+        loses,
+    )
     assert ContextSampler(lambda _: values, 5, loss=0.1, loses=loses).loses
 
 
@@ -77,7 +87,9 @@ def test_the_rounding_errors_of_a_float_cost_no_step():
 # Distances.
 
 
-def at_distance(law: Distance, distance: float, loss: float = 0.0, dt: float = 1.0, **entries) -> Tensor:
+def at_distance(
+    law: Distance, distance: float, loss: float = 0.0, dt: float = 1.0, **entries
+) -> Tensor:
     """Delays of messages sent at this distance east of the origin [M], -1 for a lost one."""
     streams, clock = counter_rng.world_seeds(3, SENDERS), torch.tensor(1)
     place = torch.tensor([[distance, 0.0]]).expand(SENDERS, 2)
@@ -94,7 +106,10 @@ def test_half_of_the_messages_are_lost_at_the_range_and_more_beyond_it():
     require_share(at_distance(law, 80.0) == -1, expected)
     require_share(at_distance(law, 100.0, 0.4) == -1, 0.7)
     sharp = Distance(range=100.0, shadowing=0.01)
-    assert [(at_distance(sharp, each) == -1).double().mean() for each in (99.0, 101.0)] == [0.0, 1.0]
+    assert [(at_distance(sharp, each) == -1).double().mean() for each in (99.0, 101.0)] == [
+        0.0,
+        1.0,
+    ]
     assert (at_distance(Distance(), 1e6) >= 0).all()
 
 

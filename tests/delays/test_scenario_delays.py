@@ -1,4 +1,5 @@
-"""What an environment has been made from may change: it keeps its own copy, and the next one follows."""
+"""What an environment has been made from may change: it keeps its own copy, and the next one
+follows."""
 
 import json
 from copy import deepcopy
@@ -21,7 +22,9 @@ from damian.world.config import RegionConfig, SourceConfig
 
 
 def test_an_environment_reads_a_trace_once(tmp_path):
-    delay = DelayConfig(obs=trace(tmp_path, 1, 2, 0), act={"law": "uniform", "high": 2}, rew=1, history=2)
+    delay = DelayConfig(
+        obs=trace(tmp_path, 1, 2, 0), act={"law": "uniform", "high": 2}, rew=1, history=2
+    )
     scenario = square(delay=delay, links=LinkConfig("matrix", delay=1))
     config = TrainConfig(**vars(scenario), learner=MappoConfig(steps=5), worlds=2, backupdate=True)
     check_learning(config)
@@ -36,20 +39,28 @@ def write_trace(path, delay: int) -> None:
 
 
 def write_region(path, side: int) -> None:
-    places = [[x * side * 1e-5, y * side * 1e-5] for x, y in [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]]
+    places = [
+        [x * side * 1e-5, y * side * 1e-5] for x, y in [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
+    ]
     path.write_text(json.dumps({"type": "Polygon", "coordinates": [places]}))
 
 
 FILES = {
     "trace": (write_trace, (1, 5), lambda env: env.delays.longest),
-    "region": (write_region, (150, 300), lambda env: env.uav_env.simulation.airspace.scale.item() // 1.57),
+    "region": (
+        write_region,
+        (150, 300),
+        lambda env: env.uav_env.simulation.airspace.scale.item() // 1.57,
+    ),
 }
-"""What writes a file, from which numbers, and the number that an environment has read; a diagonal of 1e-5
-degrees is 1.57 metres long."""
+"""What writes a file, from which numbers, and the number that an environment has read; a diagonal
+of 1e-5 degrees is 1.57 metres long."""
 
 
 @pytest.mark.parametrize("kind", FILES)
-@pytest.mark.parametrize("copied", [lambda s: s, deepcopy, replace], ids=["same", "deepcopy", "replace"])
+@pytest.mark.parametrize(
+    "copied", [lambda s: s, deepcopy, replace], ids=["same", "deepcopy", "replace"]
+)
 def test_a_file_that_was_rewritten_is_read_anew(tmp_path, kind, copied):
     (write, numbers, read), path = FILES[kind], tmp_path / "file.csv"
     told = {"delay": DelayConfig(obs={"law": "trace", "path": str(path)})}

@@ -1,4 +1,5 @@
-"""Late messages, actions and rewards beside senders in plain Python, whose episodes end at random steps."""
+"""Late messages, actions and rewards beside senders in plain Python, whose episodes end at random
+steps."""
 
 import math
 import runpy
@@ -49,7 +50,8 @@ LAWS: dict[str, Any] = {
     "context": Crowd("seen", column=4),
     "state of one's own": Route(4, change=0.6),
 }
-"""Laws that hold delays, read contexts, or keep a state of their own; ``TABLES`` have the others."""
+"""Laws that hold delays, read contexts, or keep a state of their own; ``TABLES`` have the
+others."""
 
 
 @pytest.fixture(params=[*TABLES, *LAWS])
@@ -80,7 +82,9 @@ class LagSender:
         drawn = 1 + 5 * self.bits(now) // 2**32
         if self.held is None:
             self.held = drawn
-            self.update_at = now + (1 + self.bits(now, 2) % self.period if self.lag.stagger else self.period)
+            self.update_at = now + (
+                1 + self.bits(now, 2) % self.period if self.lag.stagger else self.period
+            )
         elif now == self.update_at:
             self.update_at = now + self.period
             if self.share(now, 1) >= self.lag.hold_probability:
@@ -89,7 +93,8 @@ class LagSender:
 
 
 class CrowdSender(LagSender):
-    """Delays of one sender's messages by the law ``Crowd``; the first one is sent after so many steps."""
+    """Delays of one sender's messages by the law ``Crowd``; the first one is sent after so many
+    steps."""
 
     def __init__(self, agent: int, stream: int, loss: float = 0.0, first: int = 1) -> None:
         self.agent, self.stream, self.loss, self.first = agent, torch.tensor(stream), loss, first
@@ -141,7 +146,9 @@ def senders(transform: Any, law: Any, loss: float = 0.0, first: int = 1) -> list
         return [TableSender(d, sampler.lost) for d in drawn(sampler, streams, STEPS).T.tolist()]
     assert len(streams.unique()) >= len(WORLDS), "worlds draw apart"
     pairs = zip(streams.tolist(), ROWS, strict=True)
-    return [own(n, s, loss, first) if own is CrowdSender else own(law, s, loss) for s, (_, n) in pairs]
+    return [
+        own(n, s, loss, first) if own is CrowdSender else own(law, s, loss) for s, (_, n) in pairs
+    ]
 
 
 def options(law: Any) -> dict[str, Any]:
@@ -156,9 +163,14 @@ def options(law: Any) -> dict[str, Any]:
 )
 def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sent_key):
     further = {"loss": loss, "order": order, "sent_key": sent_key, "delay_key": "delay"}
-    transform = ObservationDelay(law, [OBSERVATION], [("agents", "seen")], **further, **options(law))
+    transform = ObservationDelay(
+        law, [OBSERVATION], [("agents", "seen")], **further, **options(law)
+    )
     outputs = play(delayed(transform), choices())
-    observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
+    observed, message_sent = (
+        column(outputs, *OBSERVATION),
+        column(outputs, "agents", "message_sent"),
+    )
     found = {key: column(outputs, "agents", key) for key in ("seen", "age", "delay")}
     done = column(outputs, "done")
     for sender, (w, n) in zip(senders(transform, law, loss), ROWS, strict=True):
@@ -171,11 +183,19 @@ def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sen
             delay = delay if sent_key is None or message_sent[at][w][n] else None
             receiver.step(now, observed[at][w][n], delay)
             held, told = receiver.holds, -1 if delay is None else delay
-            assert [found[key][at][w][n] for key in found] == [held.content, [now - held.sent], [told]]
+            assert [found[key][at][w][n] for key in found] == [
+                held.content,
+                [now - held.sent],
+                [told],
+            ]
             if done[at][w][0]:
                 receiver.begin(now, observed[reset][w][n])
                 sender.begin()
-                assert [found[key][reset][w][n] for key in found] == [observed[reset][w][n], [0], [0]]
+                assert [found[key][reset][w][n] for key in found] == [
+                    observed[reset][w][n],
+                    [0],
+                    [0],
+                ]
 
 
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
@@ -203,12 +223,20 @@ def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key
 def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
     law = Crowd("seen", column=4, loses=False) if isinstance(law, Crowd) else law
     earned = after(play(Counting(WORLDS, N_AGENTS), choices()), *REWARD)
-    transform = RewardDelay(law, REWARD, delay_key="reward_delay", earned_key="earned", **options(law))
+    transform = RewardDelay(
+        law, REWARD, delay_key="reward_delay", earned_key="earned", **options(law)
+    )
     outputs = play(delayed(transform), choices())
-    seen, received, done = after(outputs, *OBSERVATION), after(outputs, *REWARD), after(outputs, "done")
+    seen, received, done = (
+        after(outputs, *OBSERVATION),
+        after(outputs, *REWARD),
+        after(outputs, "done"),
+    )
     reported, known = (after(outputs, "agents", name) for name in ("reward_delay", "earned"))
     assert known == earned
-    assert received == after(play(delayed(RewardDelay(law, REWARD, **options(law))), choices()), *REWARD)
+    assert received == after(
+        play(delayed(RewardDelay(law, REWARD, **options(law))), choices()), *REWARD
+    )
     for sender, (w, n) in zip(senders(transform, law), ROWS, strict=True):
         purse, in_transit = Purse(), 0.0
         for t in range(STEPS):
@@ -231,7 +259,9 @@ def test_in_a_scenario_a_law_reads_the_true_position_at_the_instant_of_sending()
         stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
         found, truth = stepped["next"], stepped["next", "agents", "position"]
         ended, state = found["done"].view(-1), env.uav_env.state
-        place = state.position[..., :2] + env.uav_env.simulation.airspace.offset[state.region].unsqueeze(1)
+        place = state.position[..., :2] + env.uav_env.simulation.airspace.offset[
+            state.region
+        ].unsqueeze(1)
         assert truth[~ended].equal(place[~ended])
         sent = found["agents", "message_sent"].tolist()
         for row, sender in enumerate(people):
@@ -250,6 +280,8 @@ def test_a_held_law_loses_the_same_messages_and_delays_the_others_equally():
         play(env := make_env(everything(delay=delay), 4, extras=["message"]), uav_choices(env, 20))
         for delay in (DelayConfig(obs=Crowd()), DelayConfig(obs=Crowd(), hold="max"))
     )
-    one, other = (torch.stack([td["agents", "delay"] for td in outputs[1::2]]) for outputs in (free, held))
+    one, other = (
+        torch.stack([td["agents", "delay"] for td in outputs[1::2]]) for outputs in (free, held)
+    )
     assert other.equal(torch.where(one == -1, -1, LONGEST))
     assert (one == -1).any()

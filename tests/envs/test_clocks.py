@@ -50,12 +50,33 @@ def test_impossible_periods_are_refused(clock, message):
 
 def test_a_triggered_clock_stays_within_its_bounds():
     clock = triggered(10, "4s", shortest="3s", longest="15s")
-    assert periods(clock, *[SPOTTED] * 3, *[NOT_SPOTTED] * 5, SPOTTED) == [6, 3, 3, 7, 11, 15, 15, 15, 11]
-    assert periods(triggered(10, "4s"), *[SPOTTED] * 3, *[NOT_SPOTTED] * 5) == [6, 4, 4, 8, 12, 16, 20, 20]
+    assert periods(clock, *[SPOTTED] * 3, *[NOT_SPOTTED] * 5, SPOTTED) == [
+        6,
+        3,
+        3,
+        7,
+        11,
+        15,
+        15,
+        15,
+        11,
+    ]
+    assert periods(triggered(10, "4s"), *[SPOTTED] * 3, *[NOT_SPOTTED] * 5) == [
+        6,
+        4,
+        4,
+        8,
+        12,
+        16,
+        20,
+        20,
+    ]
 
 
 @pytest.mark.parametrize(("spotting_worlds", "period"), [(0, 12), (1, 12), (2, 8), (4, 8)])
-def test_the_period_shrinks_if_the_source_is_spotted_in_half_of_the_worlds_or_more(spotting_worlds, period):
+def test_the_period_shrinks_if_the_source_is_spotted_in_half_of_the_worlds_or_more(
+    spotting_worlds, period
+):
     spotted = torch.zeros(4, 3, dtype=torch.bool)
     spotted[:spotting_worlds, 1:] = True
     assert periods(triggered(10), spotted) == [period]
@@ -72,7 +93,8 @@ def config(clock: ClockConfig, level_db: float) -> TrainConfig:
 
 
 def batches(config: TrainConfig, n_steps: int, period: int) -> list[tuple[int, TensorDictBase]]:
-    """Batches of ``n_steps`` steps or more in all, each with the system clock's period at that time."""
+    """Batches of ``n_steps`` steps or more in all, each with the system clock's period at that
+    time."""
     env, clock = learning_env(config), SystemClock(config.clock, period)
     frames = WORLDS * clock.unit
     collector = Collector(env, random_policy(env), frames_per_batch=frames, total_frames=-1)
@@ -87,7 +109,10 @@ def batches(config: TrainConfig, n_steps: int, period: int) -> list[tuple[int, T
     return collected
 
 
-CLOCKS = {"fixed": ClockConfig(), "triggered": ClockConfig(trigger="3s", shortest="2s", longest="12s")}
+CLOCKS = {
+    "fixed": ClockConfig(),
+    "triggered": ClockConfig(trigger="3s", shortest="2s", longest="12s"),
+}
 
 
 @pytest.mark.parametrize("kind", CLOCKS)

@@ -1,4 +1,5 @@
-"""``DelayedEnv``: what holds in a scenario with any delays, losses and clocks, eager and compiled."""
+"""``DelayedEnv``: what holds in a scenario with any delays, losses and clocks, eager and
+compiled."""
 
 from collections.abc import Sequence
 
@@ -54,20 +55,29 @@ def all_transforms(scenario: ScenarioConfig, n_worlds: int) -> DelayedEnv:
 def check_equals_undelayed(env: EnvBase, scenario: ScenarioConfig, n_steps: int = 25) -> None:
     """Everything that the environment without transforms outputs is output, bit for bit."""
     undelayed = UavEnv(scenario, env.batch_size[0])
-    expected, outputs = play(undelayed, choices(undelayed, n_steps)), play(env, choices(undelayed, n_steps))
-    assert all_same([td.select(*expected[1].keys(True, True), strict=False) for td in outputs], expected)
+    expected, outputs = (
+        play(undelayed, choices(undelayed, n_steps)),
+        play(env, choices(undelayed, n_steps)),
+    )
+    assert all_same(
+        [td.select(*expected[1].keys(True, True), strict=False) for td in outputs], expected
+    )
     assert sum(td["done"].sum() for td in expected) > 0
 
 
 @both_kinds
 @both_motions
-def test_with_delays_of_0_all_transforms_output_what_the_environment_without_them_does(motion, kind):
+def test_with_delays_of_0_all_transforms_output_what_the_environment_without_them_does(
+    motion, kind
+):
     scenario = everything(motion, kind)
     check_equals_undelayed(all_transforms(scenario, 8), scenario)
 
 
 def test_without_any_delay_there_are_no_transforms():
-    nothing = DelayConfig(obs="0s", act={"law": "uniform", "high": "7s", "low": "3s", "probability": 0.0})
+    nothing = DelayConfig(
+        obs="0s", act={"law": "uniform", "high": "7s", "low": "3s", "probability": 0.0}
+    )
     env = make_env(everything(delay=nothing), 4, extras=EXTRAS)
     assert not [*env.transform.transforms]
     check_equals_undelayed(env, everything())
@@ -89,7 +99,8 @@ def test_the_specs_are_right_with_every_delay(delays, motion, kind):
 
 
 class FalsifyMessage(Transform):
-    """Changes the position in the message that one UAV sends in one step, for all later transforms."""
+    """Changes the position in the message that one UAV sends in one step, for all later
+    transforms."""
 
     def __init__(self, world: int, agent: int, step: int) -> None:
         super().__init__()
@@ -103,7 +114,9 @@ class FalsifyMessage(Transform):
             next_tensordict.set(MESSAGE, message)
         return next_tensordict
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return tensordict_reset
 
 
@@ -120,14 +133,19 @@ def test_a_message_has_no_effect_before_it_arrives(obs, order):
         falsified = play(env, choices(env, 20))
         delay = int(after_steps(original, ("agents", "delay"))[sent - 1, world, agent])
         arrival = 2 * (sent + delay) - 1
-        received = [td.exclude(MESSAGE) for td in original], [td.exclude(MESSAGE) for td in falsified]
+        received = (
+            [td.exclude(MESSAGE) for td in original],
+            [td.exclude(MESSAGE) for td in falsified],
+        )
         assert all_same(received[0][:arrival], received[1][:arrival])
         others = torch.arange(4) != world
         assert all_same([td[others] for td in original], [td[others] for td in falsified])
         at_arrival = original[arrival], falsified[arrival]
         if at_arrival[0][AGE][world, agent] == delay:
             n_held += 1
-            assert not at_arrival[0][RECEIVED][world, agent].equal(at_arrival[1][RECEIVED][world, agent])
+            assert not at_arrival[0][RECEIVED][world, agent].equal(
+                at_arrival[1][RECEIVED][world, agent]
+            )
             one, other = (td[GLOBAL_OBSERVATION][world] for td in at_arrival)
             assert not one.equal(other)
     assert n_held >= 1
@@ -149,7 +167,9 @@ def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
         alone = delayed(scenario, 1)
         alone.seed_worlds(seeds[w : w + 1])
         outputs = play(alone, [action[w : w + 1] for action in actions])
-        rounding = 1e-6 if delays == "belief" else 0.0  # some processors multiply one row in another order
+        rounding = (
+            1e-6 if delays == "belief" else 0.0
+        )  # some processors multiply one row in another order
         assert all_same([td[w : w + 1] for td in together], outputs, rounding)
 
 
@@ -170,7 +190,11 @@ def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
             outputs += [stepped["next"].clone(), td.clone()]
         return outputs
 
-    some, every, none = rollout([True, False, False, True]), rollout([True] * 4), rollout([False] * 4)
+    some, every, none = (
+        rollout([True, False, False, True]),
+        rollout([True] * 4),
+        rollout([False] * 4),
+    )
     for worlds, expected in (([1, 2], none), ([0, 3], every)):
         for w in worlds:
             assert all_same([td[w] for td in some], [td[w] for td in expected])
@@ -181,7 +205,10 @@ def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
 
 
 ROUTES = {**DELAYS, "nothing": {}}
-ROUTES["links"] = {"delay": DelayConfig(obs=2, loss=0.1), "links": LinkConfig(kind="matrix", delay=1)}
+ROUTES["links"] = {
+    "delay": DelayConfig(obs=2, loss=0.1),
+    "links": LinkConfig(kind="matrix", delay=1),
+}
 
 
 @pytest.mark.sample(3)
@@ -217,7 +244,9 @@ def test_a_scenario_compiles_to_kernels(name):
 def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None:
     base = env.base_env
     uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
-    one_by_one = TransformedEnv(uav_env, make_transforms(scenario, env.delays, uav_env.server, EXTRAS))
+    one_by_one = TransformedEnv(
+        uav_env, make_transforms(scenario, env.delays, uav_env.server, EXTRAS)
+    )
     for transform in one_by_one.transform:
         transform.set_seed(0)
     one_by_one.append_transform(RewardSum([REWARD], [EPISODE_REWARD]))
@@ -230,17 +259,22 @@ def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None
 
 
 def steps_of(env: EnvBase, actions: list[torch.Tensor]) -> list[TensorDictBase]:
-    """What each step returns, and that with which the next one begins, without what a policy has written."""
+    """What each step returns, and that with which the next one begins, without what a policy has
+    written."""
     following, shown = env.reset(), []
     for t, action in enumerate(actions):
         if t == 3:  # from here on the episode of one world ends at another time than the others
-            following = env.reset(following.set("_reset", torch.arange(4).view(4, 1) == 1)).exclude("_reset")
+            following = env.reset(following.set("_reset", torch.arange(4).view(4, 1) == 1)).exclude(
+                "_reset"
+            )
         following = following.clone().set(ACTION, action)
         following.set("policy_note", torch.ones(4)).set(("agents", "logits"), torch.zeros(4, 3, 5))
         after, following = env.step_and_maybe_reset(following)
         for td in (after, following):
             assert {"policy_note", ("agents", "logits")} <= {*td.keys(True, True)}
-        shown += [td.exclude("policy_note", ACTION, ("agents", "logits")) for td in (after, following)]
+        shown += [
+            td.exclude("policy_note", ACTION, ("agents", "logits")) for td in (after, following)
+        ]
     return shown
 
 

@@ -1,4 +1,5 @@
-"""What a GPU would run, without a GPU: nothing waits for it, and it touches no tensor of another device."""
+"""What a GPU would run, without a GPU: nothing waits for it, and it touches no tensor of another
+device."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,12 +23,20 @@ from damian.transforms.base import Memory, StatefulTransform
 from damian.transforms.entries import Entries
 from damian.world.state import PackedState
 
-LATE = DelayConfig(obs={"law": "geometric", "mean": 2}, rew={"law": "uniform", "low": 0, "high": 30})
+LATE = DelayConfig(
+    obs={"law": "geometric", "mean": 2}, rew={"law": "uniform", "low": 0, "high": 30}
+)
 LAG = {"law": "lag", "lag": {"law": "uniform", "low": 0, "high": 3}, "update_period": 2}
 LINKS = {
-    "own": {"delay": DelayConfig(obs=2), "observation": replace(everything().observation, own=True)},
+    "own": {
+        "delay": DelayConfig(obs=2),
+        "observation": replace(everything().observation, own=True),
+    },
     "updown": {"links": LinkConfig("updown", delay=2, loss=0.1)},
-    "matrix": {"links": LinkConfig("matrix", delay=[[0, 1, LAG]] * 3, loss=0.1, range=100.0), "delay": LATE},
+    "matrix": {
+        "links": LinkConfig("matrix", delay=[[0, 1, LAG]] * 3, loss=0.1, range=100.0),
+        "delay": LATE,
+    },
 }
 SCENARIOS = {
     **{name: square(**sections) for name, sections in KINDS.items()},
@@ -40,7 +49,15 @@ SCENARIOS = {
 }
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 
-WAITS = {"_local_scalar_dense", "is_nonzero", "item", "equal", "nonzero", "masked_select", "bincount"}
+WAITS = {
+    "_local_scalar_dense",
+    "is_nonzero",
+    "item",
+    "equal",
+    "nonzero",
+    "masked_select",
+    "bincount",
+}
 WAITS |= {"_unique", "_unique2", "unique_dim", "unique_consecutive"}
 """Operators whose result, or its shape, a CPU must wait for."""
 INDEXES = {"index", "index_put", "index_put_", "_index_put_impl_"}
@@ -92,7 +109,8 @@ class OnMeta(Watched):
 
 
 class Recording(TorchDispatchMode):
-    """Stands in for a CUDA graph: records operators, and runs them again on the same tensors, in place."""
+    """Stands in for a CUDA graph: records operators, and runs them again on the same tensors, in
+    place."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -113,7 +131,8 @@ Inputs = tuple[DelayedEnv, PackedState, list[Memory], Entries, Tensor]
 
 
 def inputs(scenario: ScenarioConfig) -> Inputs:
-    """An environment in the middle of an episode, the inputs of its next step, and worlds to reset."""
+    """An environment in the middle of an episode, the inputs of its next step, and worlds to
+    reset."""
     env = delayed(scenario)
     assert isinstance(env, DelayedEnv)
     shown = play(env, choices(env, 3))
@@ -123,7 +142,13 @@ def inputs(scenario: ScenarioConfig) -> Inputs:
     for transform in stateful:
         memories.append(transform.memory)
         entries |= {key: shown[-1][key] for key in transform.action_keys if key not in entries}
-    return env, env.uav_env.worlds, memories, entries, torch.tensor([[True], [False], [True], [False]])
+    return (
+        env,
+        env.uav_env.worlds,
+        memories,
+        entries,
+        torch.tensor([[True], [False], [True], [False]]),
+    )
 
 
 def step_and_reset(
@@ -161,7 +186,9 @@ def test_a_step_and_a_reset_touch_no_tensor_of_another_device(scenario, no_data)
         if isinstance(module, StatefulTransform):
             module.to(meta)
     worlds, mask = tree_map(lambda table: table.to(meta), worlds), mask.to(meta)
-    moved = [{name: value.to(meta) for name, value in each.items()} for each in [*memories, entries]]
+    moved = [
+        {name: value.to(meta) for name, value in each.items()} for each in [*memories, entries]
+    ]
     with OnMeta():
         step_and_reset(env, worlds, moved[:-1], moved[-1], mask)
 
@@ -181,7 +208,9 @@ def test_steps_replayed_as_a_graph_equal_steps(name, no_data, monkeypatch):
 def test_both_ways_give_the_same_rollout(name, monkeypatch):
     outputs = []
     for dependent in (True, False):
-        monkeypatch.setattr(devices, "data_dependent", lambda device, dependent=dependent: dependent)
+        monkeypatch.setattr(
+            devices, "data_dependent", lambda device, dependent=dependent: dependent
+        )
         env = delayed(SCENARIOS[name])
         outputs.append(play(env, choices(env, 12)))
     rounding = 1e-5 if name == "belief" else 0.0  # sums over cells in another order

@@ -43,7 +43,9 @@ def go(env: UavEnv, *actions: list) -> TensorDictBase:
 def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding(
     motion, level, resolution, empty
 ):
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.5, resolution=resolution, charging_points=FAR)
+    battery = BatteryConfig(
+        enabled=True, capacity_kwh=0.5, resolution=resolution, charging_points=FAR
+    )
     episode = EpisodeConfig(max_steps=None, discharged_share=1.0)
     task = RewardConfig(penalty=2.0)
     env = fresh(one_uav(battery=battery, motion=MOTIONS[motion], episode=episode, reward=task))
@@ -76,7 +78,9 @@ def test_the_battery_drain_of_a_flight_does_not_depend_on_the_length_of_a_step()
     drained, cost = [], None
     for period in ("1s", "0.5s", "0.25s"):
         battery = BatteryConfig(enabled=True, capacity_kwh=0.1, charging_points=FAR)
-        env = fresh(one_uav(battery=battery, motion=MotionConfig("polynomial"), clock=clock(period)))
+        env = fresh(
+            one_uav(battery=battery, motion=MotionConfig("polynomial"), clock=clock(period))
+        )
         go(env, EAST)
         origin, goal = (env.simulation.points[p.item()] for p in (env.state.origin, env.state.goal))
         length = torch.linalg.vector_norm(goal - origin)

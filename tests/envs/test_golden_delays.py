@@ -1,10 +1,10 @@
 """Comparison with runs recorded from the original implementation in which messages were late.
 
 The recorded messages pass a ``DelayLine`` with the recorded times of arrival, and the server node
-computes features from what it then holds (rewards and ends: ``tests/server/test_golden_rewards.py``). A
-recorded value that this project computes differently is left out only for a named reason, whose condition is
-checked in the record itself. Each test pins how many values were compared, and how many were left out for
-each reason.
+computes features from what it then holds
+(rewards and ends: ``tests/server/test_golden_rewards.py``). A recorded value that this project
+computes differently is left out only for a named reason, whose condition is checked in the record
+itself. Each test pins how many values were compared, and how many were left out for each reason.
 """
 
 import itertools
@@ -27,8 +27,8 @@ from damian.server.server import Server
 from damian.world.messages import Messages
 
 RUNS = json.loads((DATA / "delayed_runs.json").read_text())
-"""By use case and kind, runs of up to 15 steps; each field has an entry for each step. The original counts
-steps from 0, this project from 1, and the reset is at 0 in both."""
+"""By use case and kind, runs of up to 15 steps; each field has an entry for each step. The original
+counts steps from 0, this project from 1, and the reset is at 0 in both."""
 
 KINDS = ("p0.15_persistent", "p0.6_persistent", "p0.4_terminal_as_usecase")
 """Kinds of runs: the probability that a message is late, and whether episodes end."""
@@ -58,22 +58,26 @@ class Step(NamedTuple):
         return dict(zip(self.run["features"], self.recorded("obs_global")[uav], strict=True))
 
     def reset_came_last(self, uav: int) -> bool:
-        """Whether the UAV's message of the reset was late, and arrived after its other messages so far."""
+        """Whether the UAV's message of the reset was late, and arrived after its other messages so
+        far."""
         now, first = self.number - 1, self.run["reset_arrives_at"][uav]
-        others = [arrival[uav] for arrival in self.run["arrives_at"][: self.number] if arrival[uav] <= now]
+        others = [
+            arrival[uav] for arrival in self.run["arrives_at"][: self.number] if arrival[uav] <= now
+        ]
         return 0 < first <= now and bool(others) and max(others) < first
 
     @property
     def lost_in_reset(self) -> bool:
-        """Whether the server of the original has replaced a newer message by a late one of the reset."""
+        """Whether the server of the original has replaced a newer message by a late one of the
+        reset."""
         return any(map(self.reset_came_last, self.uavs))
 
 
 def sent_messages(case: int, run: dict[str, Any]) -> Messages:
     """What the UAVs of a run sent at its reset and in each step, [1 + T, N].
 
-    As in the original, a UAV that hears nothing passes on the newest detection that the server has told of,
-    if that is newer than its own.
+    As in the original, a UAV that hears nothing passes on the newest detection that the server has
+    told of, if that is newer than its own.
     """
     start = GOLDEN[case]["scenario"]["uav_start_positions"]
     position = torch.tensor([start, *run["positions"]])
@@ -124,7 +128,9 @@ def replay(case: int, *kinds: str) -> list[Step]:
         for run in record["sequences"]:
             held = received_messages(case, run)
             for t in range(len(run["positions"])):
-                steps.append(Step(run | {"features": names}, t + 1, Messages(*(part[t] for part in held))))
+                steps.append(
+                    Step(run | {"features": names}, t + 1, Messages(*(part[t] for part in held)))
+                )
     return steps
 
 
@@ -135,7 +141,9 @@ def held_by_server(steps: list[Step]) -> tuple[Messages, Tensor]:
 
 
 @pytest.mark.parametrize(("case", "compared", "late_resets"), [(1, 181, 2), (2, 621, 9)])
-def test_the_server_holds_the_recorded_messages_but_for_late_ones_of_the_reset(case, compared, late_resets):
+def test_the_server_holds_the_recorded_messages_but_for_late_ones_of_the_reset(
+    case, compared, late_resets
+):
     counts = Counter()
     for step in replay(case, *KINDS):
         for uav, place in enumerate(step.recorded("server_agent_pos")):
@@ -144,7 +152,10 @@ def test_the_server_holds_the_recorded_messages_but_for_late_ones_of_the_reset(c
             ours = step.held.position[uav].tolist()
             assert (ours == pytest.approx(place, abs=1e-2)) is not late_reset, step
             if not late_reset:
-                assert max(step.held.time[uav].item() - 1, 0) == step.recorded("server_agent_sent_at")[uav]
+                assert (
+                    max(step.held.time[uav].item() - 1, 0)
+                    == step.recorded("server_agent_sent_at")[uav]
+                )
                 assert step.held.spotted[uav].item() == (uav + 1 in step.recorded("spotting_ids"))
     assert counts == {False: compared, True: late_resets}
 
@@ -170,13 +181,19 @@ def reason_for_other_feature(step: Step, name: str, uav: int) -> str | None:
         return LATE_RESET
     if name == "coverage":
         return NOTHING_COVERED
-    if name == "source_time" and uav > 0 and step.recorded("last_time") not in (None, step.number - 1):
+    if (
+        name == "source_time"
+        and uav > 0
+        and step.recorded("last_time") not in (None, step.number - 1)
+    ):
         return DIVIDED
     detected = step.held.detected_time >= 0
     places = {tuple(place) for place in step.held.detected_position[detected].tolist()}
     if name in ESTIMATED and len(places) < detected.sum():
         return ONCE
-    at_estimate = step.recorded("est_pos") == pytest.approx(step.recorded("server_agent_pos")[uav], abs=1e-2)
+    at_estimate = step.recorded("est_pos") == pytest.approx(
+        step.recorded("server_agent_pos")[uav], abs=1e-2
+    )
     if name in ("source_bearing", "source_drift") and at_estimate:
         return NO_BEARING
     return None
@@ -198,7 +215,9 @@ def test_the_server_computes_the_recorded_features(case, compared, reasons):
     messages, numbers = held_by_server(steps)
     names = [name for name in steps[0].run["features"] if name != "coverage"]
     server = make_server(case)
-    ours = {name: value.tolist() for name, value in server.features(messages, numbers, names).items()}
+    ours = {
+        name: value.tolist() for name, value in server.features(messages, numbers, names).items()
+    }
     counts = Counter()
     for m, step in enumerate(steps):
         for uav in step.uavs:

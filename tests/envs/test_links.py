@@ -18,7 +18,9 @@ EXTRAS = ["message", "reward_terms"]
 def linked(motion: str = "instant", **links):
     """An environment whose messages to the server are delayed too, and the outputs of its steps."""
     delay = DelayConfig(obs=LATE, loss=0.1)
-    env = make_env(everything(motion, delay=delay, links=LinkConfig(**links)), 4, seed=2, extras=EXTRAS)
+    env = make_env(
+        everything(motion, delay=delay, links=LinkConfig(**links)), 4, seed=2, extras=EXTRAS
+    )
     return env, play(env, choices(env, 20))
 
 
@@ -77,7 +79,9 @@ def test_updown_shows_the_observation_that_the_server_computed_some_steps_ago(mo
 
 
 @both_motions
-def test_on_board_each_uav_computes_what_the_server_would_from_the_messages_that_have_reached_it(motion):
+def test_on_board_each_uav_computes_what_the_server_would_from_the_messages_that_have_reached_it(
+    motion,
+):
     delay = DelayConfig(obs=LATE)
     links = LinkConfig("matrix", delay=LATE, loss=0.2)
     env = make_env(everything(motion, delay=delay, links=links), 4, seed=2, extras=EXTRAS)

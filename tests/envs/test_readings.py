@@ -16,8 +16,11 @@ from damian.server.termination import EpisodeConfig
 
 
 def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioConfig:
-    """Episodes without end, and readings in the actor's and the critic's observation and in the reward."""
-    observation = ObservationConfig(["spotted", *LOCAL], [*GLOBAL, "source_time"], ctde=True, own=own)
+    """Episodes without end, and readings in the actor's and the critic's observation and in the
+    reward."""
+    observation = ObservationConfig(
+        ["spotted", *LOCAL], [*GLOBAL, "source_time"], ctde=True, own=own
+    )
     reward = RewardConfig(spotted=0.0, custom=[{"term": "sensor_cases:calm"}])
     sections = {"observation": observation, "reward": reward, "sensors": SENSORS}
     return everything(motion, episode=EpisodeConfig(max_steps=None), **(sections | changed))
@@ -25,7 +28,10 @@ def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioCo
 
 def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
     """The first output, and those after each of the same random actions."""
-    env, generator = make_env(scenario, 4, seed=1, extras=["message"]), torch.Generator().manual_seed(0)
+    env, generator = (
+        make_env(scenario, 4, seed=1, extras=["message"]),
+        torch.Generator().manual_seed(0),
+    )
     outputs = play(env, [random_actions(env.uav_env, generator) for _ in range(n_steps)])
     return [outputs[0], *outputs[1::2]]
 

@@ -1,4 +1,5 @@
-"""Settings of scenarios and arguments of ``make_env``: what is taken, and what is refused in one line."""
+"""Settings of scenarios and arguments of ``make_env``: what is taken, and what is refused in one
+line."""
 
 from collections.abc import Callable
 from typing import Any

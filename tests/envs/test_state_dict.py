@@ -1,4 +1,5 @@
-"""Copies and states of whole environments: another environment goes on as they did, and shares no memory."""
+"""Copies and states of whole environments: another environment goes on as they did, and shares no
+memory."""
 
 import pickle
 from multiprocessing.reduction import ForkingPickler
@@ -36,7 +37,9 @@ def test_an_environment_sent_to_a_worker_process_shares_no_memory(delays):
         td = each.reset()
         for step, action in enumerate(actions):
             if step == 6 and each is env:  # messages are in transit
-                play(pickle.loads(ForkingPickler.dumps(env)), actions)  # what a worker process receives
+                play(
+                    pickle.loads(ForkingPickler.dumps(env)), actions
+                )  # what a worker process receives
             after, td = each.step_and_maybe_reset(td.set(ACTION, action))
             outputs.append(after["next"])
     assert all_same(outputs[:12], outputs[12:])

@@ -29,7 +29,9 @@ from damian.world.landing import ActionConfig
 
 @both_motions
 def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
-    delay = DelayConfig(obs={"law": "burst"}, act={"law": "uniform", "low": 0, "high": 2}, rew=1, history=2)
+    delay = DelayConfig(
+        obs={"law": "burst"}, act={"law": "uniform", "low": 0, "high": 2}, rew=1, history=2
+    )
     scenario = everything(motion, delay=delay)
     skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
     td, other = skipping.reset(), steady.reset()
@@ -41,7 +43,9 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
             mask = torch.arange(2) == world
             stepped = skipping.step(td.clone().set(ACTION, action).set("_step", mask))["next"]
             assert same(stepped[world], after[world])
-            assert same(stepped[1 - world].select(*td.keys(True, True), strict=False), td[1 - world])
+            assert same(
+                stepped[1 - world].select(*td.keys(True, True), strict=False), td[1 - world]
+            )
             td = stepped.select(*td.keys(True, True), strict=False)
         other = after.select(*other.keys(True, True), strict=False)
 
@@ -67,7 +71,9 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
 def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_terms(motion, kind):
     env = UavEnv(everything(motion, kind), num_worlds=16)
     generator = torch.Generator().manual_seed(0)
-    td = env.rollout(40, lambda td: td.set(ACTION, random_actions(env, generator)), break_when_any_done=False)
+    td = env.rollout(
+        40, lambda td: td.set(ACTION, random_actions(env, generator)), break_when_any_done=False
+    )
     for name in ("observation", "global_observation"):
         observation = td["next", "agents", name]
         ways = 4 * (3 * env.server.observation.timeline + 3)  # of the timeline, which come last

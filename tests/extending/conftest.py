@@ -24,7 +24,9 @@ def example(request, monkeypatch) -> ModuleType:
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """An empty folder with a copy of the examples, from which programs are started."""
-    shutil.copytree(EXAMPLES, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        EXAMPLES, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__")
+    )
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -1,4 +1,5 @@
-"""The files of examples/extending run from outside the package, and a mistake in them is one clear line."""
+"""The files of examples/extending run from outside the package, and a mistake in them is one clear
+line."""
 
 import csv
 import sys
@@ -25,16 +26,30 @@ LOW = "{term: rewards:low_battery, weight: -0.2, below: 0.5}"
 REWARDS = ["scenario=energy", f"reward.custom=[{LOW}, {{term: rewards:together, weight: 0.1}}]"]
 REGION = ["region=vertices", "region.kind=region:yard", "region.options={side: 200}"]
 REGION += ["region.lattice_step=40"]
-MOTION = ["motion=polynomial", "motion.kind=motion:WindyFlight", "motion.options={wind: 4, bearing: 0}"]
+MOTION = [
+    "motion=polynomial",
+    "motion.kind=motion:WindyFlight",
+    "motion.options={wind: 4, bearing: 0}",
+]
 METRIC = "metrics=[metric:apart]"
 SENSOR = "sensors=[{sensor: sensor:wind, strength: 3}]"
 
 
 def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
     first = run(
-        *TINY, *REWARDS, *LAW, *FEATURES, *REGION, *MOTION, SENSOR, METRIC, "aware=backupdate+history"
+        *TINY,
+        *REWARDS,
+        *LAW,
+        *FEATURES,
+        *REGION,
+        *MOTION,
+        SENSOR,
+        METRIC,
+        "aware=backupdate+history",
     )
-    second = run(f"checkpoint={first}", "seed=1", "trust=true", program="evaluate", name="evaluated")
+    second = run(
+        f"checkpoint={first}", "seed=1", "trust=true", program="evaluate", name="evaluated"
+    )
     tables = [read_results(folder / "result.csv") for folder in (first, second)]
     assert all(table["metric:apart"].between(0, 1).all() for table in tables)
     assert "metric:apart" in (first / "result.md").read_text()
@@ -48,8 +63,14 @@ def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["delay.obs={law: law:Satelite}"], "delay.obs.law: law:Satelite: the module law has no Satelite"),
-        (["sensors=[{sensor: sensor:wind, strenght: 3}]"], "sensors[0].strenght: 3 is not a parameter of"),
+        (
+            ["delay.obs={law: law:Satelite}"],
+            "delay.obs.law: law:Satelite: the module law has no Satelite",
+        ),
+        (
+            ["sensors=[{sensor: sensor:wind, strenght: 3}]"],
+            "sensors[0].strenght: 3 is not a parameter of",
+        ),
         ([*REGION[:2], "region.options={sid: 50}"], "region.options: sid is not one of side"),
     ],
 )
@@ -120,7 +141,9 @@ def test_a_component_that_does_not_keep_what_it_declares_is_one_line_before_anyt
 ):
     (folder / "lies.py").write_text(LIES)
     monkeypatch.delitem(sys.modules, "lies", raising=False)
-    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=20)
+    region = RegionConfig(
+        kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=20
+    )
     with pytest.raises(InputError, match=message):
         make_env(everything(region=region, **sections), 2)
 

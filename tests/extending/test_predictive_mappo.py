@@ -1,4 +1,5 @@
-"""The learnt belief: its attention and loss beside slow twins, what it may know, and that it learns."""
+"""The learnt belief: its attention and loss beside slow twins, what it may know, and that it
+learns."""
 
 from typing import Any
 
@@ -29,7 +30,8 @@ LATE = {"law": "uniform", "low": 0, "high": 3}
 def build(
     example, kind: str = "discrete", flights: bool = False, act: int = 0, **learner
 ) -> tuple[Any, DelayedEnv]:
-    """A learner of few prediction steps, and an environment whose messages are up to 3 steps late or lost."""
+    """A learner of few prediction steps, and an environment whose messages are up to 3 steps late
+    or lost."""
     few: dict[str, Any] = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
     scenario = square(
         source=walking(),
@@ -60,7 +62,8 @@ def collected(learner: Any, env: DelayedEnv) -> TensorDictBase:
 
 
 def encoding(example, *batch: int) -> tuple[Any, list[Tensor]]:
-    """An encoder, and an observation of 5, a timeline of 2 senders and 4 slots of 2 + 1, and 3 codes of 4."""
+    """An encoder, and an observation of 5, a timeline of 2 senders and 4 slots of 2 + 1, and 3
+    codes of 4."""
     torch.manual_seed(1)
     encoder = example.MessageEncoder(5, 3, 4, SMALL, heads=2, width=6)
     inputs = [torch.rand(*batch, *shape) for shape in ((5,), (2, 4, 3), (3, 4))]
@@ -69,7 +72,8 @@ def encoding(example, *batch: int) -> tuple[Any, list[Tensor]]:
 
 
 def twin(encoder: Any, observation: Tensor, timeline: Tensor, code: Tensor) -> Tensor:
-    """The encoding of an observation [F], timeline [S, K, C] and code [E], by loops over messages."""
+    """The encoding of an observation [F], timeline [S, K, C] and code [E], by loops over
+    messages."""
     rows = [
         torch.cat([slot, torch.tensor([age / len(slots), float(sender == 0)])])
         for sender, slots in enumerate(timeline)

@@ -1,4 +1,5 @@
-"""Your own learners, loggers and configuration files: trained with, resumed, evaluated, compared."""
+"""Your own learners, loggers and configuration files: trained with, resumed, evaluated,
+compared."""
 
 import csv
 import re
@@ -104,7 +105,13 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
         "  naive: {naive: true}\n"
     )
     tiny = ",".join(f"'{word}'" for word in TINY if word != "logger=csv")
-    words = ["--config-dir=conf", "experiment=mine", "seeds=1", "processes=2", f"overrides=[{tiny}]"]
+    words = [
+        "--config-dir=conf",
+        "experiment=mine",
+        "seeds=1",
+        "processes=2",
+        f"overrides=[{tiny}]",
+    ]
     compared = run(*words, program="compare", name="compared")
     assert "| naive | late data |" in (compared / "table.md").read_text()
 
@@ -112,8 +119,14 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("learner=reader:ReaderConfig", "learner: reader:ReaderConfig reads hindsight, which needs aware="),
-        ("logger.custom=[law:Satellite]", "law:Satellite is not a function (folder) -> logger, nor a class"),
+        (
+            "learner=reader:ReaderConfig",
+            "learner: reader:ReaderConfig reads hindsight, which needs aware=",
+        ),
+        (
+            "logger.custom=[law:Satellite]",
+            "law:Satellite is not a function (folder) -> logger, nor a class",
+        ),
     ],
 )
 def test_a_mistake_is_one_clear_line(run, folder, capsys, word, message):
@@ -123,7 +136,9 @@ def test_a_mistake_is_one_clear_line(run, folder, capsys, word, message):
 
 
 def test_an_error_in_the_first_update_is_one_line_after_the_progress_bar(run, folder, capsys):
-    (folder / "faulty.py").write_text(READER.replace('batch["next", "agents", "reward"]', 'batch["nothing"]'))
+    (folder / "faulty.py").write_text(
+        READER.replace('batch["next", "agents", "reward"]', 'batch["nothing"]')
+    )
     words = ["learner=faulty:ReaderConfig", "delay.obs=3", "aware=backupdate"]
     with pytest.raises(SystemExit) as stopped:
         run(*TINY, *words)

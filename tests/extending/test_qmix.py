@@ -1,4 +1,5 @@
-"""QMIX as a learner of one's own: what it draws and how it explores; it is trained, resumed and evaluated."""
+"""QMIX as a learner of one's own: what it draws and how it explores; it is trained, resumed and
+evaluated."""
 
 import csv
 
@@ -24,7 +25,13 @@ def learner_of(example, env, **changed):
 
 @pytest.mark.parametrize("mixer", ["qmix", "vdn"])
 def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run, mixer):
-    words = [*TINY, "delay.obs=2", "aware=backupdate", f"learner.mixer={mixer}", "learner.annealed=1"]
+    words = [
+        *TINY,
+        "delay.obs=2",
+        "aware=backupdate",
+        f"learner.mixer={mixer}",
+        "learner.annealed=1",
+    ]
     first = run(*words, "learner=qmix:QmixConfig", "learner.steps=8")
     run("resume=run", "trust=true", "frames=256", name="unused")
     with (first / "metrics.csv").open(newline="") as file:
@@ -33,10 +40,14 @@ def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run,
     assert 0 < float(rows[-1]["loss"]) < 10
     flown = run(f"checkpoint={first}", "agents=4", "trust=true", program="evaluate", name="flown")
     with (flown / "result.csv").open(newline="") as file:
-        assert {"trained", "trained, deterministic"} <= {row["policy"] for row in csv.DictReader(file)}
+        assert {"trained", "trained, deterministic"} <= {
+            row["policy"] for row in csv.DictReader(file)
+        }
 
 
-def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_the_legal_ones(example):
+def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_the_legal_ones(
+    example,
+):
     env = UavEnv(everything(actions=ActionConfig(kind="discrete")), 4, 0)
     actor = example.QmixConfig(epsilon=0.4).make_actor(env, MlpConfig(hidden=[8]))
     seen = env.reset().select(keys.OBSERVATION, keys.ACTION_MASK)

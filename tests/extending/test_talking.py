@@ -1,4 +1,5 @@
-"""UAVs that attend to what they have heard of each other: what they observe of it, and that they learn."""
+"""UAVs that attend to what they have heard of each other: what they observe of it, and that they
+learn."""
 
 import csv
 
@@ -25,7 +26,10 @@ def make(agents):
     observation = ObservationConfig(["spotted"], ["talking:heard"], window=WINDOW)
     links = LinkConfig(kind="matrix", delay={"law": "uniform", "low": 1, "high": 4})
     return make_env(
-        ScenarioConfig(agents=agents, observation=observation, links=links), 2, 0, extras=["message"]
+        ScenarioConfig(agents=agents, observation=observation, links=links),
+        2,
+        0,
+        extras=["message"],
     )
 
 
@@ -98,7 +102,11 @@ ROWS, OWN = "learner=extensions:RowsConfig", "observation.own=true"
         ([OWN, "observation.belief=[belief_gain]", "model.skip=true"], False),
         ([OWN, "learner=sac"], False),
         (
-            ["links=matrix", "observation.global_features=[talking:heard]", "model=talking:AttentionConfig"],
+            [
+                "links=matrix",
+                "observation.global_features=[talking:heard]",
+                "model=talking:AttentionConfig",
+            ],
             False,
         ),
     ],
@@ -111,7 +119,9 @@ def test_an_actor_by_which_uavs_talk_without_delay_is_refused(example, words, re
     learning.make_collector(env, learner.actor, 64)
     before = torch.get_rng_state(), [each.clone() for each in learner.actor.parameters()]
     if refused:
-        with pytest.raises(InputError, match=r"reads other UAVs' rows, .* or give learner\.talks=true"):
+        with pytest.raises(
+            InputError, match=r"reads other UAVs' rows, .* or give learner\.talks=true"
+        ):
             learning.require_delayed_talk(config, env, learner)
     else:
         learning.require_delayed_talk(config, env, learner)
@@ -121,5 +131,7 @@ def test_an_actor_by_which_uavs_talk_without_delay_is_refused(example, words, re
 
 
 def test_undelayed_talk_is_refused_before_anything_is_written(run, folder, capsys):
-    check_refused(lambda: run(*TINY, ROWS, OWN, "delay.obs=3"), "observation.own=true hold what each", capsys)
+    check_refused(
+        lambda: run(*TINY, ROWS, OWN, "delay.obs=3"), "observation.own=true hold what each", capsys
+    )
     assert not [each for each in (folder / "run").rglob("*") if each.is_file()]

@@ -32,7 +32,8 @@ from damian.interop.pettingzoo import DelayParallelWrapper
 
 
 def by_time(message: MessageContext) -> torch.Tensor:
-    """Delays that follow from the time alone, so that messages overtake each other without chance."""
+    """Delays that follow from the time alone, so that messages overtake each other without
+    chance."""
     return (3 * message.time) % 5
 
 
@@ -45,10 +46,13 @@ LOSSY = ContextSampler(lost_at_times, 5)
 
 
 def test_drawn_delays_have_their_frequencies():
-    env = DelayWrapper(gymnasium.make("Pendulum-v1", max_episode_steps=3000), Uniform(0, 1), loss=0.5)
+    env = DelayWrapper(
+        gymnasium.make("Pendulum-v1", max_episode_steps=3000), Uniform(0, 1), loss=0.5
+    )
     env.reset(seed=0)
     ages = [env.step(env.action_space.sample())[-1]["age"] for _ in range(3000)]
-    # The newest message is there with probability 1/4; else the one before, with 1/2, or an older one.
+    # The newest message is there with probability 1/4; else the one before, with 1/2, or an older
+    # one.
     shares = np.bincount(ages, minlength=3)[:3] / 3000
     assert shares == pytest.approx([1 / 4, 3 / 4 * 1 / 2, 3 / 8 * 1 / 2], abs=0.03)
 
@@ -131,9 +135,12 @@ def test_gymnasiums_checker_finds_nothing(name, wide):
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
 @pytest.mark.parametrize(
-    ("observation", "action", "reward"), [(0, 0, 0), (LOSSY, 0, 3), (1, by_time, by_time), (by_time, 2, 40)]
+    ("observation", "action", "reward"),
+    [(0, 0, 0), (LOSSY, 0, 3), (1, by_time, by_time), (by_time, 2, 40)],
 )
-def test_history_timeline_and_rewards_are_those_of_the_transforms(name, observation, action, reward):
+def test_history_timeline_and_rewards_are_those_of_the_transforms(
+    name, observation, action, reward
+):
     delays = Compose(
         ActionDelay(action),
         ObservationDelay(observation, "observation", "held", delay_key="delay"),
@@ -156,8 +163,14 @@ def test_history_timeline_and_rewards_are_those_of_the_transforms(name, observat
                 assert np.array_equal(told[key], now[key].numpy()), key
             assert np.array_equal(told["observation"], now["held"].numpy())
             assert info["age"] == told["age"].item()
-            chosen = rng.uniform(-2, 2, 1).astype(np.float32) if name == "Pendulum-v1" else rng.integers(2)
-            now["action"] = torch.as_tensor(chosen if name == "Pendulum-v1" else np.eye(2, dtype=int)[chosen])
+            chosen = (
+                rng.uniform(-2, 2, 1).astype(np.float32)
+                if name == "Pendulum-v1"
+                else rng.integers(2)
+            )
+            now["action"] = torch.as_tensor(
+                chosen if name == "Pendulum-v1" else np.eye(2, dtype=int)[chosen]
+            )
             now = reference.step(now)["next"]
             told, received, terminated, truncated, info = env.step(chosen)
             assert received == pytest.approx(now["reward"].item(), rel=1e-5)
@@ -189,7 +202,10 @@ def test_every_reward_is_received_once_and_the_info_tells_when_it_was_earned():
 @pytest.mark.parametrize("late", [0, torch.zeros_like], ids=["0", "a function that returns 0"])
 def test_without_delay_all_is_as_without_the_wrapper(late):
     law = late if late == 0 else lambda message: torch.zeros_like(message.time)
-    plain, env = gymnasium.make("Pendulum-v1"), DelayWrapper(gymnasium.make("Pendulum-v1"), law, law, law)
+    plain, env = (
+        gymnasium.make("Pendulum-v1"),
+        DelayWrapper(gymnasium.make("Pendulum-v1"), law, law, law),
+    )
     assert env.observation_space == plain.observation_space
     assert np.array_equal(plain.reset(seed=1)[0], env.reset(seed=1)[0])
     for _ in range(20):
@@ -233,7 +249,8 @@ LINE = Box(-99, 99, (1,), np.float32)
 
 
 class Overwrites(gymnasium.Env):
-    """Counts its steps in arrays that it keeps and returns, and writes over the actions that it executes."""
+    """Counts its steps in arrays that it keeps and returns, and writes over the actions that it
+    executes."""
 
     action_space, observation_space = LINE, Dict({"gps": LINE, "camera": LINE})
 
@@ -287,7 +304,14 @@ class KeepsInfos(gymnasium.vector.VectorWrapper):
 @pytest.mark.parametrize("kind", ["whole", "in parts", "vector", "agent"])
 def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
     default = np.full(1, 4, np.float32)
-    late = {"observation": 2, "action": 2, "reward": 3, "history": 3, "timeline": 4, "default": default}
+    late = {
+        "observation": 2,
+        "action": 2,
+        "reward": 3,
+        "history": 3,
+        "timeline": 4,
+        "default": default,
+    }
     if kind == "agent":
         inner = OneOverwrites()
         env, inner = DelayParallelWrapper(inner, **late | {"default": {"a": default}}), inner.inner
@@ -296,8 +320,12 @@ def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
         env, inner = DelayVectorWrapper(KeepsInfos(vector), **late), vector.envs[1]
     else:
         inner = Overwrites()
-        env = DelayWrapper(inner, **late | ({"observation": {"camera": 2}} if kind == "in parts" else {}))
-    of_agent = {"agent": lambda each: each["a"], "vector": lambda each: each}.get(kind, lambda each: each)
+        env = DelayWrapper(
+            inner, **late | ({"observation": {"camera": 2}} if kind == "in parts" else {})
+        )
+    of_agent = {"agent": lambda each: each["a"], "vector": lambda each: each}.get(
+        kind, lambda each: each
+    )
     shape = (2, 1) if kind == "vector" else (1,)
     default[:], action, rows = 9, np.zeros(shape, np.float32), []
     told = of_agent(env.reset(seed=0)[0])
@@ -372,7 +400,10 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
     inner = Anything(Discrete(3))
     for options, message in (
         ({"reward": LOSSY}, "reward: .* loses messages"),
-        ({"observation": {"sound": 1}}, "observation: sound is named, but the names are: place, word"),
+        (
+            {"observation": {"sound": 1}},
+            "observation: sound is named, but the names are: place, word",
+        ),
         ({"action": {"left": 1}}, "action: left is named, but the names are: none"),
         ({"timeline": -1}, "timeline: -1 steps is not at least 0"),
     ):
@@ -380,7 +411,9 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
             DelayWrapper(inner, **options)
     with pytest.raises(InputError, match="observation: camera is named, but the names are: none"):
         DelayWrapper(gymnasium.make("CartPole-v1"), {"camera": 2})
-    by_hand = SyncVectorEnv([partial(gymnasium.make, "CartPole-v1")], autoreset_mode=AutoresetMode.DISABLED)
+    by_hand = SyncVectorEnv(
+        [partial(gymnasium.make, "CartPole-v1")], autoreset_mode=AutoresetMode.DISABLED
+    )
     with pytest.raises(InputError, match=r"env: .*DISABLED is no autoreset_mode in which"):
         DelayVectorWrapper(by_hand, 3)
     with pytest.raises(InputError, match=r"history: Sequence.* has no vectors of a fixed length"):
@@ -413,7 +446,13 @@ WRITTEN = {"held": "observation"} | {key: key for key in ("age", "timeline", "ac
 
 @pytest.mark.parametrize(
     ("law", "given"),
-    [(3, 3), (LOSSY, LOSSY), (of_congestion, of_congestion), (of_sender, BY_AGENT), (of_sender, of_sender)],
+    [
+        (3, 3),
+        (LOSSY, LOSSY),
+        (of_congestion, of_congestion),
+        (of_sender, BY_AGENT),
+        (of_sender, of_sender),
+    ],
     ids=["constant", "lossy", "congestion", "by agent", "by sender"],
 )
 def test_the_delays_of_agents_are_those_of_the_transforms(law, given):
@@ -444,7 +483,9 @@ def test_the_delays_of_agents_are_those_of_the_transforms(law, given):
             chosen = rng.uniform(0, 1, (3, 5)).astype(np.float32)
             now["agent", "action"] = torch.as_tensor(chosen)
             now = reference.step(now)["next"]
-            told, received, _, truncated, infos = env.step(dict(zip(env.agents, chosen, strict=True)))
+            told, received, _, truncated, infos = env.step(
+                dict(zip(env.agents, chosen, strict=True))
+            )
             expected = now["agent", "reward"].flatten().tolist()
             assert [*received.values()] == pytest.approx(expected, rel=1e-5)
         assert all(truncated.values())
@@ -460,7 +501,9 @@ class Relay(ParallelEnv):
     def __init__(self, again=None, tells=True, names="abc"):
         self.again, self.tells = again, tells
         self.metadata, self.possible_agents = {"name": "relay"}, [*names]
-        self.observation_spaces = dict.fromkeys(self.possible_agents, Box(-99.0, 99.0, (2,), np.float32))
+        self.observation_spaces = dict.fromkeys(
+            self.possible_agents, Box(-99.0, 99.0, (2,), np.float32)
+        )
         self.action_spaces = dict.fromkeys(self.possible_agents, Discrete(50))
 
     def observation_space(self, agent):
@@ -475,19 +518,33 @@ class Relay(ParallelEnv):
         return {agent: np.zeros(2, np.float32) for agent in self.agents}, infos
 
     def step(self, actions):
-        actions = {agent: actions[agent] for agent in self.agents}  # TorchRL sends those of the dead, too
+        actions = {
+            agent: actions[agent] for agent in self.agents
+        }  # TorchRL sends those of the dead, too
         self.t += 1
-        present = [*self.agents, *self.possible_agents[2:] * (self.t == 3), *["b"] * (self.t == self.again)]
+        present = [
+            *self.agents,
+            *self.possible_agents[2:] * (self.t == 3),
+            *["b"] * (self.t == self.again),
+        ]
         ends = {agent: self.t == 9 or (self.t == 5 and agent == "b") for agent in present}
         told = {agent: np.array([self.t, actions.get(agent, -1)], np.float32) for agent in present}
         rewards = {agent: float(10**self.t) for agent in present}
         self.agents = [agent for agent in present if not ends[agent]]
         ends |= {agent: ended and (self.tells or agent != "b") for agent, ended in ends.items()}
-        return told, rewards, ends, dict.fromkeys(present, False), {agent: {"t": self.t} for agent in present}
+        return (
+            told,
+            rewards,
+            ends,
+            dict.fromkeys(present, False),
+            {agent: {"t": self.t} for agent in present},
+        )
 
 
 def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
-    env = DelayParallelWrapper(Relay(), {"a": 1, "b": 4, "c": 2}, {"a": 2}, {"b": 3, "a": 1}, timeline=4)
+    env = DelayParallelWrapper(
+        Relay(), {"a": 1, "b": 4, "c": 2}, {"a": 2}, {"b": 3, "a": 1}, timeline=4
+    )
     for _ in range(2):  # nothing of an episode reaches the next one
         told, infos = env.reset()
         assert {agent: each["observation"].tolist() for agent, each in told.items()} == {
@@ -502,10 +559,16 @@ def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
             rows.append((told, rewards))
             assert infos["a"]["t"] == env.unwrapped.t
         told = [row[0] for row in rows]
-        seen = {uav: [each[uav]["observation"].tolist() for each in told if uav in each] for uav in "abc"}
+        seen = {
+            uav: [each[uav]["observation"].tolist() for each in told if uav in each]
+            for uav in "abc"
+        }
         assert seen["a"] == [[0, 0], [1, 0], [2, 0], [3, 1], [4, 2], [5, 3], [6, 4], [7, 5], [8, 6]]
         assert seen["b"] == [[0, 0], [0, 0], [0, 0], [0, 0], [1, 1]]
-        assert seen["c"] == [[3, -1], [3, -1], [3, -1], [4, 4], [5, 5], [6, 6], [7, 7]][: len(seen["c"])]
+        assert (
+            seen["c"]
+            == [[3, -1], [3, -1], [3, -1], [4, 4], [5, 5], [6, 6], [7, 7]][: len(seen["c"])]
+        )
         assert [row[1].get("b") for row in rows] == [0, 0, 0, 10, 111100, None, None, None, None]
         assert [row[1]["a"] for row in rows] == [0, *(10**t for t in range(1, 8)), 10**8 + 10**9]
         assert rows[4][0]["c"]["timeline"][:, -1].tolist() == [0, 0, 1, 0]
@@ -515,13 +578,17 @@ def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
 @pytest.mark.parametrize("tells", [True, False])
 @pytest.mark.parametrize("again", [6, 7, 8])
 def test_who_comes_again_begins_anew(again, tells):
-    env = DelayParallelWrapper(Relay(again, tells), {"b": 2}, {"b": 1}, {"b": 3}, history=4, timeline=4)
+    env = DelayParallelWrapper(
+        Relay(again, tells), {"b": 2}, {"b": 1}, {"b": 3}, history=4, timeline=4
+    )
     env.reset()
     rows = []
     while env.agents:
         rows.append([of.get("b") for of in env.step(dict.fromkeys(env.agents, 7))])
     told, rewards = ([row[i] for row in rows] for i in (0, 1))
-    for t in range(again, 10):  # it executes nothing in the step in which it comes, and then its default
+    for t in range(
+        again, 10
+    ):  # it executes nothing in the step in which it comes, and then its default
         seen = told[t - 1]
         last = max(again, t - 2)
         assert seen["observation"].tolist() == [last, -1 if last == again else 0]
@@ -563,7 +630,9 @@ def test_who_comes_again_begins_anew_in_the_transforms_too(again):
             for key in ("held", "age", "timeline"):
                 assert np.array_equal(told[agent][WRITTEN[key]], now["agents", key][i].numpy()), key
             history = told[agent]["action_history"].reshape(3, 50).argmax(-1)
-            assert np.array_equal(history, (49 * now["agents", "action_history"][i]).round().numpy())
+            assert np.array_equal(
+                history, (49 * now["agents", "action_history"][i]).round().numpy()
+            )
             expected = rewards[agent] + 0.9 * (
                 0 if env.unwrapped.t == again and agent == "b" else earned[agent]
             )
@@ -595,5 +664,7 @@ def test_agents_draw_different_delays_which_follow_from_the_seed():
 
 
 def test_pettingzoos_checker_finds_nothing(capsys):
-    parallel_api_test(DelayParallelWrapper(made_spread(), Uniform(0, 3), 1, 2, history=2, timeline=3), 30)
+    parallel_api_test(
+        DelayParallelWrapper(made_spread(), Uniform(0, 3), 1, 2, history=2, timeline=3), 30
+    )
     assert "Passed Parallel API test" in capsys.readouterr().out

@@ -9,7 +9,9 @@ import pytest
 import damian
 
 TEXT = (Path(damian.__file__).parents[1] / "docs" / "interop.md").read_text()
-BLOCKS = re.findall(r"## ([^\n]+)\n(?:(?!\n## ).)*?```python\n(.*?)```", "## first\n" + TEXT, re.DOTALL)
+BLOCKS = re.findall(
+    r"## ([^\n]+)\n(?:(?!\n## ).)*?```python\n(.*?)```", "## first\n" + TEXT, re.DOTALL
+)
 
 
 def test_every_example_is_found():
@@ -33,8 +35,12 @@ def test_an_example_runs(code, capsys):
 
 def test_the_callback_for_stable_baselines3_moves_each_reward_to_the_step_that_earned_it():
     pytest.importorskip("stable_baselines3")
-    example = runpy.run_path(str(Path(damian.__file__).parents[1] / "examples" / "sb3_late_rewards.py"))
-    buffers = [example["train"](frames=1024, back_update=moved).rollout_buffer for moved in (True, False)]
+    example = runpy.run_path(
+        str(Path(damian.__file__).parents[1] / "examples" / "sb3_late_rewards.py")
+    )
+    buffers = [
+        example["train"](frames=1024, back_update=moved).rollout_buffer for moved in (True, False)
+    ]
     settled = [buffer.rewards[: 256 - 30] for buffer in buffers]  # each step of CartPole earns 1
     assert (settled[0] == 1).all()
     assert not (settled[1] == 1).all()

@@ -39,14 +39,22 @@ def test_gymnasiums_checker_finds_nothing(task, actions, motion, delay):
 @pytest.mark.sample(4)
 @pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS)
 def test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys):
-    overrides = [f"scenario={task}", f"actions={actions}", f"motion={motion}", delay, "episode.max_steps=4"]
+    overrides = [
+        f"scenario={task}",
+        f"actions={actions}",
+        f"motion={motion}",
+        delay,
+        "episode.max_steps=4",
+    ]
     parallel_api_test(made(*overrides), num_cycles=6)
     parallel_seed_test(lambda: made(*overrides))
     assert "Passed Parallel API test" in capsys.readouterr().out
 
 
 def test_gymnasiums_environment_is_pettingzoos_of_one_uav():
-    scenario = compose_scenario("scenario=tracking", "agents=1", "delay=paper", "episode.max_steps=12")
+    scenario = compose_scenario(
+        "scenario=tracking", "agents=1", "delay=paper", "episode.max_steps=12"
+    )
     env, other = UavGymEnv(scenario, seed=3), UavParallelEnv(scenario, seed=3)
     (observation, info), (observations, _) = env.reset(seed=7), other.reset(seed=7)
     told = [0.0, False, False]
@@ -73,9 +81,13 @@ def test_pettingzoos_environment_does_what_torchrls_does():
     for _ in range(8):
         for number, agent in enumerate(env.possible_agents):
             assert np.array_equal(observations[agent], now[keys.OBSERVATION][0, number].numpy())
-            assert np.array_equal(infos[agent]["action_mask"], now[keys.ACTION_MASK][0, number].numpy())
+            assert np.array_equal(
+                infos[agent]["action_mask"], now[keys.ACTION_MASK][0, number].numpy()
+            )
         assert np.array_equal(env.state(), now[keys.GLOBAL_OBSERVATION][0].flatten().numpy())
-        chosen = {name: env.action_space(name).sample(infos[name]["action_mask"]) for name in env.agents}
+        chosen = {
+            name: env.action_space(name).sample(infos[name]["action_mask"]) for name in env.agents
+        }
         now[keys.ACTION] = torch.tensor([[*chosen.values()]])
         now = reference.step(now)["next"]
         observations, rewards, terminated, truncated, infos = env.step(chosen)

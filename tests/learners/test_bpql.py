@@ -1,4 +1,5 @@
-"""BPQL: critics read states that have arrived, and the actor what had arrived and its own actions since."""
+"""BPQL: critics read states that have arrived, and the actor what had arrived and its own actions
+since."""
 
 import pytest
 import torch
@@ -24,7 +25,8 @@ SMALL, LONGEST = MlpConfig(hidden=[16]), 5
 
 
 def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase, TensorDictBase]:
-    """A learner after several batches, all steps that it was given [B, T], and the last transitions drawn."""
+    """A learner after several batches, all steps that it was given [B, T], and the last transitions
+    drawn."""
     delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": LONGEST}, history=3)
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, 1, extras=["message", "privileged"])
@@ -49,12 +51,17 @@ def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase
 
 
 def rows(before: TensorDictBase, after: TensorDictBase, state: str) -> Tensor:
-    """What an update reads of each decision: the actor's observation, and a state, before and after it."""
-    return torch.cat([agents[key] for agents in (before, after) for key in ("observation", state)], -1)
+    """What an update reads of each decision: the actor's observation, and a state, before and after
+    it."""
+    return torch.cat(
+        [agents[key] for agents in (before, after) for key in ("observation", state)], -1
+    )
 
 
 @both_kinds
-def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_from_what_it_saw(kind):
+def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_from_what_it_saw(
+    kind,
+):
     _, flight, drawn = learnt(kind)
     found = rows(drawn["agents"], drawn["next", "agents"], "global_observation")
     expected, late = [], []
@@ -64,14 +71,20 @@ def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_fr
                 place = world, step, agent
                 before, after = flight["agents"][place], flight["next", "agents"][place]
                 twin = [
-                    torch.cat([each["observation"], each["privileged_observation"][:-2]])  # no source
+                    torch.cat(
+                        [each["observation"], each["privileged_observation"][:-2]]
+                    )  # no source
                     for each in (before, after)
                 ]
                 expected.append(torch.cat(twin))
                 late.append(rows(before, after, "global_observation"))
     differences = (found.unsqueeze(1) - torch.stack(expected)).abs().amax(-1)
-    assert differences.amin(1).max() < 1e-5  # every drawn transition has undelayed states of a settled step
-    assert (torch.stack(late) - torch.stack(expected)).abs().max() > 0.1  # as collected, they were late
+    assert (
+        differences.amin(1).max() < 1e-5
+    )  # every drawn transition has undelayed states of a settled step
+    assert (
+        torch.stack(late) - torch.stack(expected)
+    ).abs().max() > 0.1  # as collected, they were late
 
 
 def test_bpql_waits_for_states_and_refuses_to_learn_without_back_updating():
@@ -81,5 +94,7 @@ def test_bpql_waits_for_states_and_refuses_to_learn_without_back_updating():
     with pytest.raises(InputError, match="learner: bpql needs back-updating"):
         config.check(learning(SMALL, longest_delay=3))
     config.check(learning(SMALL, longest_delay=3, backupdate=True))
-    config.check(learning(SMALL, longest_delay=3, critic_key=keys.PRIVILEGED_OBSERVATION))  # always true
+    config.check(
+        learning(SMALL, longest_delay=3, critic_key=keys.PRIVILEGED_OBSERVATION)
+    )  # always true
     config.check(learning(SMALL))  # nothing is late

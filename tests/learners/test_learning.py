@@ -1,4 +1,5 @@
-"""MAPPO: actors and critics, advantages, losses, importance ratios with back-updating, divergence."""
+"""MAPPO: actors and critics, advantages, losses, importance ratios with back-updating,
+divergence."""
 
 import itertools
 import math
@@ -52,7 +53,8 @@ def test_a_policy_made_for_three_uavs_works_with_ten(kind):
 
 
 def collect(motion: str, kind: str):
-    """A batch with episodes of 9 steps, terminated in every other world and truncated in the others."""
+    """A batch with episodes of 9 steps, terminated in every other world and truncated in the
+    others."""
     config = scenario(
         episode=EpisodeConfig(max_steps=9),
         motion=MotionConfig(kind=motion),
@@ -103,7 +105,8 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
 
 
 def collect_delayed(kind: str) -> tuple[Mappo, TensorDictBase]:
-    """A learner with back-updating, and a batch of several episodes that its actor has flown under delay."""
+    """A learner with back-updating, and a batch of several episodes that its actor has flown under
+    delay."""
     delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["message"])
@@ -150,7 +153,11 @@ def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():
 
 def test_a_nan_counts_only_if_weights_are_wrong():
     network = nn.Linear(2, 2)
-    components = {"actor": network, "optimizer": torch.optim.Adam(network.parameters()), "other": nn.ReLU()}
+    components = {
+        "actor": network,
+        "optimizer": torch.optim.Adam(network.parameters()),
+        "other": nn.ReLU(),
+    }
     assert divergence(components, {"loss": 1.0, "not known yet": math.nan}) is None
     assert divergence(components, {"a": 1.0, "b": -math.inf}) == "b is -inf"
     for value in (math.nan, -2e5):

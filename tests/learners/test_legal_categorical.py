@@ -17,7 +17,11 @@ def both(shape: tuple[int, ...], masked: bool) -> tuple[LegalCategorical, Catego
     mask = torch.rand(*shape, 7) < 0.4
     mask[..., 2] = True
     if masked:
-        return LegalCategorical(logits, mask), MaskedCategorical(logits, mask=mask, neg_inf=-1e8), logits
+        return (
+            LegalCategorical(logits, mask),
+            MaskedCategorical(logits, mask=mask, neg_inf=-1e8),
+            logits,
+        )
     return LegalCategorical(logits), Categorical(logits=logits), logits
 
 
@@ -27,7 +31,9 @@ masked_or_not = pytest.mark.parametrize("masked", [True, False])
 
 @every_shape
 @masked_or_not
-def test_probabilities_and_entropies_and_their_gradients_are_those_of_other_libraries(shape, masked):
+def test_probabilities_and_entropies_and_their_gradients_are_those_of_other_libraries(
+    shape, masked
+):
     ours, other, logits = both(shape, masked)
     actions = other.sample()
     terms = [(p.log_prob(actions), p.entropy(), p.probs) for p in (ours, other)]
@@ -35,7 +41,8 @@ def test_probabilities_and_entropies_and_their_gradients_are_those_of_other_libr
     for one, another in zip(*terms, strict=True):
         weights = torch.rand_like(one)  # TorchRL's gradient is nan for weights above 1
         gradients = [
-            torch.autograd.grad((term * weights).sum(), logits, retain_graph=True) for term in (one, another)
+            torch.autograd.grad((term * weights).sum(), logits, retain_graph=True)
+            for term in (one, another)
         ]
         torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
 
@@ -51,7 +58,9 @@ def test_draws_are_legal_and_as_frequent_as_probable(shape, masked):
     assert ours.sample().shape == shape
     frequency = torch.nn.functional.one_hot(drawn, 7).float().mean((0, 1))
     error = (ours.probs * (1 - ours.probs) / n_draws).sqrt()
-    assert ((frequency - ours.probs).abs() <= 5 * error).all()  # none of an illegal action, whose error is 0
+    assert (
+        (frequency - ours.probs).abs() <= 5 * error
+    ).all()  # none of an illegal action, whose error is 0
     assert ours.deterministic_sample.equal(other.mode)
     illegal = ours.logits < -1e7
     assert illegal.any() == masked
@@ -60,7 +69,9 @@ def test_draws_are_legal_and_as_frequent_as_probable(shape, masked):
 
 @pytest.mark.parametrize("low", [-1e9, -1e30, -torch.inf])
 def test_however_low_the_logits_are_draws_are_legal_and_entropies_finite(low):
-    logits = torch.tensor([[low, low, 0.0, 1.0], [0.0, low, low, low]]).repeat(500, 1).requires_grad_()
+    logits = (
+        torch.tensor([[low, low, 0.0, 1.0], [0.0, low, low, low]]).repeat(500, 1).requires_grad_()
+    )
     mask = torch.tensor([[True, True, False, False], [True, True, False, False]]).repeat(500, 1)
     distribution = LegalCategorical(logits, mask)
     first, second = distribution.probs.view(500, 2, 4)[0]

@@ -1,4 +1,5 @@
-"""MAPPO's loss beside TorchRL's, its compiled form, its minibatches, and the values of its critics."""
+"""MAPPO's loss beside TorchRL's, its compiled form, its minibatches, and the values of its
+critics."""
 
 import copy
 from dataclasses import replace
@@ -45,8 +46,8 @@ every_case = pytest.mark.parametrize("case", CASES)
 
 
 def flown(case: str, **setup) -> tuple[DelayedEnv, Mappo, TensorDictBase]:
-    """A learner and a batch [4, 12] with advantages: several episodes of 9 steps, real flight times, and
-    importance ratios within and beyond the clipping."""
+    """A learner and a batch [4, 12] with advantages: several episodes of 9 steps, real flight
+    times, and importance ratios within and beyond the clipping."""
     actions, model = CASES[case]
     scenario = everything("polynomial", actions=actions, episode=EpisodeConfig(max_steps=9))
     torch.manual_seed(3)
@@ -73,7 +74,9 @@ def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
     config = learner.config
     norm = copy.deepcopy(learner.critic.module.norm).float() if config.normalize_value else None
     if norm is not None:
-        norm.update = lambda targets: None  # a learner has updated it already, once for the whole batch
+        norm.update = lambda targets: (
+            None
+        )  # a learner has updated it already, once for the whole batch
     loss = MAPPOLoss(
         learner.actor,
         learner.critic,
@@ -92,7 +95,9 @@ def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
         sample_log_prob=keys.ACTION_LOG_PROB,
     )
     terms, ready = loss(batch.copy()), batch[keys.READY]
-    decided = [terms[name].view_as(ready)[ready].mean() for name in ("loss_objective", "loss_entropy")]
+    decided = [
+        terms[name].view_as(ready)[ready].mean() for name in ("loss_objective", "loss_entropy")
+    ]
     return torch.stack([*decided, terms["loss_critic"].mean()])
 
 
@@ -144,8 +149,12 @@ def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number
         torch.manual_seed(0)
         expected, expected_numbers = learner._losses(entries)
         assert torch.rand(1) == after  # as many draws of torch's generator
-        gradients = [torch.autograd.grad(terms.sum(), learner.weights) for terms in (found, expected)]
-        torch.testing.assert_close((found, numbers), (expected, expected_numbers), rtol=1e-4, atol=1e-6)
+        gradients = [
+            torch.autograd.grad(terms.sum(), learner.weights) for terms in (found, expected)
+        ]
+        torch.testing.assert_close(
+            (found, numbers), (expected, expected_numbers), rtol=1e-4, atol=1e-6
+        )
         torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
 
 
@@ -156,7 +165,9 @@ def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number
 def test_values_are_those_of_two_passes_over_the_batch(case):
     _, learner, batch = flown(case)
     key = keys.GLOBAL_OBSERVATION
-    batch[keys.next_key(key)][2, 4, 1] += 1.0  # a correction after the step that is not before the next one
+    batch[keys.next_key(key)][2, 4, 1] += (
+        1.0  # a correction after the step that is not before the next one
+    )
     ends = batch["next", "done"].squeeze(-1)
     assert ends[:, :-1].any()
     evaluated = []
@@ -166,7 +177,9 @@ def test_values_are_those_of_two_passes_over_the_batch(case):
         hook.remove()
         expected = (learner.critic(batch.copy()), learner.critic(batch["next"].copy()))
     torch.testing.assert_close(values, tuple(td[keys.STATE_VALUE] for td in expected))
-    assert evaluated == [batch.numel() + 4 + int(ends[:, :-1].sum()) + 1]  # last steps, ends, correction
+    assert evaluated == [
+        batch.numel() + 4 + int(ends[:, :-1].sum()) + 1
+    ]  # last steps, ends, correction
 
 
 @pytest.mark.sample(2)

@@ -1,4 +1,5 @@
-"""Recurrent actors: hidden states in flight, their recomputation in training, and what memory is good for."""
+"""Recurrent actors: hidden states in flight, their recomputation in training, and what memory is
+good for."""
 
 import itertools
 from collections.abc import Iterator
@@ -28,14 +29,19 @@ ROUNDING = 3e-5
 OBSERVATION, ACTION = (("agents", name) for name in ("observation", "action"))
 
 both_kinds_and_motions = pytest.mark.parametrize(
-    ("kind", "motion"), [("discrete", "instant"), ("continuous", "instant"), ("discrete", "polynomial")]
+    ("kind", "motion"),
+    [("discrete", "instant"), ("continuous", "instant"), ("discrete", "polynomial")],
 )
 
 
-def delayed_env(kind: str = "discrete", motion: str = "instant", worlds: int = 4, **changed) -> DelayedEnv:
+def delayed_env(
+    kind: str = "discrete", motion: str = "instant", worlds: int = 4, **changed
+) -> DelayedEnv:
     """An environment with late messages, and episodes of 9 steps."""
     delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5})
-    scenario = everything(motion, kind, **({"delay": delay, "episode": EpisodeConfig(max_steps=9)} | changed))
+    scenario = everything(
+        motion, kind, **({"delay": delay, "episode": EpisodeConfig(max_steps=9)} | changed)
+    )
     env = make_env(scenario, worlds, seed=1, extras=["message"])
     env.append_transform(StepCounter())
     return env
@@ -100,7 +106,10 @@ def test_a_batch_from_the_replay_buffer_keeps_its_first_hidden_state(settle):
 
 def test_gradients_reach_back_to_the_beginning_of_the_episode_and_no_further():
     gru = make_actor(delayed_env(), GRU).module[0][0]
-    features, begins = torch.rand(2, 6, 3, 16, requires_grad=True), torch.zeros(2, 6, 1, dtype=torch.bool)
+    features, begins = (
+        torch.rand(2, 6, 3, 16, requires_grad=True),
+        torch.zeros(2, 6, 1, dtype=torch.bool),
+    )
     begins[0, 2] = True  # in one of two worlds
     gru.replay(features, torch.rand(2, 3, 8), begins)[:, -1].sum().backward()
     has_gradient = (features.grad != 0).any(-1).all(-1)

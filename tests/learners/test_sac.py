@@ -43,7 +43,9 @@ def test_the_target_entropy_is_a_share_of_the_entropy_of_a_uniform_choice_among_
     mask = torch.zeros(2, n_actions, dtype=torch.bool)
     mask[0, :4], mask[1, :16] = True, True
     states = TensorDict({"agents": TensorDict({"action_mask": mask}, [2])}, [2])
-    assert torch.allclose(learner.loss.target_entropies(states), torch.tensor([4.0, 16.0]).log() / 2)
+    assert torch.allclose(
+        learner.loss.target_entropies(states), torch.tensor([4.0, 16.0]).log() / 2
+    )
     unmasked = learner.loss.target_entropies(TensorDict({}, [2]))
     assert unmasked.item() == pytest.approx(math.log(n_actions) / 2)
 
@@ -58,16 +60,22 @@ def test_the_discrete_losses_and_their_gradients_are_torchrls(mask):
     env = UavEnv(everything("polynomial", actions=ActionConfig(kind="discrete", mask=mask)), 8)
     learner = recording_learner(env, lr=0.1)  # so that actor, critics and targets differ
     batch, loss = learner.drawn[0], learner.loss
-    assert ("agents", "action_mask") not in batch.keys(True) or not batch["agents", "action_mask"].all()
+    assert ("agents", "action_mask") not in batch.keys(True) or not batch[
+        "agents", "action_mask"
+    ].all()
     names = ("loss_actor", "loss_qvalue", "loss_alpha")
     found = loss(batch.copy())
     expected = DiscreteSACLoss.forward(loss, batch.copy())
     # TorchRL has one target for all states, here 0.
-    expected["loss_alpha"] = expected["loss_alpha"] - loss.log_alpha * loss.target_entropies(batch).mean()
+    expected["loss_alpha"] = (
+        expected["loss_alpha"] - loss.log_alpha * loss.target_entropies(batch).mean()
+    )
     assert found["alpha"] == expected["alpha"]
     for name in names:
         gradients = [
-            torch.autograd.grad(terms[name], [*loss.parameters()], retain_graph=True, materialize_grads=True)
+            torch.autograd.grad(
+                terms[name], [*loss.parameters()], retain_graph=True, materialize_grads=True
+            )
             for terms in (found, expected)
         ]
         torch.testing.assert_close(found[name], expected[name])
@@ -85,7 +93,9 @@ class RecordingSac(Sac):
         return super().update(drawn)
 
 
-def decision(flight: TensorDictBase, world: int, begin: int, agent: int, last: int) -> Tensor | None:
+def decision(
+    flight: TensorDictBase, world: int, begin: int, agent: int, last: int
+) -> Tensor | None:
     """Transition of a UAV over a decision at step ``begin``, as a row of numbers (``ROW``).
 
     None if the UAV was not ready, or if the outcome is not known by the last step.
@@ -110,11 +120,18 @@ def decision(flight: TensorDictBase, world: int, begin: int, agent: int, last: i
         for key in ("observation", PRIVILEGED_OBSERVATION[-1])
     ]
     action = agents["action"][world, begin, agent].view(1)
-    return torch.cat([*observations, action, earned, over, terminated, torch.tensor([t - begin + 1])])
+    return torch.cat(
+        [*observations, action, earned, over, terminated, torch.tensor([t - begin + 1])]
+    )
 
 
 OBSERVED = [OBSERVATION, PRIVILEGED_OBSERVATION]
-ROW = [*OBSERVED, *(("next", *key) for key in OBSERVED), ("agents", "action"), ("next", "agents", "reward")]
+ROW = [
+    *OBSERVED,
+    *(("next", *key) for key in OBSERVED),
+    ("agents", "action"),
+    ("next", "agents", "reward"),
+]
 ROW += [("next", "done"), ("next", "terminated"), "steps_to_next_obs"]
 
 
@@ -123,9 +140,13 @@ def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_ho
     env = make_env(scenario, 4, seed=1, extras=["privileged"])
     config = SacConfig(gamma=0.8, updates=2, batch_size=600, warm_up=0)
     buffer = ReplayBuffer(storage=TimeStorage(24 * 4))
-    learner = RecordingSac(env, config, learning(SMALL, 3, critic_key=PRIVILEGED_OBSERVATION), buffer)
+    learner = RecordingSac(
+        env, config, learning(SMALL, 3, critic_key=PRIVILEGED_OBSERVATION), buffer
+    )
     flight = fly(env, learner.actor, 40)
-    flight["next", "terminated"][::2] = flight["next", "done"][::2]  # no time limit in every other world
+    flight["next", "terminated"][::2] = flight["next", "done"][
+        ::2
+    ]  # no time limit in every other world
     for part in flight.split(8, 1):  # more than the buffer holds, so that old steps are overwritten
         learner.drawn = ()
         learner.learn(part)
@@ -143,7 +164,10 @@ def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_ho
 
 def test_steps_after_an_end_that_was_known_only_later_are_not_learnt_from():
     env = UavEnv(everything("instant", kind="discrete"), 4)
-    config, buffer = SacConfig(updates=1, batch_size=200, warm_up=0), ReplayBuffer(storage=TimeStorage(200))
+    config, buffer = (
+        SacConfig(updates=1, batch_size=200, warm_up=0),
+        ReplayBuffer(storage=TimeStorage(200)),
+    )
     learner = RecordingSac(env, config, learning(SMALL), buffer)
     flight = fly(env, learner.actor, 12)
     flight["valid"] = torch.zeros(4, 12, 1, dtype=torch.bool)

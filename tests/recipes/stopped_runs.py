@@ -1,4 +1,5 @@
-"""Runs of the training recipe that are stopped in the middle: in this process, or in a forked child."""
+"""Runs of the training recipe that are stopped in the middle: in this process, or in a forked
+child."""
 
 import os
 import signal
@@ -23,7 +24,14 @@ TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "c
 TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]
 SAC = ["learner=sac", "learner.updates=1", "learner.batch_size=16", "learner.warm_up=40"]
 SAC += ["learner.buffer_steps=160"]
-FINISHED = {"config.yaml", "run.json", "metrics.csv", "checkpoint.pt", "best.pt", "learning_curve.png"}
+FINISHED = {
+    "config.yaml",
+    "run.json",
+    "metrics.csv",
+    "checkpoint.pt",
+    "best.pt",
+    "learning_curve.png",
+}
 FINISHED |= {"result.csv", "result.md"}
 
 
@@ -70,14 +78,17 @@ def counted_updates() -> Iterator[list[int]]:
 
 
 def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
-    """Start the recipe with words in a forked child, which needs no second for imports; returns its id."""
+    """Start the recipe with words in a forked child, which needs no second for imports; returns its
+    id."""
     child = os.fork()
     if child:
         return child
     code = 130  # if a signal comes before the program has begun
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+            signal.signal(
+                number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+            )
         output = os.open("output.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(output, 1)
         os.dup2(output, 2)
@@ -139,7 +150,9 @@ def check_equal(whole: Path, other: Path) -> None:
         assert (other / name).read_bytes() == (whole / name).read_bytes(), name
     one, two = stored(whole), stored(other)
     assert one.keys() == two.keys()
-    differ = [name for name in one if not torch.equal(one[name].nan_to_num(9), two[name].nan_to_num(9))]
+    differ = [
+        name for name in one if not torch.equal(one[name].nan_to_num(9), two[name].nan_to_num(9))
+    ]
     assert differ == []
     assert files(other) == files(whole)
     assert {str(path) for path in FINISHED} <= files(whole)

@@ -29,16 +29,22 @@ from damian.recipes.shared.settings import check_learning
     ],
 )
 def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
-    code = f"import sys\ntry:\n    {code}\nfinally:\n    assert not {{'torch', 'pandas'}} & {{*sys.modules}}"
+    code = (
+        f"import sys\ntry:\n    {code}\nfinally:\n    assert not {{'torch', 'pandas'}} & "
+        f"{{*sys.modules}}"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "AssertionError" not in done.stderr
     assert done.returncode == (2 if "agnts=3" in code else 0)
 
 
-LATE = "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, 3s..7s)"
+LATE = (
+    "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, 3s..7s)"
+)
 FILES = "is not one of damian:fir.csv, damian:queue_trace.csv"
 POLICIES = (
-    "is not one of damian:convoy, damian:crowded-any-delay, damian:flights, damian:requests, damian:tracking"
+    "is not one of damian:convoy, damian:crowded-any-delay, damian:flights, damian:requests, "
+    "damian:tracking"
 )
 RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order"
 
@@ -51,7 +57,10 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
         (["train", "agents"], "agents: this word is not of the form KEY=VALUE"),
         (["train", "+delay.obz=1"], "delay.obz: unknown setting; did you mean delay.obs?"),
         (["train", "num_envs=8"], "num_envs: unknown setting; did you mean worlds?"),
-        (["train", "learner.lmbd=0.9"], "learner.lmbd: unknown setting; did you mean learner.lmbda?"),
+        (
+            ["train", "learner.lmbd=0.9"],
+            "learner.lmbd: unknown setting; did you mean learner.lmbda?",
+        ),
         (["train", "delay=3"], "delay: 3 is not an option of this group; write delay.obs=3"),
         (["train", "-m", "delay=none,papr"], "delay: papr is not one of"),
         (["train", "source.speed=3"], "source.speed: 3.0 means nothing with source=static"),
@@ -62,11 +71,20 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
         (["train", "delay.obs=-1"], f"delay.obs: -1 {LATE}"),
         (["train", "delay.obs=1..7s"], f"delay.obs: 1..7s {RANGE}"),
         (["train", "delay.obs.high=3"], "delay.obs.law: None is not one of"),
-        (["train", "clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
+        (
+            ["train", "clock.agents=1.5s"],
+            "clock.agents: 1.5s is not a multiple of clock.simulation=1s",
+        ),
         (["train", "region=geojson"], "region.path: it is missing: region.kind=geojson needs it"),
         (["train", "delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
-        (["train", "delay.obs={law: trace, path: damian:x.csv}"], f"delay.obs.path: damian:x.csv {FILES}"),
-        (["train", "region=geojson", "region.path=damian:x.csv"], f"region.path: damian:x.csv {FILES}"),
+        (
+            ["train", "delay.obs={law: trace, path: damian:x.csv}"],
+            f"delay.obs.path: damian:x.csv {FILES}",
+        ),
+        (
+            ["train", "region=geojson", "region.path=damian:x.csv"],
+            f"region.path: damian:x.csv {FILES}",
+        ),
         (["train", "checkpoint=nowhere"], "checkpoint: nowhere holds no config.yaml"),
         (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
         (["export", "damian:crowded/best.pt"], f"checkpoint: damian:crowded {POLICIES}"),
@@ -74,9 +92,15 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
             ["submit", "folder=.", "method=x", "authors=x"],
             "folder: . has no results.csv beside curves.csv: give the",
         ),
-        (["train", "resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
+        (
+            ["train", "resume=nowhere", "agents=4"],
+            "agents=4: a resumed run keeps its configuration",
+        ),
         (["compare", "experiment=usecases", "agents=3"], "agents: it is a setting of the runs"),
-        (["compare", "-m", "experiment=usecases"], "-m: not with damian compare, which has many runs anyway"),
+        (
+            ["compare", "-m", "experiment=usecases"],
+            "-m: not with damian compare, which has many runs anyway",
+        ),
         (["results"], "folders: it is not one folder, or two to compare"),
     ],
     ids=lambda part: part[-1] if isinstance(part, list) else "",
@@ -97,7 +121,13 @@ def test_whole_numbers_and_times_may_be_written_as_people_write_them(tmp_path, m
     monkeypatch.setenv("TASK", "7")
     words = ["frames=1e6", "seed=${oc.env:TASK}", "model.hidden=[1e2,64]", "delay.obs=133ms"]
     config = cli.settings(*words, "clock.simulation=50ms", "worlds=2e1", "episode.max_steps=3.0e+1")
-    found = [config.frames, config.seed, *config.model.hidden, config.worlds, config.episode.max_steps]
+    found = [
+        config.frames,
+        config.seed,
+        *config.model.hidden,
+        config.worlds,
+        config.episode.max_steps,
+    ]
     assert found == [1_000_000, 7, 100, 64, 20, 30]
     assert {type(number) for number in found} == {int}
     assert config.make_delays().obs.longest == 3
@@ -116,19 +146,25 @@ RISEN = {"law": "uniform", "low": "3s", "high": "9s", "probability": 0.15}
         (["delay=lag", f"delay.obs={UNIFORM}"], yaml.safe_load(UNIFORM)),
         (["delay=paper", f"+delay.obs={UNIFORM}"], yaml.safe_load(UNIFORM)),
         (["delay=paper", "delay.obs=1..7"], "1..7"),
-        (["delay=paper", f"delay.obs={UNIFORM}", "delay.obs.high=9"], yaml.safe_load(UNIFORM) | {"high": 9}),
+        (
+            ["delay=paper", f"delay.obs={UNIFORM}", "delay.obs.high=9"],
+            yaml.safe_load(UNIFORM) | {"high": 9},
+        ),
         (["delay=paper", "delay.obs.high=9s"], RISEN),
     ],
 )
 def test_a_law_replaces_the_one_before_it_whole_and_its_fields_change_it(words, law):
     assert cli.settings(*words).delay.obs == law
-    links = cli.settings("links=updown", "links.delay={law: geometric}", f"links.delay={UNIFORM}").links
+    links = cli.settings(
+        "links=updown", "links.delay={law: geometric}", f"links.delay={UNIFORM}"
+    ).links
     assert links.delay == yaml.safe_load(UNIFORM)
 
 
 @pytest.fixture
 def mine(tmp_path, monkeypatch) -> Path:
-    """The file of a scenario of one's own, ``--config-dir=own scenario=mine`` in the current folder."""
+    """The file of a scenario of one's own, ``--config-dir=own scenario=mine`` in the current
+    folder."""
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "own" / "scenario" / "mine.yaml"
     file.parent.mkdir(parents=True)
@@ -207,7 +243,9 @@ def test_every_program_is_a_module_and_says_what_it_does(capsys):
 
 
 def test_help_explains_a_program_a_section_and_a_setting(capsys):
-    assert [key for key, each in known_settings("train").items() if not (each.is_section or each.text)] == []
+    assert [
+        key for key, each in known_settings("train").items() if not (each.is_section or each.text)
+    ] == []
     main(["train", "--help"])
     page = capsys.readouterr().out
     assert all(name in page for name in {*groups()} - {"experiment"})
@@ -221,7 +259,13 @@ def test_help_explains_a_program_a_section_and_a_setting(capsys):
 
 
 def test_a_program_is_a_script_too(tmp_path):
-    command = [sys.executable, str(CONF.parent / "recipes" / "train.py"), "agents=1", "--cfg", "job"]
+    command = [
+        sys.executable,
+        str(CONF.parent / "recipes" / "train.py"),
+        "agents=1",
+        "--cfg",
+        "job",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "agents: 1" in done.stdout
@@ -236,7 +280,9 @@ def test_a_folder_that_cannot_be_written_is_one_line(capsys, tmp_path, monkeypat
 
 
 def test_a_belief_by_which_nothing_is_won_is_left_out_and_said():
-    with pytest.warns(UserWarning, match="observation.belief and model.skip: left out, because nothing"):
+    with pytest.warns(
+        UserWarning, match="observation.belief and model.skip: left out, because nothing"
+    ):
         config = settings("scenario=patrol", "aware=belief")
     assert (config.observation.belief, config.model.skip) == ([], False)
 
@@ -245,7 +291,9 @@ def test_a_learner_is_judged_by_what_it_reads_not_by_the_shape_of_its_name():
     read = {"reads": ("timeline",), "__doc__": "A learner of a plug-in.", "__module__": "lab"}
     lab = LEARNERS.register("lab")(dataclass(type("Lab", (MappoConfig,), read)))
     try:
-        assert type(settings("learner=mappo", "learner.name=lab", "delay.messages=2").learner) is lab
+        assert (
+            type(settings("learner=mappo", "learner.name=lab", "delay.messages=2").learner) is lab
+        )
         check_learning(settings("learner=mappo", "learner.name=lab", "delay.messages=2"))
     finally:
         del LEARNERS._components["lab"]

@@ -52,26 +52,40 @@ def measured(folder: Path) -> list[dict[str, str]]:
 
 def stamps(folder: Path) -> dict[str, int]:
     """Time of the last change of every file in the folders of the runs."""
-    return {str(path): path.stat().st_mtime_ns for path in sorted(folder.rglob("seed_*/*")) if path.is_file()}
+    return {
+        str(path): path.stat().st_mtime_ns
+        for path in sorted(folder.rglob("seed_*/*"))
+        if path.is_file()
+    }
 
 
-def test_each_method_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare, capsys, tmp_path):
+def test_each_method_and_seed_is_run_once_and_an_interrupted_run_is_resumed(
+    compare, capsys, tmp_path
+):
     (tmp_path / "my files").mkdir()
     folder = compare("--config-dir", "my files", *TWO)
     printed = capsys.readouterr().out
     runs = [f"none/undelayed/seed_{n}" for n in (8, 9)] + [f"paper/naive/seed_{n}" for n in (8, 9)]
-    found = sorted(path.parent.relative_to(folder / "usecase2") for path in folder.rglob("result.csv"))
+    found = sorted(
+        path.parent.relative_to(folder / "usecase2") for path in folder.rglob("result.csv")
+    )
     assert [str(path) for path in found] == runs
     assert "| random |" in (folder / "usecase2" / runs[0] / "log.txt").read_text()
     text = (folder / "table.md").read_text()
     assert text.strip() in printed
-    for part in ("**developing**", "2 seeds (8 to 9), 3 episodes", "Trained for 16 environment steps"):
+    for part in (
+        "**developing**",
+        "2 seeds (8 to 9), 3 episodes",
+        "Trained for 16 environment steps",
+    ):
         assert part in text
     typed = re.search(r"^- `damian compare (.*)`$", text, re.MULTILINE)[1]
     assert shlex.split(typed) == ["--config-dir", "my files", *TWO]
     rows = table(folder / "results.csv")
     assert len(rows) == 4 * 6
-    naive = [r for r in rows if (r["method"], r["policy"], r["delay"]) == ("naive", TRAINED, "paper")]
+    naive = [
+        r for r in rows if (r["method"], r["policy"], r["delay"]) == ("naive", TRAINED, "paper")
+    ]
     assert [r["seed"] for r in naive] == ["8", "9"]
     stored = [table(folder / "usecase2" / name / "result.csv")[2]["return"] for name in runs[2:]]
     assert [float(r["return"]) for r in naive] == [float(number) for number in stored]
@@ -84,7 +98,9 @@ def test_each_method_and_seed_is_run_once_and_an_interrupted_run_is_resumed(comp
     assert rewritten
     assert all(runs[3] in path for path in rewritten)
     assert {Path(path).parent.parent.name for path in after.keys() - before.keys()} == {"deployed"}
-    resumed = [name for name in runs if "resumed" in (folder / "usecase2" / name / "run.json").read_text()]
+    resumed = [
+        name for name in runs if "resumed" in (folder / "usecase2" / name / "run.json").read_text()
+    ]
     assert resumed == runs[3:]
 
     capsys.readouterr()
@@ -120,7 +136,14 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
     (tmp_path / "conf" / "experiment" / "others.yaml").write_text(LEARNING_FROM_OTHERS)
     shutil.copy(ROOT / "examples" / "extending" / "distillation.py", tmp_path)
     small = listed(*(word for word in SMALL if "learner" not in word), "episode.max_steps=8")
-    words = ["--config-dir", "conf", "experiment=others", "seeds=1", "experiment.first_seed=3", small]
+    words = [
+        "--config-dir",
+        "conf",
+        "experiment=others",
+        "seeds=1",
+        "experiment.first_seed=3",
+        small,
+    ]
     compare(*words)
     folder = tmp_path / "runs" / "others"
     place = folder / "tracking"
@@ -143,7 +166,9 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
     found = measured(folder)
     assert sorted(map(str, found)) == sorted(map(str, rows))
 
-    compare(*words[:3], "methods=[undelayed]", "seeds=1", "experiment.first_seed=4", small, "keep=true")
+    compare(
+        *words[:3], "methods=[undelayed]", "seeds=1", "experiment.first_seed=4", small, "keep=true"
+    )
     assert {row["seed"] for row in measured(folder)} == {"3", "4"}
     assert "1 seeds (4 to 4)" in (folder / "table.md").read_text()
 
@@ -160,7 +185,11 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     for name in ("table.csv", "figure.png", "curves.png"):
         assert (kept / name).read_bytes() == (folder / name).read_bytes()
     compare(*words[:3], "methods=[undelayed]", *stored)
-    assert {line["method"] for line in table(kept / "table.csv")} == {"undelayed", "random", "script"}
+    assert {line["method"] for line in table(kept / "table.csv")} == {
+        "undelayed",
+        "random",
+        "script",
+    }
     late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
     check_refused(lambda: compare(*words, *late), problem, capsys)
 
@@ -174,9 +203,13 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
     before = stamps(folder)
     (source / "result.csv").touch()  # as in a copy of the folder
     compare(*words)
-    assert stamps(folder) == before | {str(source / "result.csv"): stamps(folder)[str(source / "result.csv")]}
+    assert stamps(folder) == before | {
+        str(source / "result.csv"): stamps(folder)[str(source / "result.csv")]
+    }
     record = json.loads((flown / "run.json").read_text())
-    (flown / "run.json").write_text(json.dumps(record | {"policy_sha256": "of an earlier checkpoint"}))
+    (flown / "run.json").write_text(
+        json.dumps(record | {"policy_sha256": "of an earlier checkpoint"})
+    )
     compare(*words)
     rewritten = {path for path, stamp in stamps(folder).items() if stamp != before.get(path)}
     assert str(flown / "result.csv") in rewritten
@@ -219,13 +252,23 @@ methods:
     ("text", "words", "message"),
     [
         ("", [listed("framess=3")], "usecase2/none/undelayed: framess: unknown setting"),
-        ("", ["methods=[deployed]"], "experiment.methods.deployed.policy_of: undelayed is not known"),
-        ("tasks: {spotting: []}", ["experiment=mine"], "experiment.methods: it is missing or empty"),
+        (
+            "",
+            ["methods=[deployed]"],
+            "experiment.methods.deployed.policy_of: undelayed is not known",
+        ),
+        (
+            "tasks: {spotting: []}",
+            ["experiment=mine"],
+            "experiment.methods: it is missing or empty",
+        ),
         (FITS_NOT, ["experiment=mine"], "flown: observation.age: the policy was trained with True"),
     ],
     ids=["words", "methods", "empty", "fits not"],
 )
-def test_a_mistake_is_one_line_and_leaves_no_folder(compare, capsys, tmp_path, text, words, message):
+def test_a_mistake_is_one_line_and_leaves_no_folder(
+    compare, capsys, tmp_path, text, words, message
+):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     (tmp_path / "own" / "experiment" / "mine.yaml").write_text(text)
     words = words if text else [*TWO[:3], *words]
@@ -248,7 +291,10 @@ def test_a_comparison_flies_policies_in_held_out_tasks(compare, tmp_path):
     words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
     compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
     results = tmp_path / "runs/script"
-    assert "## follow@two, delay late\n\nPolicies of another task." in (results / "table.md").read_text()
+    assert (
+        "## follow@two, delay late\n\nPolicies of another task."
+        in (results / "table.md").read_text()
+    )
     for method in ("none/best", "late/naive"):
         flown = results / "follow@two" / method / "seed_0"
         config = (flown / "config.yaml").read_text()
@@ -267,11 +313,18 @@ def test_runs_go_seed_by_seed_and_a_held_out_delay_replaces_the_one_of_the_train
     runs = plan(config, Path("runs"))
     trains = [run for run in runs if run.work is train]
     trained = [
-        f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
+        f"{name}/seed_{seed}"
+        for seed in (3, 4)
+        for name in ("a/none/best", "a/late/naive", "b/none/best")
     ]
     assert [run.name for run in trains] == trained
     flown = {run.folder.parts[1:-1:2]: run.config.delay.obs for run in runs if run not in trains}
     assert flown.keys() == {("b", "flown"), ("a@six", "naive"), ("a@burst", "naive")}
     assert (flown["a@six", "naive"], flown["a@burst", "naive"]["law"]) == (6, "burst")
-    stored = pd.DataFrame({"task": ["a@six", "a@seven"], "delay": "late", "method": "naive", "seed": 3})
-    assert includes(config, stored).tolist() == [True, False]  # of an experiment that had another one
+    stored = pd.DataFrame(
+        {"task": ["a@six", "a@seven"], "delay": "late", "method": "naive", "seed": 3}
+    )
+    assert includes(config, stored).tolist() == [
+        True,
+        False,
+    ]  # of an experiment that had another one

@@ -1,4 +1,5 @@
-"""A trained policy with other UAVs, regions and delays: ``damian evaluate``, and ``damian.load``."""
+"""A trained policy with other UAVs, regions and delays: ``damian evaluate``, and
+``damian.load``."""
 
 import shutil
 import sys
@@ -17,7 +18,14 @@ from damian.compare.comparison import OF_METHOD
 from damian.recipes import train
 from damian.runs.metrics import evaluate
 
-TRAINED = ["frames=64", "worlds=4", "learner.steps=8", "model.hidden=[16]", "eval_episodes=8", "logger=csv"]
+TRAINED = [
+    "frames=64",
+    "worlds=4",
+    "learner.steps=8",
+    "model.hidden=[16]",
+    "eval_episodes=8",
+    "logger=csv",
+]
 TRAINED += ["episode.max_steps=10", "region.lattice_step=60", "seed=3", "delay.obs=1"]
 SHIPPED = sorted(Path(damian.__file__).parent.glob("data/*/"))
 
@@ -44,7 +52,12 @@ def fly(run, trained) -> Callable[..., Path]:
 
 def test_without_overrides_the_evaluation_after_the_training_is_repeated(fly, trained, capsys):
     folder = fly()
-    assert {path.name for path in folder.iterdir()} == {"config.yaml", "result.csv", "result.md", "run.json"}
+    assert {path.name for path in folder.iterdir()} == {
+        "config.yaml",
+        "result.csv",
+        "result.md",
+        "run.json",
+    }
     assert (folder / "result.md").read_text().strip() in capsys.readouterr().out
     again, before = (damian.results(path).set_index("policy") for path in (folder, trained))
     assert {*again.index} == {*before.index} == {*OF_METHOD, "random", "script"}
@@ -69,13 +82,19 @@ def test_a_run_that_was_resumed_is_flown_and_begun_with_as_any_other(fly, traine
     shutil.copytree(trained, tmp_path / "longer")
     fly("resume=longer", "frames=96", of=None, folder="unused", program="train")
     assert (fly(of="longer") / "result.csv").exists()
-    begun = OmegaConf.load(fly("frames=32", of="longer", folder="begun", program="train") / "config.yaml")
+    begun = OmegaConf.load(
+        fly("frames=32", of="longer", folder="begun", program="train") / "config.yaml"
+    )
     assert (begun.resume, begun.frames, begun.seed) == (None, 32, 3)
 
 
 def test_an_option_replaces_what_its_group_sets_and_all_else_stays(fly):
     config = OmegaConf.load(fly("delay=paper", "source=dynamic", "aware=none") / "config.yaml")
-    assert (config.delay.obs.law, config.delay.loss, config.source.motion) == ("uniform", 0.0, "dynamic")
+    assert (config.delay.obs.law, config.delay.loss, config.source.motion) == (
+        "uniform",
+        0.0,
+        "dynamic",
+    )
     assert (config.episode.max_steps, config.region.lattice_step, config.seed) == (10, 60, 3)
 
 
@@ -101,11 +120,16 @@ def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["model.hidden=[8]"], "model.hidden: the policy was trained with [16], so it cannot fly with [8]"),
+        (
+            ["model.hidden=[8]"],
+            "model.hidden: the policy was trained with [16], so it cannot fly with [8]",
+        ),
         (["actions=continuous"], "actions.kind: the policy was trained with 'discrete'"),
     ],
 )
-def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path, overrides, message):
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
+    fly, capsys, tmp_path, overrides, message
+):
     check_refused(lambda: fly(*overrides), message, capsys)
     assert [*tmp_path.glob("*/*")] == []
 
@@ -113,7 +137,12 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tm
 def test_the_policies_of_the_package_are_a_megabyte_of_plain_data():
     assert len(SHIPPED) == 5
     files = [file for folder in SHIPPED for file in folder.iterdir()]
-    assert {file.name for file in files} == {"checkpoint.pt", "config.yaml", "result.csv", "README.md"}
+    assert {file.name for file in files} == {
+        "checkpoint.pt",
+        "config.yaml",
+        "result.csv",
+        "README.md",
+    }
     assert sum(file.stat().st_size for file in files) <= 1_000_000
 
 
@@ -123,6 +152,8 @@ def test_a_policy_of_the_package_returns_what_its_card_says(folder):
     policy, env = damian.load(f"damian:{folder.name}", worlds=50, seed=1)
     told = read_csv(folder / "result.csv", ["law", "policy"]).iloc[0]
     assert (told["law"], told["policy"]) == ("as trained", "sampled")
-    assert f"{told['return']:.1f} ± {told['interval']:.1f}" in (folder / "README.md").read_text("utf-8")
+    assert f"{told['return']:.1f} ± {told['interval']:.1f}" in (folder / "README.md").read_text(
+        "utf-8"
+    )
     horizon = env.uav_env.scenario.episode.max_steps
     assert evaluate(env, policy, horizon)["return"] == pytest.approx(told["return"], rel=0.1)

@@ -1,4 +1,5 @@
-"""An exported policy, run in a process without damian, chooses the same actions as the loaded one."""
+"""An exported policy, run in a process without damian, chooses the same actions as the loaded
+one."""
 
 import json
 import subprocess
@@ -32,7 +33,10 @@ OWN = ["model.shared=false", "source.count=2", "observation.belief=[belief_momen
 
 @pytest.mark.parametrize(
     "words",
-    [HISTORY, *(pytest.param(words, marks=pytest.mark.slow) for words in (GRU, CONTINUOUS, BELIEF, OWN))],
+    [
+        HISTORY,
+        *(pytest.param(words, marks=pytest.mark.slow) for words in (GRU, CONTINUOUS, BELIEF, OWN)),
+    ],
     ids=["history", "gru", "continuous", "belief", "own"],
 )
 def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path):
@@ -53,8 +57,15 @@ def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path):
         for name in {*outputs} - {"action", "probability"}:
             torch.testing.assert_close(outputs[name], rollout["agents", name], rtol=1e-4, atol=1e-5)
         if "probability" in outputs:
-            log_prob = outputs["probability"].log().gather(-1, rollout[keys.ACTION].unsqueeze(-1)).squeeze(-1)
-            torch.testing.assert_close(log_prob, rollout[keys.ACTION_LOG_PROB], rtol=1e-4, atol=1e-5)
+            log_prob = (
+                outputs["probability"]
+                .log()
+                .gather(-1, rollout[keys.ACTION].unsqueeze(-1))
+                .squeeze(-1)
+            )
+            torch.testing.assert_close(
+                log_prob, rollout[keys.ACTION_LOG_PROB], rtol=1e-4, atol=1e-5
+            )
     columns = described["inputs"]["observation"]["columns"]
     assert sum(each["columns"] for each in columns) == inputs["observation"].shape[-1]
     assert all(each["meaning"] for each in columns)

@@ -1,4 +1,5 @@
-"""Faults around a run: a full disk, a folder in use, a learner that diverges, damaged folders, signals."""
+"""Faults around a run: a full disk, a folder in use, a learner that diverges, damaged folders,
+signals."""
 
 import os
 import re
@@ -95,9 +96,13 @@ def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatc
         run(*TINY, "checkpoint_every=1", folder="bad")
     assert stopped.value.code == 3
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("error: update 2: loss_critic is inf: the learner has diverged; choose a smaller")
+    assert line.startswith(
+        "error: update 2: loss_critic is inf: the learner has diverged; choose a smaller"
+    )
     assert line.endswith("bad/checkpoint.pt is of update 1 and intact")
-    assert read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 1
+    assert (
+        read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 1
+    )
 
 
 LATE = """
@@ -121,7 +126,9 @@ NAN = {
 
 
 @pytest.mark.parametrize("word", NAN)
-def test_a_nan_is_blamed_on_what_made_it_and_not_on_the_learner(run, capsys, tmp_path, monkeypatch, word):
+def test_a_nan_is_blamed_on_what_made_it_and_not_on_the_learner(
+    run, capsys, tmp_path, monkeypatch, word
+):
     (tmp_path / "late.py").write_text(LATE)
     monkeypatch.delitem(sys.modules, "late", raising=False)
     with pytest.raises(SystemExit) as stopped:
@@ -135,9 +142,15 @@ def test_a_nan_is_blamed_on_what_made_it_and_not_on_the_learner(run, capsys, tmp
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda f: (f / "checkpoint.pt").unlink(), "checkpoint.pt: it cannot be read: No such file"),
+        (
+            lambda f: (f / "checkpoint.pt").unlink(),
+            "checkpoint.pt: it cannot be read: No such file",
+        ),
         (lambda f: (f / "config.yaml").write_text("agents: [\n"), "config.yaml: "),
-        (lambda f: (f / "run.json").write_text('{"damian": "0.4.0"}'), "resume: run: damian 0.4.0 wrote it"),
+        (
+            lambda f: (f / "run.json").write_text('{"damian": "0.4.0"}'),
+            "resume: run: damian 0.4.0 wrote it",
+        ),
     ],
 )
 def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, message):
@@ -156,4 +169,6 @@ def test_sigterm_stops_a_run_after_its_update(run, capsys):
         run(*TINY)
     assert stopped.value.code == 143
     assert capsys.readouterr().err.splitlines()[-1] == "interrupted; continue with resume=run"
-    assert read_checkpoint(Path("run/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 2
+    assert (
+        read_checkpoint(Path("run/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 2
+    )

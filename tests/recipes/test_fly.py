@@ -27,7 +27,9 @@ def fly(run):
 
 def printed_line(capsys) -> str:
     """The line about the episode."""
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("episode_0")]
+    (line,) = [
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("episode_0")
+    ]
     return line
 
 
@@ -48,12 +50,21 @@ def test_a_run_folder_holds_configuration_episode_film_and_figure(fly, capsys):
 @pytest.mark.parametrize(("motion", "crosses"), [("instant", True), ("polynomial", False)])
 def test_a_note_says_that_instant_ways_cross_no_fly_zones(fly, capsys, motion, crosses):
     fly("region.zones=1", "episode.max_steps=2", f"motion={motion}", *FLYING[1:])
-    assert ("note: with motion=instant nobody lands in a no-fly zone" in capsys.readouterr().out) == crosses
+    assert (
+        "note: with motion=instant nobody lands in a no-fly zone" in capsys.readouterr().out
+    ) == crosses
 
 
 @pytest.mark.slow
 def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run, fly):
-    words = ["agents=2", "frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "eval_episodes=2"]
+    words = [
+        "agents=2",
+        "frames=32",
+        "worlds=2",
+        "learner.steps=8",
+        "model.hidden=[4]",
+        "eval_episodes=2",
+    ]
     words += ["actions.distances=[0,30,60]", "episode.max_steps=6", "delay.obs=2"]
     run(*words, folder="trained")
     words = ["policy=deterministic", "checkpoint=trained", "episode.max_steps=6"]
@@ -87,10 +98,15 @@ def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(fly, c
     [
         (["policy=deterministic"], "policy: deterministic needs checkpoint"),
         (["agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
-        (["formats=[geojson]", "region=usecase"], "geojson: its region has no latitude and longitude"),
+        (
+            ["formats=[geojson]", "region=usecase"],
+            "geojson: its region has no latitude and longitude",
+        ),
     ],
 )
-def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path, overrides, message):
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
+    fly, capsys, tmp_path, overrides, message
+):
     check_refused(lambda: fly(*overrides), message, capsys)
     assert [*tmp_path.glob("*/*")] == []
 

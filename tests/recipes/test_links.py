@@ -1,6 +1,8 @@
-"""Each program, started where one of the things that it writes is a link: what the link leads to stays.
+"""Each program, started where one of the things that it writes is a link: what the link leads to
+stays.
 
-What a program writes is found out by a run without links: each path that Python writes, if only for a while.
+What a program writes is found out by a run without links: each path that Python writes, if only for
+a while.
 """
 
 import os
@@ -30,7 +32,10 @@ DOORS = {
     "resume": ("off-policy", ["train", "resume=named", "frames=96"]),
     "evaluate": (None, ["evaluate", "checkpoint=finished/train", HERE]),
     "fly": (None, ["fly", "policy=random", "episode.max_steps=2", "eval_episodes=1", *FILMS, HERE]),
-    "advise": (None, ["advise", "policy=script", "region.lattice_step=90", "table=table.csv", HERE]),
+    "advise": (
+        None,
+        ["advise", "policy=script", "region.lattice_step=90", "table=table.csv", HERE],
+    ),
     "fit": (None, ["advise", "fit=log.csv", HERE]),
     "export": ("train", ["export", "named"]),
     "sweep": (None, ["train", "-m", *TINY, "seed=0", "hydra.sweep.dir=named"]),
@@ -55,16 +60,21 @@ sys.addaudithook(_listen)  # none can be removed
 
 
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """All below a folder, with the times of the last changes, since the same may be written again."""
+    """All below a folder, with the times of the last changes, since the same may be written
+    again."""
     return {
-        str(path.relative_to(folder)): (b"" if path.is_dir() else path.read_bytes(), path.stat().st_mtime_ns)
+        str(path.relative_to(folder)): (
+            b"" if path.is_dir() else path.read_bytes(),
+            path.stat().st_mtime_ns,
+        )
         for path in sorted(folder.rglob("*"))
     }
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with what the programs read, and with the finished folder of each door that was asked for."""
+    """A folder with what the programs read, and with the finished folder of each door that was
+    asked for."""
     folder = tmp_path_factory.mktemp("links")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -104,7 +114,8 @@ def finished(door: str) -> tuple[Path, list[str]]:
 
 
 def link(path: Path, original: Path, outside: Path, dangling: bool) -> None:
-    """Put a link where a path was, or shall be, to a copy of the original outside, or to nothing there."""
+    """Put a link where a path was, or shall be, to a copy of the original outside, or to nothing
+    there."""
     shutil.rmtree(outside, ignore_errors=True)
     outside.mkdir()
     if original.is_dir() and not dangling:
@@ -118,7 +129,10 @@ def link(path: Path, original: Path, outside: Path, dangling: bool) -> None:
     path.symlink_to(outside / "target")
 
 
-CASES = [pytest.param("report", 3), *(pytest.param(door, 1, marks=pytest.mark.slow) for door in DOORS)]
+CASES = [
+    pytest.param("report", 3),
+    *(pytest.param(door, 1, marks=pytest.mark.slow) for door in DOORS),
+]
 
 
 @pytest.mark.parametrize(("door", "share"), CASES)

@@ -1,4 +1,5 @@
-"""Reference methods: messages held back to a constant delay (``delay.hold``), and a privileged critic."""
+"""Reference methods: messages held back to a constant delay (``delay.hold``), and a privileged
+critic."""
 
 import math
 
@@ -35,7 +36,10 @@ from damian.world.state import Truth
 
 UNIFORM = {"law": "uniform", "low": 1, "high": 3, "probability": 0.3}
 BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.0}
-LATE = {"delay": DelayConfig(obs=BURST, loss=0.3, history=2, rew=1), "clock": ClockConfig(server="2s")}
+LATE = {
+    "delay": DelayConfig(obs=BURST, loss=0.3, history=2, rew=1),
+    "clock": ClockConfig(server="2s"),
+}
 
 
 def rollout_of(scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS) -> list[TensorDictBase]:
@@ -56,10 +60,13 @@ def test_held_messages_arrive_as_with_a_constant_delay(obs, longest, motion):
 def test_delays_and_losses_do_not_change_the_privileged_observation(motion):
     same = {"episode": KEEPS_GOING, "observation": ObservationConfig(LOCAL, GLOBAL)}
     undelayed, delayed = (
-        rollout_of(everything(motion, **same, **sections), ("privileged",)) for sections in ({}, LATE)
+        rollout_of(everything(motion, **same, **sections), ("privileged",))
+        for sections in ({}, LATE)
     )
     held = ("agents", "global_observation")
-    assert not all(one[held].equal(other[held]) for one, other in zip(undelayed, delayed, strict=True))
+    assert not all(
+        one[held].equal(other[held]) for one, other in zip(undelayed, delayed, strict=True)
+    )
     for one, other in zip(undelayed, delayed, strict=True):
         assert one[PRIVILEGED].equal(other[PRIVILEGED])
         assert one[PRIVILEGED][..., :-2].equal(one[held])
@@ -69,7 +76,8 @@ def test_delays_and_losses_do_not_change_the_privileged_observation(motion):
 def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
     position = [20.0, 150.0]
     outputs = rollout_of(
-        square(motion=MOTIONS[motion], source=SourceConfig(position=position)), ("privileged", "state")
+        square(motion=MOTIONS[motion], source=SourceConfig(position=position)),
+        ("privileged", "state"),
     )
     for td in outputs:
         uavs = Truth.unpack(td["state"]).position[..., :2]
@@ -81,7 +89,9 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
 @both_kinds
 @pytest.mark.parametrize("learner", [MappoConfig(steps=12, minibatches=2), SacConfig()])
 def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(learner, kind):
-    late = vars(everything(delay=DelayConfig(obs=UNIFORM, history=2), actions=ActionConfig(kind=kind)))
+    late = vars(
+        everything(delay=DelayConfig(obs=UNIFORM, history=2), actions=ActionConfig(kind=kind))
+    )
     tiny = {"worlds": 4, "learner": learner, "model": MlpConfig([16])}
     config = TrainConfig(**late, **tiny, critic="privileged")
     env = learning_env(config)

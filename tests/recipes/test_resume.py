@@ -1,4 +1,5 @@
-"""A run that was stopped and resumed equals one that never was: metrics, weights and results, bit for bit."""
+"""A run that was stopped and resumed equals one that never was: metrics, weights and results, bit
+for bit."""
 
 import itertools
 import os
@@ -14,12 +15,30 @@ from stopped_runs import SAC, TINY, check_equal, counted_updates, ended, files, 
 
 WHOLE = ["delay=paper", "delay.obs.high=9s", "aware=backupdate+history", "delay.act=1"]
 WHOLE += ["motion=polynomial", "model.rnn=gru"]
-TRIGGERED = ["learner.steps=4", "clock.trigger=2s", "clock.longest=10s", "source.level_db=106", "delay.obs=2"]
+TRIGGERED = [
+    "learner.steps=4",
+    "clock.trigger=2s",
+    "clock.longest=10s",
+    "source.level_db=106",
+    "delay.obs=2",
+]
 TRIGGERED += ["learner.normalize_value=true"]
-SLOW_CLOCKS = ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"]
+SLOW_CLOCKS = [
+    "delay=paper",
+    "delay.obs.high=9s",
+    "clock.agents=2s",
+    "clock.server=4s",
+    "clock.system=16s",
+]
 FEW = ["learner.prediction_steps=2", "learner.prediction_batch=8", "learner.prediction_buffer=64"]
 CASES = {
-    "recurrent": ["delay.obs=2", "aware=backupdate", "delay.act=1", "delay.history=2", "model.rnn=gru"],
+    "recurrent": [
+        "delay.obs=2",
+        "aware=backupdate",
+        "delay.act=1",
+        "delay.history=2",
+        "model.rnn=gru",
+    ],
     "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1"],
     "sac bursts": [*SAC, "scenario=tracking", "delay=burst", "delay.history=2"],
     "everything": [*WHOLE, "settle=true", "learner.steps=16", "frames=512"],
@@ -27,13 +46,19 @@ CASES = {
     "slow clocks": [*SLOW_CLOCKS, "frames=512"],
     "lags": ["delay=lag", "delay.rew=2", "scenario=coverage", "region=random", "region.pool=2"],
     "matrix": ["links=matrix", "links.delay=2", "scenario=mixed", "actions=continuous"],
-    "privileged": ["critic=privileged", "source.motion=dynamic", "observation.own=true", "delay.obs=2"],
+    "privileged": [
+        "critic=privileged",
+        "source.motion=dynamic",
+        "observation.own=true",
+        "delay.obs=2",
+    ],
 }
 QUICK = ("sac",)
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in CASES]
+    "case",
+    [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in CASES],
 )
 def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case):
     words = [*TINY, *CASES[case]]
@@ -62,15 +87,21 @@ def test_a_finished_run_that_goes_on_equals_a_longer_one(run):
 SMALL = [*TINY, "frames=512", "checkpoint_every=4", "episode.max_steps=6"]
 LEARNERS = {"mappo": ["delay.obs=2", "aware=backupdate"], "sac": [*SAC, "delay.obs=2"]}
 STOPPED = (0, 130, 143, -signal.SIGTERM, -signal.SIGKILL)
-"""Exit codes of a run that has ended, or that a signal has stopped before, in or after its training."""
+"""Exit codes of a run that has ended, or that a signal has stopped before, in or after its
+training."""
 STOPS, STOPS_PER_RUN = 20, 5
 
 
 def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int]) -> int:
-    """Start a run and resume it until it is finished; returns how often ``stop``, which starts it, did so."""
+    """Start a run and resume it until it is finished; returns how often ``stop``, which starts it,
+    did so."""
     for stops in range(STOPS_PER_RUN + 1):
         begun = Path(folder, "config.yaml").exists()
-        again = [f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"]
+        again = (
+            [f"resume={folder}", "hydra.run.dir=unused"]
+            if begun
+            else [*words, f"hydra.run.dir={folder}"]
+        )
         code = stop(again) if stops < STOPS_PER_RUN else ended(forked(again))
         assert code in STOPPED, Path("output.txt").read_text(encoding="utf-8")[-2000:]
         if code == 0:
@@ -89,7 +120,9 @@ def check_stopped_runs(words: list[str], whole: Path, stop: Callable[[list[str]]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name)
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name
+)
 def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, number):
     words, moments = [*SMALL, *LEARNERS[learner]], random.Random(f"{learner} {number}")
     begin = time.monotonic()
@@ -118,7 +151,8 @@ def test_a_run_killed_in_the_middle_of_writing_loses_nothing(run, learner):
 
 
 def kill_at_write(number: int) -> None:
-    """Kill this process before the call of this number that makes a file last or gives it its name."""
+    """Kill this process before the call of this number that makes a file last or gives it its
+    name."""
     calls = itertools.count()
     for name in ("fsync", "replace", "unlink"):
         original = getattr(os, name)

@@ -27,7 +27,11 @@ SUBMIT = ["submit", "folder=runs", "method=mine", "authors=A. Author"]
 def folder(tmp_path, monkeypatch):
     """The folder of a comparison in which ``mine`` has five runs."""
     monkeypatch.chdir(tmp_path)
-    words = ["scenario=delaybench/crowded", "delay.obs={law: uniform, low: 1, high: 7}", "aware=timeline"]
+    words = [
+        "scenario=delaybench/crowded",
+        "delay.obs={law: uniform, low: 1, high: 7}",
+        "aware=timeline",
+    ]
     config, rows = settings(*words), []
     for seed in range(8, 13):
         run = tmp_path / "runs" / "crowded" / "1-7" / "mine" / f"seed_{seed}"
@@ -40,7 +44,13 @@ def folder(tmp_path, monkeypatch):
         write_csv(run / "result.csv", pd.DataFrame([evaluated]))
         networks = {"actor": {"w": torch.zeros(3, 4)}, "optimizer": {"w": torch.zeros(9)}}
         write_checkpoint(run / "checkpoint.pt", {"components": networks})
-        label = {"task": "crowded", "delay": "1-7", "method": "mine", "seed": seed, "regime": "late data"}
+        label = {
+            "task": "crowded",
+            "delay": "1-7",
+            "method": "mine",
+            "seed": seed,
+            "regime": "late data",
+        }
         rows.append(label | evaluated | {"frames": 1e6, "return": 99.0})
     write_csv(tmp_path / "runs" / "results.csv", pd.DataFrame(rows))
     (tmp_path / "runs" / "curves.csv").write_text("task,delay,method,seed\n")
@@ -96,7 +106,11 @@ def test_a_submission_of_another_task_is_refused(folder, capsys, key, value, tol
     [
         ("seed", range(5), "seed: [0, 1, 2, 3, 4] are too few, or too small: run compare again"),
         ("seed", 8, "are not all different"),
-        ("task", "crowded_mini", "task: crowded_mini is not of the leaderboard: train in one that is"),
+        (
+            "task",
+            "crowded_mini",
+            "task: crowded_mini is not of the leaderboard: train in one that is",
+        ),
         ("regime", "R0", "mine.csv: regime: R0"),
         ("commit", "abc+changes", "has changes: commit them"),
         ("commit", "", "commit: it is empty"),
@@ -122,7 +136,13 @@ def test_a_comparison_of_few_steps_is_refused(tmp_path, monkeypatch, capsys):
     """As docs/delaybench.md tells it, with a few steps."""
     monkeypatch.chdir(ROOT)
     small = "['frames=64','worlds=2','learner.steps=8','eval_episodes=100']"
-    what = ["tasks=[crowded]", "delays=['1-7']", "methods=[timeline]", f"overrides={small}", "seeds=5"]
+    what = [
+        "tasks=[crowded]",
+        "delays=['1-7']",
+        "methods=[timeline]",
+        f"overrides={small}",
+        "seeds=5",
+    ]
     main(["compare", "experiment=delaybench", *what, f"hydra.run.dir={tmp_path}/runs"])
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):

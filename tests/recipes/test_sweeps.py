@@ -20,7 +20,14 @@ from damian.recipes.command import main
 from damian.recipes.shared.runs import Run
 from damian.recipes.shared.sweeps import perform_all
 
-TINY = ["frames=64", "worlds=2", "learner.steps=16", "eval_episodes=2", "model.hidden=[4]", "logger=csv"]
+TINY = [
+    "frames=64",
+    "worlds=2",
+    "learner.steps=16",
+    "eval_episodes=2",
+    "model.hidden=[4]",
+    "logger=csv",
+]
 TINY += ["region.lattice_step=90", "episode.max_steps=8", "learner.minibatches=1", "agents=1"]
 
 
@@ -44,16 +51,23 @@ def test_a_refused_or_diverged_run_is_a_row_and_the_others_go_on(sweep, capsys, 
     learn = Mappo.learn
 
     def diverge(learner: Mappo, batch) -> dict[str, float]:
-        return learn(learner, batch) | ({"loss_critic": math.inf} if learner.config.lr > 0.1 else {})
+        return learn(learner, batch) | (
+            {"loss_critic": math.inf} if learner.config.lr > 0.1 else {}
+        )
 
     monkeypatch.setattr(Mappo, "learn", diverge)
     words = ["seed=0,1", "delay.obs=-1,1", "learner.lr=1e-3,0.99"]
     assert sweep(*words, "hydra.sweep.dir=all") == 1
     printed = capsys.readouterr()
     finished = sorted(file.parent.name for file in Path("all").glob("*/result.csv"))
-    failed = {file.parent.name: json.loads(file.read_text()) for file in Path("all").glob("*/failed.json")}
+    failed = {
+        file.parent.name: json.loads(file.read_text()) for file in Path("all").glob("*/failed.json")
+    }
     assert len(failed) == 6
-    assert finished == ["seed-0_delay.obs-1_learner.lr-0.001", "seed-1_delay.obs-1_learner.lr-0.001"]
+    assert finished == [
+        "seed-0_delay.obs-1_learner.lr-0.001",
+        "seed-1_delay.obs-1_learner.lr-0.001",
+    ]
     assert "the learner has diverged" in failed["seed-0_delay.obs-1_learner.lr-0.99"]["error"]
     refused = failed["seed-0_delay.obs--1_learner.lr-0.001"]
     assert refused["error"].startswith("delay.obs: -1 is not a delay")
@@ -97,8 +111,14 @@ def test_of_many_runs_one_that_fails_is_kept_and_the_others_go_on(tmp_path):
     runs = [Run(work, config, tmp_path / name) for name in names]
     runs.append(Run(work, config, tmp_path / "later", needs=tmp_path / "wrong", stage=1))
     assert [run.folder.name for run in perform_all(runs, 1)] == ["wrong", "later"]
-    told = [json.loads((tmp_path / name / "failed.json").read_text())["error"] for name in ("wrong", "later")]
-    assert told == ["frames: of the user's own code", f"checkpoint: {tmp_path}/wrong has no finished policy"]
+    told = [
+        json.loads((tmp_path / name / "failed.json").read_text())["error"]
+        for name in ("wrong", "later")
+    ]
+    assert told == [
+        "frames: of the user's own code",
+        f"checkpoint: {tmp_path}/wrong has no finished policy",
+    ]
     assert told[0] in (tmp_path / "wrong" / "log.txt").read_text()
     assert perform_all(runs, 1) == []
     assert done == [*names, "wrong", "later"]
@@ -106,18 +126,26 @@ def test_of_many_runs_one_that_fails_is_kept_and_the_others_go_on(tmp_path):
 
 
 def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, capsys):
-    assert sweep("aware=none,backupdate", "delay.obs=1..3", "seed=0,1,2", "hydra.sweep.dir=sweep") == 0
+    assert (
+        sweep("aware=none,backupdate", "delay.obs=1..3", "seed=0,1,2", "hydra.sweep.dir=sweep") == 0
+    )
     table = capsys.readouterr().out.rpartition("results of the sweep")[2]
     assert Path("sweep/figure.png").stat().st_size
     rows = damian.results("sweep")
-    trained = rows[rows["policy"] == "trained"].pivot(index="seed", columns="aware", values="return")
+    trained = rows[rows["policy"] == "trained"].pivot(
+        index="seed", columns="aware", values="return"
+    )
     mean = (trained["backupdate"] - trained["none"]).mean()
     (line,) = [line for line in table.splitlines() if line.startswith("| backupdate | trained |")]
     *_, shown, better = line.removesuffix(" |").split(" | ")
     assert float(shown.split()[0]) == pytest.approx(mean, abs=6e-4)
-    expected = probability_of_improvement(trained["backupdate"].to_numpy(), trained["none"].to_numpy())
+    expected = probability_of_improvement(
+        trained["backupdate"].to_numpy(), trained["none"].to_numpy()
+    )
     assert float(better.split()[0]) == pytest.approx(expected, abs=6e-4)
-    assert float(line.split(" | ")[3].split()[0]) == pytest.approx(trained["backupdate"].mean(), abs=6e-4)
+    assert float(line.split(" | ")[3].split()[0]) == pytest.approx(
+        trained["backupdate"].mean(), abs=6e-4
+    )
     (first,) = [line for line in table.splitlines() if line.startswith("| none | trained |")]
     assert first.endswith("| - | - |")
     assert "return to that of aware=none, paired by seed" in table
@@ -126,12 +154,16 @@ def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, caps
         for folder in Path("sweep").glob(f"aware-{aware}_*"):
             shutil.copytree(folder, Path(aware, folder.name))
     main(["results", "none", "backupdate"])
-    (again,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("| backupdate | trained |")]
+    (again,) = [
+        x for x in capsys.readouterr().out.splitlines() if x.startswith("| backupdate | trained |")
+    ]
     assert again == line
 
 
 def test_a_difference_takes_only_seeds_that_both_have():
-    runs = pd.DataFrame({"seed": [0, 1, 2, 5], "return": [3.0, 5.0, 4.0, 99.0], "steps": [1, 2, 3, 0]})
+    runs = pd.DataFrame(
+        {"seed": [0, 1, 2, 5], "return": [3.0, 5.0, 4.0, 99.0], "steps": [1, 2, 3, 0]}
+    )
     others = pd.DataFrame({"seed": [2, 1, 0], "return": [3.5, 4.0, 1.0], "steps": [4.0, 5.0, 6.0]})
     found = difference(runs, others, "return")
     assert found["difference"] == pytest.approx((2 + 1 + 0.5) / 3)
@@ -146,19 +178,25 @@ def test_a_sweep_evaluates_runs_of_other_folders_as_they_are_now(sweep):
     words = ["checkpoint=trained/0,trained/1", "delay.obs=0,2..4"]
     assert sweep(*words, "hydra.sweep.dir=flown", program="evaluate") == 0
     names = {path.parent.name for path in Path("flown").glob("*/result.csv")}
-    assert names == {f"checkpoint-trained-{run}_delay.obs-{obs}" for run in (0, 1) for obs in ("0", "2..4")}
+    assert names == {
+        f"checkpoint-trained-{run}_delay.obs-{obs}" for run in (0, 1) for obs in ("0", "2..4")
+    }
     before = {path: path.stat().st_mtime_ns for path in Path("flown").glob("*/result.csv")}
     shutil.copy("trained/1/checkpoint.pt", "trained/0/checkpoint.pt")
     assert sweep(*words, "hydra.sweep.dir=flown", program="evaluate") == 0
     again = {path.parent.name for path, when in before.items() if path.stat().st_mtime_ns != when}
-    assert again == {name for name in names if "trained-0" in name}, "the policy that is there now was flown"
+    assert again == {name for name in names if "trained-0" in name}, (
+        "the policy that is there now was flown"
+    )
 
 
 def test_names_of_folders_are_short_and_can_be_typed():
     law = "delay.obs={law:lag,lag:{law:uniform,low:0,high:6},update_period:20,stagger:true,shared:true}"
     sweep, words = ["seed=0,1", law, "scenario=a/b,c"], ["seed=0", law, "scenario=a/b"]
     assert cli._run_name(sweep, words) == "seed-0_scenario-a-b"
-    assert cli._run_name([f"{law},0"], [law]) != cli._run_name([f"{law},0"], [law.replace("20", "21")])
+    assert cli._run_name([f"{law},0"], [law]) != cli._run_name(
+        [f"{law},0"], [law.replace("20", "21")]
+    )
     assert len(cli._run_name([f"{law},0"], [law])) < 100
     assert cli._sweep_name(sweep) != cli._sweep_name([*sweep, "frames=7"])
 

@@ -1,4 +1,5 @@
-"""The training recipe, run by its command line: its run folder, its refusals of wrong input, resumed runs."""
+"""The training recipe, run by its command line: its run folder, its refusals of wrong input,
+resumed runs."""
 
 import csv
 import json
@@ -39,7 +40,9 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
     make = {"actor": make_actor, "critic": make_critic}
     networks = {name: make[name](env, config.model) for name in names}
     load_networks(folder, "folder", networks)
-    return {f"{key}.{name}": w for key, net in networks.items() for name, w in net.state_dict().items()}
+    return {
+        f"{key}.{name}": w for key, net in networks.items() for name, w in net.state_dict().items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +62,35 @@ def trained(tmp_path_factory) -> Path:
         ["scenario=tracking", "motion=polynomial", "agents=2"],
         ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
         ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
-        ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
+        [
+            "delay=paper",
+            "delay.obs.high=9s",
+            "clock.agents=2s",
+            "clock.server=4s",
+            "clock.system=16s",
+        ],
         ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
-        ["learner=sac", "learner.warm_up=64", "actions=continuous", "motion=polynomial", "aware=backupdate"],
-        ["learner=sac", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=backupdate+history"],
-        ["actions=continuous", "model=gru", "motion=polynomial", "delay=paper", "aware=backupdate+history"],
+        [
+            "learner=sac",
+            "learner.warm_up=64",
+            "actions=continuous",
+            "motion=polynomial",
+            "aware=backupdate",
+        ],
+        [
+            "learner=sac",
+            "learner.warm_up=64",
+            "learner.updates=1",
+            "delay=paper",
+            "aware=backupdate+history",
+        ],
+        [
+            "actions=continuous",
+            "model=gru",
+            "motion=polynomial",
+            "delay=paper",
+            "aware=backupdate+history",
+        ],
     ],
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):
@@ -91,7 +118,10 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     assert (trained / "metrics.csv").read_text() == before
     assert (other / "metrics.csv").read_text() != before
     check_refused(lambda: run(*TINY, "seed=2", folder="same"), "same holds a run already", capsys)
-    fewer, made = (f"resume={same}", "frames=100"), "frames: 100 is fewer than the 256 that the run has made"
+    fewer, made = (
+        (f"resume={same}", "frames=100"),
+        "frames: 100 is fewer than the 256 that the run has made",
+    )
     check_refused(lambda: run(*fewer, folder="second"), made, capsys)
     run(f"resume={same}", "frames=250", folder="second")
     assert (same / "metrics.csv").read_text() == before, "nothing was left to train"
@@ -102,7 +132,10 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     resumed = json.loads((same / "run.json").read_text())
     assert record["command"] == resumed["command"]
     assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
-    assert resumed["resumed"][0]["command"] == f"damian train resume={same} frames=250 hydra.run.dir=second"
+    assert (
+        resumed["resumed"][0]["command"]
+        == f"damian train resume={same} frames=250 hydra.run.dir=second"
+    )
 
 
 def test_evaluations_on_the_way_are_seen_beside_the_training_and_change_nothing(run, trained):
@@ -111,9 +144,17 @@ def test_evaluations_on_the_way_are_seen_beside_the_training_and_change_nothing(
         assert (folder / name).read_text() == (trained / name).read_text()
     events = EventAccumulator(str(folder)).Reload()
     tags = events.Tags()["scalars"]
-    assert {tag.partition("/")[0] for tag in tags} == {"train", "reward", "eval", "eval_deterministic"}
+    assert {tag.partition("/")[0] for tag in tags} == {
+        "train",
+        "reward",
+        "eval",
+        "eval_deterministic",
+    }
     assert {"train/perceived_return", "train/steps_per_second", "eval/age", "eval/late"} <= {*tags}
-    points, result = events.Scalars("eval/return"), (folder / "result.csv").read_text().splitlines()[3]
+    points, result = (
+        events.Scalars("eval/return"),
+        (folder / "result.csv").read_text().splitlines()[3],
+    )
     assert [point.step for point in points] == [128, 256, 256]
     assert points[-1].value == pytest.approx(float(result.split(",")[4]))
 
@@ -128,7 +169,12 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run, tra
 
 
 def test_every_policy_is_evaluated_in_the_same_episodes(run):
-    only_hold = ["battery=charging", "battery.capacity_kwh=1e-6", "actions.mask=false", "delay=paper"]
+    only_hold = [
+        "battery=charging",
+        "battery.capacity_kwh=1e-6",
+        "actions.mask=false",
+        "delay=paper",
+    ]
     folder = run(*TINY, *only_hold, "frames=128", "source.level_db=150")
     with (folder / "result.csv").open(newline="") as file:
         _, one, *others = [row[1:] for row in csv.reader(file)]
@@ -173,8 +219,12 @@ def test_the_untrained_actor_of_an_evaluation_is_that_of_the_training_before_its
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [1, 2])
 def test_the_use_cases_are_learnt_in_500_episodes_by_most_seeds(run, case):
-    """About one run in ten of case 2 ends in a policy that takes two steps or fails, as the README says."""
-    runs = [run(f"scenario=paper/usecase{case}", f"seed={seed}", folder=f"seed_{seed}") for seed in range(3)]
+    """About one run in ten of case 2 ends in a policy that takes two steps or fails, as the README
+    says."""
+    runs = [
+        run(f"scenario=paper/usecase{case}", f"seed={seed}", folder=f"seed_{seed}")
+        for seed in range(3)
+    ]
     rows = [(folder / "result.md").read_text().splitlines()[3].split("|") for folder in runs]
     assert sorted(float(row[2]) for row in rows)[1] >= 0.97
     assert sorted(float(row[3]) for row in rows)[1] <= 1.2

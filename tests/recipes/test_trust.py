@@ -1,4 +1,5 @@
-"""A run folder of a stranger is plain data: nothing in it is imported, resolved, composed or followed."""
+"""A run folder of a stranger is plain data: nothing in it is imported, resolved, composed or
+followed."""
 
 import json
 import shutil
@@ -15,7 +16,14 @@ from damian.recipes.command import main
 from damian.recipes.shared.runs import stored_config
 from damian.runs.metrics_log import LOGGERS
 
-TINY = ["frames=64", "worlds=2", "learner.steps=16", "eval_episodes=2", "model.hidden=[4]", "logger=csv"]
+TINY = [
+    "frames=64",
+    "worlds=2",
+    "learner.steps=16",
+    "eval_episodes=2",
+    "model.hidden=[4]",
+    "logger=csv",
+]
 TINY += ["region.lattice_step=90", "episode.max_steps=8", "learner.minibatches=1"]
 MODULE = """
 from pathlib import Path
@@ -28,8 +36,20 @@ class X:
     def log_scalar(self, name, value, step):
         pass
 """
-SPELLINGS = ["evilmod:X", "'evilmod:X'", r"evilmod\:X", "[evilmod:X]", "' evilmod:X'", "str(evilmod:X)"]
-SPELLINGS += ["evil-mod:X", "evilmod:", "evil${oc.env:NOWHERE,mod}:X", r"evil$\{oc.env:NOWHERE,mod\}:X"]
+SPELLINGS = [
+    "evilmod:X",
+    "'evilmod:X'",
+    r"evilmod\:X",
+    "[evilmod:X]",
+    "' evilmod:X'",
+    "str(evilmod:X)",
+]
+SPELLINGS += [
+    "evil-mod:X",
+    "evilmod:",
+    "evil${oc.env:NOWHERE,mod}:X",
+    r"evil$\{oc.env:NOWHERE,mod\}:X",
+]
 SETTINGS = {
     "learner.name": lambda name: name,
     "delay.rew": lambda name: {"law": name},
@@ -47,7 +67,11 @@ SETTINGS = {
 }
 """Settings that name code, by their keys."""
 WORDS = [f"{key}={name}" for key in ("learner", "motion", "logger.custom") for name in SPELLINGS]
-WORDS += ["hydra.searchpath=['file://evil']", "hydra.callbacks.x._target_=evilmod.X", "+hydra/launcher=evil"]
+WORDS += [
+    "hydra.searchpath=['file://evil']",
+    "hydra.callbacks.x._target_=evilmod.X",
+    "+hydra/launcher=evil",
+]
 WORDS += ["region.path=${oc.env:SECRET}", "scenario=../../evil", "trust=true", "agents=2"]
 PROGRAMS = {
     "load": lambda: damian.load("run"),
@@ -75,7 +99,8 @@ def original(tmp_path_factory):
 
 @pytest.fixture
 def store(original):
-    """Write a setting into a copy of the run, as a stranger might; nothing is imported in the test."""
+    """Write a setting into a copy of the run, as a stranger might; nothing is imported in the
+    test."""
     shutil.rmtree("run", ignore_errors=True)
     shutil.copytree(original, "run")
     config = (original / "config.yaml").read_text(encoding="utf-8")
@@ -97,7 +122,8 @@ def check_nothing_ran() -> None:
 
 
 def check_refuses(start, capsys, message) -> None:
-    """Assert that a program is refused in a line with this message, and that nothing was run or made."""
+    """Assert that a program is refused in a line with this message, and that nothing was run or
+    made."""
     capsys.readouterr()
     with pytest.raises((InputError, SystemExit)) as stopped:
         start()
@@ -133,7 +159,9 @@ def test_stored_words_are_only_shown_and_stored_settings_not_resolved(store, mon
 
 
 @pytest.mark.parametrize("name", ["load", "export", "evaluate", "train", "resume"])
-@pytest.mark.parametrize("linked", ["config.yaml", "checkpoint.pt", "replay", "replay/000000.pt", "export"])
+@pytest.mark.parametrize(
+    "linked", ["config.yaml", "checkpoint.pt", "replay", "replay/000000.pt", "export"]
+)
 def test_links_in_a_run_folder_are_not_followed(store, name, linked, capsys):
     shutil.rmtree("outside", ignore_errors=True)
     Path("outside").mkdir()
@@ -173,7 +201,9 @@ def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(stor
 
     word = "logger.custom=[mine:X]"
     store("logger.custom", ["mine:X"])
-    with pytest.raises(InputError, match=r"logger\.custom\.logger: this run uses code outside DAMIAN .mine:"):
+    with pytest.raises(
+        InputError, match=r"logger\.custom\.logger: this run uses code outside DAMIAN .mine:"
+    ):
         imported(lambda: damian.load("run"))
     assert imported(lambda: damian.load("run", word))
     assert imported(lambda: damian.load("run", trust=True))

@@ -1,4 +1,5 @@
-"""Back-updating in any environment, against a loop over a world's steps, and what a storage refuses.
+"""Back-updating in any environment, against a loop over a world's steps, and what a storage
+refuses.
 
 ``Remote`` has no UAVs; its receiver gets messages late, at the root or in a group of agents.
 """
@@ -12,7 +13,15 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, ReplayBuffer, Unbounded
-from torchrl.envs import Compose, EnvBase, GymEnv, MultiStepTransform, StepCounter, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    GymEnv,
+    MultiStepTransform,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
 
 from damian.common.errors import InputError
 from damian.delays.laws import Uniform
@@ -39,7 +48,8 @@ def key(group: tuple[str, ...], name: str) -> NestedKey:
 
 
 def outcome(group: tuple[str, ...], message: Tensor, elapsed: Tensor) -> dict[NestedKey, Tensor]:
-    """What a receiver concludes from messages [*, 2] or [*, N, 2] after ``elapsed`` [*, 1] steps."""
+    """What a receiver concludes from messages [*, 2] or [*, N, 2] after ``elapsed`` [*, 1]
+    steps."""
     alarm = message[..., 1] < 0.1
     terminated = alarm.any(-1, keepdim=True) if group else alarm.unsqueeze(-1)
     truncated = (elapsed >= LIMIT) & ~terminated
@@ -52,7 +62,8 @@ def outcome(group: tuple[str, ...], message: Tensor, elapsed: Tensor) -> dict[Ne
 
 
 class Remote(EnvBase):
-    """Each message is the sender's random number of the step, behind one that no other message has."""
+    """Each message is the sender's random number of the step, behind one that no other message
+    has."""
 
     def __init__(self, group: tuple[str, ...]) -> None:
         super().__init__(batch_size=[WORLDS])
@@ -89,7 +100,9 @@ class Remote(EnvBase):
         return outputs
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
-        self.elapsed = self.elapsed * 0 if tensordict is None else self.elapsed * ~tensordict["_reset"]
+        self.elapsed = (
+            self.elapsed * 0 if tensordict is None else self.elapsed * ~tensordict["_reset"]
+        )
         return self._outputs(key(self.group, "reward"), *ENDS)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -131,7 +144,9 @@ def make_env(group: tuple[str, ...], case: Case = Case()) -> TransformedEnv:  # 
     transforms = [ObservationDelay(Uniform(0, LONGEST), [message], [received], **told)]
     transforms += [StepCounter(), Receiver(group)]
     if case.latest is not None:
-        transforms.append(RewardDelay(Uniform(0, case.latest), reward, delay_key="reward_delay", seed=4))
+        transforms.append(
+            RewardDelay(Uniform(0, case.latest), reward, delay_key="reward_delay", seed=4)
+        )
     if case.window > 1:
         transforms.append(CumulativeReward(case.window, GAMMA, reward))
     if case.period > 1:
@@ -144,7 +159,9 @@ def rollout(env: TransformedEnv, n_steps: int) -> TensorDictBase:
     return env.rollout(n_steps, break_when_any_done=False)
 
 
-def recompute_of(group: tuple[str, ...]) -> Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]:
+def recompute_of(
+    group: tuple[str, ...],
+) -> Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]:
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
         entries = outcome(group, messages, steps["next", "step_count"])
         return {next_key(name): value for name, value in entries.items()}
@@ -152,7 +169,9 @@ def recompute_of(group: tuple[str, ...]) -> Callable[[TensorDictBase, Tensor], d
     return recompute
 
 
-def make_storage(group: tuple[str, ...], recompute: Any = None, **options: Any) -> BackupdateStorage:
+def make_storage(
+    group: tuple[str, ...], recompute: Any = None, **options: Any
+) -> BackupdateStorage:
     names = {f"{name}_key": key(group, name) for name in ("message", "received", "delay", "age")}
     recompute = recompute or recompute_of(group)
     return BackupdateStorage(80 * WORLDS, recompute, LONGEST, **{**names, **options})
@@ -167,9 +186,12 @@ def stored(storage: BackupdateStorage, steps: TensorDictBase, parts: int = 1) ->
 
 
 class Twin:
-    """What a receiver knows of the stored steps [T, B] of one world after the last of them, step by step."""
+    """What a receiver knows of the stored steps [T, B] of one world after the last of them, step by
+    step."""
 
-    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...], case: Case) -> None:
+    def __init__(
+        self, steps: TensorDictBase, world: int, group: tuple[str, ...], case: Case
+    ) -> None:
         self.steps, self.group, self.T, self.case = steps[:, world], group, len(steps), case
         self.senders = [(i,) for i in range(AGENTS)] if group else [()]
         self.start = [t - int(self.steps["step_count"][t]) for t in range(self.T)]
@@ -186,15 +208,20 @@ class Twin:
             over = over or terminated or elapsed >= LIMIT or reset
 
     def _newest(self, t: int, row: tuple[int, ...]) -> int:
-        """The step after which the newest message was sent; the step before the episode, if at its reset."""
+        """The step after which the newest message was sent; the step before the episode, if at its
+        reset."""
         delay = self.steps[next_key(key(self.group, "delay"))]
-        arrived = [g for g in range(self.start[t], t + 1) if 0 <= delay[(g, *row)] <= self.T - 1 - g]
+        arrived = [
+            g for g in range(self.start[t], t + 1) if 0 <= delay[(g, *row)] <= self.T - 1 - g
+        ]
         return max(arrived, default=self.start[t] - 1)
 
     def message(self, t: int, row: tuple[int, ...]) -> list[float]:
         g, name = self.newest[t][self.senders.index(row)], key(self.group, "message")
         at_reset = g < self.start[t]
-        found = self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
+        found = (
+            self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
+        )
         return found.tolist()
 
     def observation(self, t: int, row: tuple[int, ...]) -> list[float]:
@@ -236,7 +263,9 @@ class Twin:
 
 def random_case(rng: random.Random) -> Case:
     latest, window, period = rng.choice([None, 0, 2, LONGEST]), rng.randint(1, 4), rng.randint(1, 5)
-    return Case(latest, window, period, rng.choice([0.0, 0.4]), rng.choice(["generation", "arrival"]))
+    return Case(
+        latest, window, period, rng.choice([0.0, 0.4]), rng.choice(["generation", "arrival"])
+    )
 
 
 def storage_of(env: TransformedEnv, group: tuple[str, ...], n_steps: int) -> BackupdateStorage:
@@ -257,7 +286,9 @@ def test_stored_steps_become_what_a_slow_twin_says(group, seed):
         case, part = random_case(rng), rng.choice([4, 10, 20])
         env = make_env(group, case)
         collected = rollout(env, 40)
-        capacity = part + 2 * LONGEST + case.window - 1 + case.period - 1  # the least, so that the ring wraps
+        capacity = (
+            part + 2 * LONGEST + case.window - 1 + case.period - 1
+        )  # the least, so that the ring wraps
         after = stored(storage_of(env, group, min(capacity, 40)), collected, 40 // part)
         steps, n_older = collected.transpose(0, 1), 40 - len(after)
         for name in ("message", "received", "delay", "age"):  # what was known at the time stays
@@ -281,8 +312,14 @@ def check_step(after: TensorDictBase, at: tuple[int, ...], twin: Twin, t: int, r
     observation, reward = key(twin.group, "observation"), key(twin.group, "reward")
     assert after[next_key(key(twin.group, "hindsight"))][at].tolist() == twin.message(t, row)
     assert after[next_key(reward)][at].item() == pytest.approx(twin.summed(t, row)), (twin.case, t)
-    assert after[next_key(observation)][at].tolist() == pytest.approx(twin.held(t, row)), (twin.case, t)
-    assert after[observation][at].tolist() == pytest.approx(twin.held_before(t, row)), (twin.case, t)
+    assert after[next_key(observation)][at].tolist() == pytest.approx(twin.held(t, row)), (
+        twin.case,
+        t,
+    )
+    assert after[observation][at].tolist() == pytest.approx(twin.held_before(t, row)), (
+        twin.case,
+        t,
+    )
 
 
 def test_what_follows_an_end_that_the_receiver_never_noticed_stays_invalid():
@@ -317,7 +354,9 @@ def test_neither_messages_nor_rewards_that_arrive_later_are_used(group):
         WORLDS, 30, *[1] * (unpaid.dim() - 2)
     )
     spoilt[reward_delay] = torch.where(unpaid, 4, collected[reward_delay])
-    spoilt[reward] = torch.full_like(spoilt[reward], torch.nan)  # the sums that were paid tell nothing
+    spoilt[reward] = torch.full_like(
+        spoilt[reward], torch.nan
+    )  # the sums that were paid tell nothing
     assert late.any()
     assert unpaid.any()
     one, other = (stored(storage_of(env, group, 60), steps, 3) for steps in (collected, spoilt))
@@ -358,7 +397,9 @@ def test_late_rewards_alone_are_credited_in_any_environment(window):
 
 @both_layouts
 @pytest.mark.parametrize("order", ["generation", "arrival"])
-def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(group, order):
+def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_the_messages(
+    group, order
+):
     reward, received = (next_key(key(group, name)) for name in ("reward", "received"))
 
     def recompute(_: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
@@ -426,13 +467,18 @@ REFUSED: dict[str, Callable[[TensorDictBase], Any]] = {
         make_storage((), message_key="none"), steps
     ),
     "recompute: .*is not an entry after the steps": lambda steps: stored(
-        recomputing(lambda entries: entries | {("next", "success"): entries["next", "reward"]}), steps
+        recomputing(lambda entries: entries | {("next", "success"): entries["next", "reward"]}),
+        steps,
     ),
     "recompute: .*are returned in part": lambda steps: stored(
         recomputing(lambda entries: {("next", "done"): entries["next", "done"]}), steps
     ),
-    "step_count grows from world to world": lambda steps: stored(make_storage(()), steps.transpose(0, 1)),
-    r"steps: a batch of shape \[.*\] is not one of 3 worlds": lambda steps: extend_twice(steps, steps[:2]),
+    "step_count grows from world to world": lambda steps: stored(
+        make_storage(()), steps.transpose(0, 1)
+    ),
+    r"steps: a batch of shape \[.*\] is not one of 3 worlds": lambda steps: extend_twice(
+        steps, steps[:2]
+    ),
     "MultiStepTransform joins steps before they are corrected": extend_joined,
     "longest: 2 steps, but a message takes 5 steps": lambda steps: stored(
         BackupdateStorage(LEAST, recompute_of(()), 2, **NAMES), steps
@@ -449,6 +495,8 @@ REFUSED: dict[str, Callable[[TensorDictBase], Any]] = {
 @pytest.mark.parametrize("line", REFUSED)
 def test_a_mistake_is_one_line(line):
     steps = rollout(make_env(()), 8)
-    stored(BackupdateStorage(LEAST, recompute_of(()), LONGEST, **NAMES), steps)  # which is large enough
+    stored(
+        BackupdateStorage(LEAST, recompute_of(()), LONGEST, **NAMES), steps
+    )  # which is large enough
     with pytest.raises(InputError, match=line):
         REFUSED[line](steps)

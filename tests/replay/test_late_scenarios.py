@@ -1,4 +1,5 @@
-"""UAVs whose rewards are late too, or summed, or whose server has a slow clock: hindsight equals no delay."""
+"""UAVs whose rewards are late too, or summed, or whose server has a slow clock: hindsight equals no
+delay."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -52,7 +53,9 @@ def buffer_of(env: DelayedEnv, corrected: Sequence[str]) -> ReplayBuffer:
     names = corrected if late else ["reward"]
     corrections = corrections_of(env.transform, [CORRECTED[name] for name in names])
     size = 3 * STEPS * env.batch_size[0]
-    return ReplayBuffer(storage=BackupdateStorage(size, recompute, LONGEST, corrections=corrections))
+    return ReplayBuffer(
+        storage=BackupdateStorage(size, recompute, LONGEST, corrections=corrections)
+    )
 
 
 def in_order(buffer: ReplayBuffer) -> TensorDictBase:
@@ -63,7 +66,8 @@ def in_order(buffer: ReplayBuffer) -> TensorDictBase:
 def backupdated(
     scenario: ScenarioConfig, corrected: Sequence[str], n_worlds: int = WORLDS, n_steps: int = STEPS
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """Such steps as collected, and as corrected by all that has arrived after the last one, [T, B]."""
+    """Such steps as collected, and as corrected by all that has arrived after the last one,
+    [T, B]."""
     env = training_env(scenario, n_worlds)
     buffer, late = buffer_of(env, corrected), fly(env, n_steps)
     for steps in late.split(8):
@@ -85,7 +89,10 @@ CASES: dict[str, dict[str, Any]] = {
         "observation": ObservationConfig(LOCAL, GLOBAL, ctde=True),
     },
     "late messages, summed rewards": {"delay": DelayConfig(obs=LATE, **SUMMED)},
-    "late messages, slow server": {"delay": DelayConfig(obs=LATE), "clock": ClockConfig(server="3s")},
+    "late messages, slow server": {
+        "delay": DelayConfig(obs=LATE),
+        "clock": ClockConfig(server="3s"),
+    },
     "late messages and rewards": {"delay": DelayConfig(obs=LATE, rew=LATE)},
     "late and summed rewards": {"delay": DelayConfig(rew=LATE, **SUMMED)},
     "late rewards, slow server": {"delay": DelayConfig(rew=3), "clock": ClockConfig(server="2s")},
@@ -103,7 +110,9 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "late messages of two stops, timeline": {
         "delay": DelayConfig(obs=LATE),
-        "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7, stops=2, own=True),
+        "observation": ObservationConfig(
+            ["spotted"], ["spotting_agents"], timeline=7, stops=2, own=True
+        ),
     },
     "late truth": {
         "delay": DelayConfig(obs=LATE),
@@ -154,7 +163,9 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
 @pytest.mark.parametrize("loss", [0.0, 0.5])
 def test_in_hindsight_requests_are_known_at_once_and_paid_once_where_the_message_arrived(loss):
     flying = MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0)
-    scenario = square(agents=1, motion=flying, episode=EpisodeConfig(30), **REQUESTS)  # nobody else tells
+    scenario = square(
+        agents=1, motion=flying, episode=EpisodeConfig(30), **REQUESTS
+    )  # nobody else tells
     delayed = replace(scenario, delay=DelayConfig(obs=LATE, loss=loss))
     rollouts = (*backupdated(delayed, ["reward", "critic"], 16), fly(training_env(scenario, 16)))
     late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
@@ -188,8 +199,12 @@ def test_only_what_is_named_is_corrected(corrected):
 )
 def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened(success):
     scenario = square(**success)
-    _, corrected = backupdated(replace(scenario, delay=DelayConfig(obs=3)), ["reward", "critic"], 16, 60)
-    first_episode = corrected["step_count"].squeeze(-1).cumsum(0) == torch.arange(60).cumsum(0).view(60, 1)
+    _, corrected = backupdated(
+        replace(scenario, delay=DelayConfig(obs=3)), ["reward", "critic"], 16, 60
+    )
+    first_episode = corrected["step_count"].squeeze(-1).cumsum(0) == torch.arange(60).cumsum(
+        0
+    ).view(60, 1)
     valid = first_episode & corrected["valid"].squeeze(-1)
     ends, true_ends = (
         td["next", "success"].squeeze(-1) for td in (corrected, fly(training_env(scenario, 16), 60))

@@ -1,4 +1,5 @@
-"""Back-updating where a sender is silent for longer than any message takes, as a UAV in flight is."""
+"""Back-updating where a sender is silent for longer than any message takes, as a UAV in flight
+is."""
 
 from helpers import square
 from tensordict import TensorDictBase

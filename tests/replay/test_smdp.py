@@ -21,7 +21,8 @@ def flags(seed: int):
 
 
 def find_in_loop(ready, after, done, terminated):
-    """Every decision that ends within the steps and is not truncated in flight, found step by step."""
+    """Every decision that ends within the steps and is not truncated in flight, found step by
+    step."""
     found = set()
     for begin, world, agent in itertools.product(range(T), range(B), range(N)):
         if not ready[begin, world, agent]:
@@ -56,7 +57,9 @@ def test_a_transition_has_the_observations_before_and_after_it_and_its_discounte
     decisions = find_decisions(*flags(0))
     batch = transitions(steps, order, decisions, 0.9, ["observation"])
     before, after = steps[order], steps["next"][order]
-    for k, (begin, world, agent, end) in enumerate(zip(*(part.tolist() for part in decisions), strict=True)):
+    for k, (begin, world, agent, end) in enumerate(
+        zip(*(part.tolist() for part in decisions), strict=True)
+    ):
         for key in ("action", "observation"):
             assert batch["agents", key][k].equal(before["agents", key][begin, world, agent])
         observation = after["agents", "observation"][end, world, agent]

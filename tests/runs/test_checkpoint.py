@@ -1,4 +1,5 @@
-"""Checkpoint files: whole or not there, refused in one line if they are damaged, and never executed."""
+"""Checkpoint files: whole or not there, refused in one line if they are damaged, and never
+executed."""
 
 import os
 from pathlib import Path
@@ -29,7 +30,9 @@ def test_everything_that_states_consist_of_is_read_as_it_was(tmp_path):
     module = nn.BatchNorm1d(3)
     content = {"step": step, **numbers, "module": module.state_dict(), "size": torch.Size([2])}
     write_checkpoint(tmp_path / "x.pt", content)
-    assert (tmp_path / "x.pt").stat().st_size < 6000  # a view does not bring along what it was cut from
+    assert (
+        tmp_path / "x.pt"
+    ).stat().st_size < 6000  # a view does not bring along what it was cut from
     read = read_checkpoint(tmp_path / "x.pt", "key")
     assert {name: read[name] for name in numbers} == numbers
     assert read["size"] == torch.Size([2])
@@ -80,7 +83,9 @@ def test_a_file_that_would_run_code_is_refused(tmp_path):
 
 def test_a_component_that_does_not_fit_is_refused_in_one_line():
     stored = {"actor": nn.Linear(3, 4).state_dict()}
-    with pytest.raises(InputError, match=r"^checkpoint: x\.pt: its actor does not fit .*size mismatch.*$"):
+    with pytest.raises(
+        InputError, match=r"^checkpoint: x\.pt: its actor does not fit .*size mismatch.*$"
+    ):
         restore({"actor": nn.Linear(3, 5)}, stored, Path("x.pt"), "checkpoint")
     with pytest.raises(InputError, match="it has no critic, only actor"):
         restore({"critic": nn.ReLU()}, stored, Path("x.pt"), "checkpoint")

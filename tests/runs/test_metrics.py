@@ -40,11 +40,14 @@ DELAYS = {
 
 
 def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
-    """Two of three UAVs must spot the source at the same time; it is near many of the landing points."""
+    """Two of three UAVs must spot the source at the same time; it is near many of the landing
+    points."""
     sections = {
         "motion": MOTIONS[motion],
         # UAVs in flight hear nothing, so that a louder source is needed for as many successes.
-        "source": SourceConfig(level_db=135.0 if motion == "instant" else 140.0, position=[100.0, 100.0]),
+        "source": SourceConfig(
+            level_db=135.0 if motion == "instant" else 140.0, position=[100.0, 100.0]
+        ),
         "delay": delay,
         "reward": RewardConfig(
             spotted=0.3, source_distance=0.2, bonus=2.0, bonus_over_steps=True, penalty=0.5
@@ -66,23 +69,33 @@ POOLED = ("age", "late", "lost")
 
 
 def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
-    """Ages of the messages held [steps], and whether each message sent is late or lost, in an episode."""
+    """Ages of the messages held [steps], and whether each message sent is late or lost, in an
+    episode."""
     agents, delays = world["next", "agents"], {"age": [], "late": [], "lost": []}
     for i in range(agents["message_sent"].shape[-1]):
-        arrivals = {0: 0}  # step of arrival by step of generation; the first message arrives at once
+        arrivals = {
+            0: 0
+        }  # step of arrival by step of generation; the first message arrives at once
         for t in range(1, steps + 1):
             if agents["message_sent"][t - 1, i]:
                 delay = int(agents["delay"][t - 1, i]) if "delay" in agents else 0
                 delays["late"].append(delay > 0)
                 delays["lost"].append(delay == -1)
                 arrivals |= {t: t + delay} if delay >= 0 else {}
-            delays["age"].append(t - max(sent for sent, arrival in arrivals.items() if arrival <= t))
+            delays["age"].append(
+                t - max(sent for sent, arrival in arrivals.items() if arrival <= t)
+            )
     return delays
 
 
 def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[str, Any]:
     """Measures of the first episode of a flight [T], counted step by step."""
-    row = {"perceived_return": 0.0, "return": 0.0, "perceived_success_rate": False, "success_rate": False}
+    row = {
+        "perceived_return": 0.0,
+        "return": 0.0,
+        "perceived_success_rate": False,
+        "success_rate": False,
+    }
     row |= {"steps": HORIZON}
     truly_over = False
     for t in range(1, HORIZON + 1):
@@ -140,16 +153,22 @@ def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion)
 def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_on_time(motion):
     sections = {
         "observation": ObservationConfig(belief=["belief_moments"]),
-        "reward": RewardConfig(spotted=0.3, custom=[{"term": "extensions:certainty", "weight": 1.0}]),
+        "reward": RewardConfig(
+            spotted=0.3, custom=[{"term": "extensions:certainty", "weight": 1.0}]
+        ),
         "episode": EpisodeConfig(max_steps=20),
     }
     flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.1), **sections))
     actions = iter(flight[keys.ACTION].unbind(1))
     again = TensorDictModule(lambda _: next(actions), [keys.READY], [keys.ACTION])
-    env = make_env(joint_spotting(motion, DelayConfig(), **sections), 24, seed=2, extras=["message"])
+    env = make_env(
+        joint_spotting(motion, DelayConfig(), **sections), 24, seed=2, extras=["message"]
+    )
     same = env.rollout(HORIZON, again, break_when_any_done=False)
     late, on_time = evaluation(flight, server), evaluation(same, env.server)
-    assert on_time["return"] == on_time["perceived_return"] == pytest.approx(late["return"], rel=1e-6)
+    assert (
+        on_time["return"] == on_time["perceived_return"] == pytest.approx(late["return"], rel=1e-6)
+    )
     assert late["perceived_return"] != pytest.approx(late["return"], rel=0.01)
 
 
@@ -158,7 +177,10 @@ def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_o
 
 def training_batch() -> TensorDictBase:
     env = make_env(
-        joint_spotting("instant", DelayConfig(), episode=EpisodeConfig(max_steps=7, success_share=0.6)), 16
+        joint_spotting(
+            "instant", DelayConfig(), episode=EpisodeConfig(max_steps=7, success_share=0.6)
+        ),
+        16,
     )
     env.append_transform(RewardSum([("agents", "reward")], [("agents", "episode_reward")]))
     env.append_transform(StepCounter())
@@ -173,12 +195,16 @@ def ended_episodes(world: TensorDictBase) -> list[dict[str, float]]:
         total += step["agents", "reward"].mean().item()
         steps += 1
         if step["done"]:
-            ended.append(dict(zip(EpisodeLog.NAMES, (total, float(step["success"]), steps), strict=True)))
+            ended.append(
+                dict(zip(EpisodeLog.NAMES, (total, float(step["success"]), steps), strict=True))
+            )
             total, steps = 0.0, 0
     return ended
 
 
-def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when_all_have_one(monkeypatch):
+def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when_all_have_one(
+    monkeypatch,
+):
     monkeypatch.setattr(EpisodeLog, "EPISODES", 3 * len(batch := training_batch()))
     log = EpisodeLog(len(batch))
     for part in batch.split(3, 1):  # in some parts no episode ends
@@ -191,10 +217,15 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
     means = log.means()
     assert means.pop("hindsight_return") == means["perceived_return"]  # nothing is late
     for name, mean in means.items():
-        assert mean == pytest.approx(fmean([fmean([row[name] for row in world]) for world in latest]))
+        assert mean == pytest.approx(
+            fmean([fmean([row[name] for row in world]) for world in latest])
+        )
     assert {row["perceived_success_rate"] for world in latest for row in world} == {0.0, 1.0}
 
-    log, shortest = EpisodeLog(len(batch)), min(int(world["next", "done"].int().argmax()) for world in batch)
+    log, shortest = (
+        EpisodeLog(len(batch)),
+        min(int(world["next", "done"].int().argmax()) for world in batch),
+    )
     log.add(batch[:, : shortest + 1])
     assert log.finished > 0
     assert all(math.isnan(mean) for mean in log.means().values())

@@ -40,7 +40,9 @@ def test_a_loaded_memory_equals_the_stored_one(tmp_path, sizes, every):
             state = plain(memory.state_dict())
             memory.remove_old()
             found = {path: path.read_bytes() for path in (tmp_path / "replay").glob("*")}
-            assert all(files.get(path, data) == data for path, data in found.items())  # each is written once
+            assert all(
+                files.get(path, data) == data for path, data in found.items()
+            )  # each is written once
             assert len(found) <= ROWS
             files |= found
             other = make_buffer()

@@ -21,15 +21,21 @@ ALL = ["belief_gain", "belief_moments", "belief_map"]
 
 
 def believing(own: bool = False, **changed) -> ScenarioConfig:
-    observation = ObservationConfig(local_features=["spotted"], global_features=[], belief=ALL, own=own)
+    observation = ObservationConfig(
+        local_features=["spotted"], global_features=[], belief=ALL, own=own
+    )
     return everything(observation=observation, source=walking(), **changed)
 
 
 @pytest.fixture(scope="module")
 def flown():
-    """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K, C] of worlds in several regions."""
+    """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K, C] of worlds in several
+    regions."""
     sources = SourceConfig(
-        count=2, motion="dynamic", emission="per_step", each=[{}, {"level_db": 136.0, "emission": "constant"}]
+        count=2,
+        motion="dynamic",
+        emission="per_step",
+        each=[{}, {"level_db": 136.0, "emission": "constant"}],
     )
     env = UavEnv(replace(believing(), source=sources), messages_only=True)
     simulation, server = env.simulation, env.server
@@ -59,7 +65,9 @@ def test_gain_is_the_chance_of_detecting_the_source_where_an_action_leads(flown)
                 chance = chance_at(server.grid, place, belief[world, source], flat - standing + at)
                 if flat == standing:  # the UAV stays
                     spots = bool(messages.spots[world, uav, source])
-                    again = server.grid.log_reports[2 * at + spots + server.grid.no_report // 2].exp()
+                    again = server.grid.log_reports[
+                        2 * at + spots + server.grid.no_report // 2
+                    ].exp()
                     found = again if spots else 1 - again
                     next_ = predict(server.grid, belief[world, source], torch.tensor(place))
                     chance = emission_of(server.grid, place) * float(found @ next_)
@@ -73,7 +81,9 @@ def test_moments_are_mean_spread_and_entropy(flown):
     for world, uav, source in ((0, 0, 0), (5, 2, 0), (5, 2, 1)):
         scale = float(simulation.airspace.scale[server.region_of(messages)[world]])
         chance, cells = belief[world, source].tolist(), server.grid.centres.tolist()
-        east, north = (sum(p * cell[i] for p, cell in zip(chance, cells, strict=True)) for i in (0, 1))
+        east, north = (
+            sum(p * cell[i] for p, cell in zip(chance, cells, strict=True)) for i in (0, 1)
+        )
         squares = ((x - east) ** 2 + (y - north) ** 2 for x, y in cells)
         variance = sum(p * square for p, square in zip(chance, squares, strict=True))
         entropy = -sum(p * math.log(p) for p in chance if p) / math.log(len(chance))
@@ -92,7 +102,10 @@ def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
         for p, (east, north) in pairs:
             distance = math.hypot(east - x, north - y)
             ring = sum(distance > radius * simulation.radius for radius in BELIEF_RINGS)
-            sector = round(math.atan2(east - x, north - y) / (2 * math.pi) * BELIEF_SECTORS) % BELIEF_SECTORS
+            sector = (
+                round(math.atan2(east - x, north - y) / (2 * math.pi) * BELIEF_SECTORS)
+                % BELIEF_SECTORS
+            )
             expected[ring * BELIEF_SECTORS + sector] += p
         found = features["belief_map"][world, uav].view(2, -1)[source]
         torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-5)

@@ -18,7 +18,9 @@ shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
 
 @settings(max_examples=settings.default.max_examples // 2)
 @given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(1, 6), heard=shares, spots=shares)
-def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(seed, n_agents, heard, spots):
+def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
+    seed, n_agents, heard, spots
+):
     worlds = random_worlds(seed, n_agents, heard, spots)
     messages, server = messages_of(worlds)
     ours = observe(messages, server, NAMES)
@@ -57,11 +59,18 @@ def test_the_actor_observes_the_age_of_the_uavs_message_and_the_critic_does_not(
     config = ObservationConfig(["spotted"], ["source_time"], ctde=True, age=True)
     assert config.actor == ["spotted", "age"]
     assert config.critic == ["source_time", "spotted"]
-    assert ObservationConfig(["spotted"], ["source_time"], age=True).actor == [*config.critic, "age"]
+    assert ObservationConfig(["spotted"], ["source_time"], age=True).actor == [
+        *config.critic,
+        "age",
+    ]
 
 
 def test_the_help_names_every_feature():
     said = rules(ObservationConfig)
-    for key, scope in (("local_features", "local"), ("global_features", "global"), ("belief", "belief")):
+    for key, scope in (
+        ("local_features", "local"),
+        ("global_features", "global"),
+        ("belief", "belief"),
+    ):
         known = {name for name in FEATURES if FEATURES.get(name, key).scope == scope}
         assert known <= {*re.findall(r"\w+", said[key].meaning)}, key

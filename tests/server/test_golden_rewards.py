@@ -36,7 +36,9 @@ DIVIDED_AGAIN = "divided again for every further UAV"
 NO_BEARING = "no bearing to where it stands"
 
 
-def reason_for_other_feature(name: str, transition: Transition, uav: int, value: float) -> str | None:
+def reason_for_other_feature(
+    name: str, transition: Transition, uav: int, value: float
+) -> str | None:
     """Why a feature differs from the original's; None if it does not."""
     estimate, place = transition.after["server"]["est_pos"], transition.after["positions"][uav]
     if name == "coverage":
@@ -71,7 +73,11 @@ def test_recorded_server_inputs_give_the_recorded_features(case, compared, reaso
                     continue
                 pairs = zip(np.ravel(ours[name][world][uav]), np.ravel(value), strict=True)
                 for mine, theirs in pairs:
-                    assert close(name, mine, converted(name, theirs, detected)), (name, transition, uav)
+                    assert close(name, mine, converted(name, theirs, detected)), (
+                        name,
+                        transition,
+                        uav,
+                    )
     assert counts.pop(None) == compared
     assert counts == reasons
 
@@ -107,7 +113,9 @@ def test_recorded_features_give_the_recorded_reward_terms(case, compared, reason
         desired_distance_not_spotting=desired,
         desired_distance_spotting=desired,
     )
-    ours = {name: value.tolist() for name, value in reward(features, counters, terms_of(task)).items()}
+    ours = {
+        name: value.tolist() for name, value in reward(features, counters, terms_of(task)).items()
+    }
     assert ours.keys() == features.keys()
     counts = Counter()
     for world, transition in enumerate(records):
@@ -133,7 +141,8 @@ def test_the_environment_gives_the_recorded_rewards_and_ends(case):
     total = after["agents", "reward"].squeeze(-1)
     expected = column(records, "reward")
     if case == 2:
-        # In the original, UAVs that do not spot pass on others' detections as their own, so estimates differ.
+        # In the original, UAVs that do not spot pass on others' detections as their own, so
+        # estimates differ.
         messages, server, counters = server_inputs(case, records)
         features = observe(messages, server, ["source_distance"])
         total = total - terms["source_distance"]

@@ -1,4 +1,5 @@
-"""What a UAV computes on board of its own features equals what the server would compute of what it knows."""
+"""What a UAV computes on board of its own features equals what the server would compute of what it
+knows."""
 
 import pytest
 import torch
@@ -15,8 +16,12 @@ from damian.world.regions.sources import RegionConfig
 
 @pytest.mark.parametrize("n_agents", [1, 2, 5])
 def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
-    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=30.0, initial_conditions=16)
-    observation = ObservationConfig(local_features=LOCAL, global_features=GLOBAL, own=True, age=True)
+    region = RegionConfig(
+        kind="vertices", vertices=SQUARE, lattice_step=30.0, initial_conditions=16
+    )
+    observation = ObservationConfig(
+        local_features=LOCAL, global_features=GLOBAL, own=True, age=True
+    )
     scenario = everything(agents=n_agents, region=region, observation=observation)
     env = UavEnv(scenario, messages_only=True)
     generator = torch.Generator().manual_seed(n_agents)

@@ -19,7 +19,9 @@ def test_a_built_in_term_can_be_used_again_with_parameters_of_its_own():
     unused = {"term": "battery", "weight": 0.0, "name": "unused"}
     task = RewardConfig(spotted=0.0, mean_distance=1.0, custom=[again, unused])
     inputs = {name: torch.rand(2, 3) for name in BUILT_IN}
-    counters = Counters(torch.ones(2), motions=torch.ones(2, 3), news=torch.ones(2, 3, dtype=torch.bool))
+    counters = Counters(
+        torch.ones(2), motions=torch.ones(2, 3), news=torch.ones(2, 3, dtype=torch.bool)
+    )
     ours = reward(inputs, counters, terms_of(task))
     assert [*ours] == task.terms == ["mean_distance", "close"]
     near = RewardConfig(spotted=0.0, mean_distance=2.0, desired_distance=0.2)
@@ -44,14 +46,17 @@ def test_every_end_of_an_episode_equals_that_of_a_plain_loop(
     dt = float(rng.choice([1.0, 0.5]))
     steps = rng.integers(1, 40, 6)
     worlds = [(float(n * dt), uavs) for n, (_, uavs) in zip(steps, worlds, strict=True)]
-    for now, uav in [(now, uav) for now, uavs in worlds for uav in uavs if uav.heard_at is not None]:
+    for now, uav in [
+        (now, uav) for now, uavs in worlds for uav in uavs if uav.heard_at is not None
+    ]:
         # All detections happen at the end of a step.
         uav.heard_at = now if uav.spots else float(rng.integers(round(now / dt) + 1)) * dt
     messages, _ = messages_of(worlds)
     over = torch.zeros(6, dtype=torch.bool)
     ours = status(messages, torch.as_tensor(steps), over, dt, episode)
     expected = [
-        twin.end(uavs, int(n), now, dt, episode) for n, (now, uavs) in zip(steps, worlds, strict=True)
+        twin.end(uavs, int(n), now, dt, episode)
+        for n, (now, uavs) in zip(steps, worlds, strict=True)
     ]
     assert list(zip(*(flag.tolist() for flag in ours), strict=True)) == expected
     assert not (ours.terminated & ours.truncated).any()

@@ -1,4 +1,5 @@
-"""The Bayes filter of the source against its slow twin, and whether its probabilities are frequencies."""
+"""The Bayes filter of the source against its slow twin, and whether its probabilities are
+frequencies."""
 
 import math
 
@@ -26,7 +27,9 @@ from damian.world.signal_source import SourceConfig
 LONGEST = 4
 
 
-def make_grid(emission: float = 0.6, moves: bool = True, regions: int = 1, **detection: float) -> SourceGrid:
+def make_grid(
+    emission: float = 0.6, moves: bool = True, regions: int = 1, **detection: float
+) -> SourceGrid:
     """A small grid, over one or several regions."""
     emits = {"emission": "per_step", "emission_probability": emission, **detection}
     airspace = UavEnv(square() if regions == 1 else everything()).simulation.airspace
@@ -42,7 +45,11 @@ grids = {
     "misses and false alarms": make_grid(miss=0.3, false_alarm=0.1),
     "unlike sources": build_source_grids(
         UavEnv(square()).simulation.airspace,
-        [walking(emission="per_step", false_alarm=0.1), SourceConfig(level_db=138.0), walking(miss=0.2)],
+        [
+            walking(emission="per_step", false_alarm=0.1),
+            SourceConfig(level_db=138.0),
+            walking(miss=0.2),
+        ],
         dt=1.0,
         cell=45.0,
     ),
@@ -61,13 +68,17 @@ def test_reports_of_a_source_that_stays_have_the_probabilities_of_all_cases(miss
             now, both, before = 0.0, 0.0, 0.0
             for covered, weight in ((True, share), (False, 1 - share)):
                 heard = 1 - miss if covered else alarm
-                fits = heard if row % 2 else 1 - heard  # while it emits; before, it may have been silent
+                fits = (
+                    heard if row % 2 else 1 - heard
+                )  # while it emits; before, it may have been silent
                 quiet = alarm if row % 2 else 1 - alarm
                 earlier = emission * fits + (1 - emission) * quiet
                 now, before = now + weight * fits, before + weight * earlier
                 both += weight * fits * earlier
             assert grid.log_reports[row, cell].exp().item() == pytest.approx(now, rel=1e-4)
-            assert grid.log_reports[row + half, cell].exp().item() == pytest.approx(both / before, rel=1e-4)
+            assert grid.log_reports[row + half, cell].exp().item() == pytest.approx(
+                both / before, rel=1e-4
+            )
 
 
 every_grid = pytest.mark.parametrize("grid", grids.values(), ids=grids)
@@ -113,7 +124,13 @@ class Flight:
         """Compare the beliefs of all receivers with the slow twin's."""
         server, own = latest(self.window, self.window.slot)
         for world, steps in enumerate(self.steps):
-            of_world = self.grid, int(self.region[world]), self.first[world].tolist(), steps, len(steps)
+            of_world = (
+                self.grid,
+                int(self.region[world]),
+                self.first[world].tolist(),
+                steps,
+                len(steps),
+            )
             for viewer, found in enumerate([server[world], *own[world]]):
                 expected = torch.tensor(belief(*of_world, viewer - 1 if viewer else None))
                 torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6)

@@ -32,13 +32,18 @@ def twin(env, messages, region, now, i):
             way = [max(-1.0, min(1.0, w / (scale / 2))) for w in to_place + to_target]
             ways.append((math.hypot(*to_target), [*way, 1.0]))
     ways.sort()
-    landed = [(points[p].tolist(), k) for trail in messages.trail for k, p in enumerate(trail.tolist())]
+    landed = [
+        (points[p].tolist(), k) for trail in messages.trail for k, p in enumerate(trail.tolist())
+    ]
     here, n = points[messages.trail[i, 0]].tolist(), messages.trail.shape[-1]
     new = []
     for ring in RINGS:
         for sector in range(SECTORS):
             angle = 2 * math.pi * sector / SECTORS
-            at = [here[0] + ring * radius * math.sin(angle), here[1] + ring * radius * math.cos(angle)]
+            at = [
+                here[0] + ring * radius * math.sin(angle),
+                here[1] + ring * radius * math.cos(angle),
+            ]
             inside = simulation.airspace.regions[region].polygon.contains(shapely.Point(at))
             value = min(math.dist(at, xy) / (2 * radius) + 0.5 * k / n for xy, k in landed)
             new.append(min(value, 1.0) if inside else 0.0)
@@ -52,9 +57,14 @@ def twin(env, messages, region, now, i):
 
 
 def check_others(rows, ways):
-    """Compare the nearest other UAVs with those of the twin; equally far ones may stand in any order."""
+    """Compare the nearest other UAVs with those of the twin; equally far ones may stand in any
+    order."""
     for row, (distance, _) in zip(rows.tolist(), ways, strict=False):
-        assert any(row == pytest.approx(way, abs=1e-5) for other, way in ways if abs(other - distance) < 1e-2)
+        assert any(
+            row == pytest.approx(way, abs=1e-5)
+            for other, way in ways
+            if abs(other - distance) < 1e-2
+        )
     assert not rows[len(ways) :].any()
 
 

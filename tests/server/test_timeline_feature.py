@@ -1,4 +1,5 @@
-"""The feature ``timeline``: slot k is where a UAV stood k steps ago, as far as that has arrived by now."""
+"""The feature ``timeline``: slot k is where a UAV stood k steps ago, as far as that has arrived by
+now."""
 
 import itertools
 
@@ -28,7 +29,9 @@ def scenario(own: bool = True, stops: int | None = None, **changed) -> ScenarioC
     sections = {
         "agents": AGENTS,
         "region": RegionConfig(kind="random", pool=2, lattice_step=60.0),
-        "observation": ObservationConfig(["place"], [], own=own, window=1, timeline=SLOTS, stops=stops),
+        "observation": ObservationConfig(
+            ["place"], [], own=own, window=1, timeline=SLOTS, stops=stops
+        ),
         "episode": EpisodeConfig(max_steps=9),
     }
     return ScenarioConfig(**(sections | changed))
@@ -36,7 +39,9 @@ def scenario(own: bool = True, stops: int | None = None, **changed) -> ScenarioC
 
 @pytest.mark.parametrize("stops", [1, None])
 @pytest.mark.parametrize(("name", "own"), [*((name, True) for name in CASES), ("held back", False)])
-def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arrived(name, own, stops):
+def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arrived(
+    name, own, stops
+):
     case = scenario(own and name != "links", stops, **CASES[name])
     env = make_env(case, 4, seed=1, extras=["message"])
     env.transform[-1].dropped_keys = []
@@ -54,7 +59,10 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
     for world, t, i in itertools.product(range(4), range(25), range(AGENTS)):
         ended = after[keys.DONE][world, :t].flatten().nonzero()
         begin = int(ended[-1]) + 1 if len(ended) else 0
-        places = [first.position[world, begin], *sent.position[world, begin : t + 1]]  # in this episode
+        places = [
+            first.position[world, begin],
+            *sent.position[world, begin : t + 1],
+        ]  # in this episode
         now, targets = len(places) - 1, []
         rows = torch.zeros(AGENTS, SLOTS + 1, 3)
         for j in range(AGENTS):
@@ -81,5 +89,7 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
 
 
 def test_a_timeline_needs_the_order_of_generation():
-    with pytest.raises(InputError, match=r"observation\.timeline: 4 does not go with delay\.order=arrival"):
+    with pytest.raises(
+        InputError, match=r"observation\.timeline: 4 does not go with delay\.order=arrival"
+    ):
         scenario(delay=DelayConfig(obs=2, order="arrival"))

@@ -87,7 +87,11 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
                 np.testing.assert_allclose(found, values, rtol=5.1e-5, atol=1e-30)
                 assert found.dtype == bool if values.dtype == bool else found.shape == values.shape
         assert again.region.equals_exact(episode.region, 1e-9)
-        assert (again.about, again.success, again.origin) == (episode.about, episode.success, episode.origin)
+        assert (again.about, again.success, again.origin) == (
+            episode.about,
+            episode.success,
+            episode.origin,
+        )
     stored = json.loads((tmp_path / "episode.json").read_text())
     assert (stored["schema"], stored["version"]) == ("damian-episode", 3)
     assert set(stored["meaning"]) == set(COLUMNS) <= set(stored)
@@ -96,7 +100,9 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
 def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path):
     path = tmp_path / "episode.json"
     path.write_text(json.dumps({**flight().document(), "version": 2}))
-    with pytest.raises(InputError, match=r"episode\.json: it is not an episode of version 3: it is .* 2$"):
+    with pytest.raises(
+        InputError, match=r"episode\.json: it is not an episode of version 3: it is .* 2$"
+    ):
         Episode.load(path)
 
 

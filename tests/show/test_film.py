@@ -13,7 +13,8 @@ from damian.show.frame import frame_of
 
 
 @pytest.mark.parametrize(
-    ("changes", "title"), [({}, "age of"), ({"battery": np.ones((4, 2)) * [[9], [8], [7], [6]]}, "battery")]
+    ("changes", "title"),
+    [({}, "age of"), ({"battery": np.ones((4, 2)) * [[9], [8], [7], [6]]}, "battery")],
 )
 def test_a_film_has_a_frame_for_each_instant_that_differs(tmp_path, changes, title):
     save_film(flight(**changes), tmp_path / "film.gif")
@@ -30,7 +31,9 @@ def test_a_film_has_a_frame_for_each_instant_that_differs(tmp_path, changes, tit
 def test_a_film_tells_of_a_source_only_if_the_task_has_one(view, changes, n_marks):
     film = Film(flight(**changes), view)
     film.draw(0)
-    assert ("0 of 2 UAVs spot the source" in film.figure.get_suptitle()) == (changes is not NO_SOURCE)
+    assert ("0 of 2 UAVs spot the source" in film.figure.get_suptitle()) == (
+        changes is not NO_SOURCE
+    )
     labels = [text.get_text() for text in film.figure.legends[0].get_texts()]
     assert sum(label.startswith("source") for label in labels) == n_marks
 
@@ -40,7 +43,9 @@ def test_a_film_of_the_space_shows_a_uav_above_the_place_where_it_stands():
     low, high = (Film(flight(0, position=position * [1, 1, scale]), "3d") for scale in (0.0, 1.0))
     same = np.abs(low.frame(0).astype(int) - high.frame(0)).sum(-1) == 0
     assert 0.5 < same.mean() < 0.999
-    colours = [(np.abs(film.frame(0) / 255 - to_rgb(COLOURS[1])).max(-1) < 0.02) for film in (low, high)]
+    colours = [
+        (np.abs(film.frame(0) / 255 - to_rgb(COLOURS[1])).max(-1) < 0.02) for film in (low, high)
+    ]
     heights = [np.nonzero(colour[:450, :500])[0].min() for colour in colours]
     assert heights[1] < heights[0] - 20
 
@@ -60,7 +65,9 @@ def shows(film, colour):
 def test_of_many_uavs_only_those_to_tell_apart_have_names_colours_and_rows(view, shown, told):
     film = Film(crowd(), view, shown)
     assert [name.get_text() for name in named(film)] == told
-    assert [label.get_text() for label in film.lanes.get_yticklabels()] == [f"UAV {name}" for name in told]
+    assert [label.get_text() for label in film.lanes.get_yticklabels()] == [
+        f"UAV {name}" for name in told
+    ]
     colours = [shows(film, colour) for colour in COLOURS[:4]]
     assert colours == [number < len(told) for number in range(4)]
     labels = [text.get_text() for text in film.figure.legends[0].get_texts()]
@@ -82,7 +89,8 @@ def test_uavs_have_their_colours_in_a_gif_too(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("up", "said"), [(0.0, "450 m"), (60.0, "heights 2 times as large"), (900.0, "heights to scale")]
+    ("up", "said"),
+    [(0.0, "450 m"), (60.0, "heights 2 times as large"), (900.0, "heights to scale")],
 )
 def test_a_film_of_the_space_cuts_nothing_and_says_how_heights_are_drawn(up, said):
     position = np.tile([[-200.0, -200, up], [200, 200, up]], (301, 1, 1))
@@ -96,15 +104,24 @@ def test_a_film_of_the_space_cuts_nothing_and_says_how_heights_are_drawn(up, sai
         assert 0 < x.min() < x.max() < film.charts[0].bbox.x0 - 15
         assert film.lanes.bbox.y1 < y.min() < y.max() < film.figure.bbox.y1 - 35
         inside = film.map.bbox
-        assert (inside.x0, inside.y0) < (x.min(), y.min()) < (x.max(), y.max()) < (inside.x1, inside.y1)
+        assert (
+            (inside.x0, inside.y0)
+            < (x.min(), y.min())
+            < (x.max(), y.max())
+            < (inside.x1, inside.y1)
+        )
 
 
 @pytest.mark.parametrize("view", ["2d", "3d"])
 def test_charging_places_are_drawn_and_explained(view):
     places = flight(about={"charging_points": [[150.0, 150.0]]})
-    plain, charged = (np.asarray(Film(e, view).frame(0), int)[100:500, :500] for e in (flight(), places))
+    plain, charged = (
+        np.asarray(Film(e, view).frame(0), int)[100:500, :500] for e in (flight(), places)
+    )
     assert 20 < (np.abs(plain - charged).sum(-1) > 0).sum() < 200
-    assert "charging place" in [text.get_text() for text in Film(places).figure.legends[0].get_texts()]
+    assert "charging place" in [
+        text.get_text() for text in Film(places).figure.legends[0].get_texts()
+    ]
 
 
 @pytest.mark.parametrize("view", ["2d", "3d"])

@@ -31,7 +31,9 @@ def episode():
     )
     torch.manual_seed(0)  # a fixture of the module is made before the seed of each test is set
     env = make_env(scenario, 1, seed=1, extras=["message", "state", "reward_terms"])
-    return record(env.rollout(10, random_policy(env)), env.uav_env, {"began": "2023-11-14T22:13:59.500Z"})[0]
+    return record(
+        env.rollout(10, random_policy(env)), env.uav_env, {"began": "2023-11-14T22:13:59.500Z"}
+    )[0]
 
 
 def local(feature: dict, origin: tuple[float, float]) -> np.ndarray:
@@ -58,10 +60,14 @@ def test_an_episode_is_valid_and_lies_where_it_was_flown(episode):
         "source track": 1,
     }
     for uav in range(2):
-        track, now, held = (kinds[kind][uav] for kind in ("track", "footprint", "believed position"))
+        track, now, held = (
+            kinds[kind][uav] for kind in ("track", "footprint", "believed position")
+        )
         flown = episode.true[:8, uav]
         moved = (flown != flown[0]).any()
-        np.testing.assert_allclose(local(track, episode.origin), flown if moved else flown[:1], atol=0.02)
+        np.testing.assert_allclose(
+            local(track, episode.origin), flown if moved else flown[:1], atol=0.02
+        )
         assert track["properties"]["times"] == episode.time[:8].tolist()
         assert track["properties"]["altitudes_m"] == episode.position[:8, uav, 2].round(2).tolist()
         assert track["properties"]["times_utc"][1] == "2023-11-14T22:14:00.500000+00:00"

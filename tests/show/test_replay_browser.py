@@ -1,4 +1,5 @@
-"""The replay page in a real browser: it shows the numbers of the episode, and every part of it draws.
+"""The replay page in a real browser: it shows the numbers of the episode, and every part of it
+draws.
 
 Run by `make test-browser`.
 """
@@ -24,14 +25,21 @@ pytestmark = pytest.mark.browser
 WEBGL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LAST, LATE = 20, 4
 ROUND = 0.056
-"""Largest error of a number of one decimal made of one with five significant digits, below 1,000."""
+"""Largest error of a number of one decimal made of one with five significant digits, below
+1,000."""
 
 
 @cache
 def late_flight():
-    """Two UAVs that fly at random with a belief, whose messages are late, and some of which are lost."""
-    words = "scenario=mixed agents=2 motion=polynomial motion.max_acceleration=20 clock.simulation=2s"
-    words += " delay.loss=0.1 source.level_db=150 battery.enabled=true observation.belief=[belief_moments]"
+    """Two UAVs that fly at random with a belief, whose messages are late, and some of which are
+    lost."""
+    words = (
+        "scenario=mixed agents=2 motion=polynomial motion.max_acceleration=20 clock.simulation=2s"
+    )
+    words += (
+        " delay.loss=0.1 source.level_db=150 battery.enabled=true "
+        "observation.belief=[belief_moments]"
+    )
     scenario = compose_scenario(*words.split(), f"delay.obs={LATE}")
     env = make_env(scenario, 1, 3, extras=EXTRAS)
     return record(env.rollout(LAST, random_policy(env)), env.uav_env, {"seed": 3})[0]
@@ -65,7 +73,10 @@ class Page:
 
     def settle(self):
         """Wait until what has changed is on the screen."""
-        code = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
+        code = (
+            "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => "
+            "done()))"
+        )
         self.driver.execute_async_script(code)
 
     def press(self, *keys):
@@ -88,8 +99,12 @@ class Page:
         """The numbers of the UAVs at this instant, by column."""
         rows = self.all(".card .numbers tbody tr")
         names = ("east", "north", "up", "age", "battery")
-        find = [[row.find_element("css selector", f"[data-shown={n}]") for n in names] for row in rows]
-        cells = np.array([[float(cell.text.replace("\u2212", "-")) for cell in row] for row in find])
+        find = [
+            [row.find_element("css selector", f"[data-shown={n}]") for n in names] for row in rows
+        ]
+        cells = np.array(
+            [[float(cell.text.replace("\u2212", "-")) for cell in row] for row in find]
+        )
         return dict(zip(names, cells.T, strict=True))
 
     def map(self):
@@ -134,7 +149,9 @@ def test_it_shows_the_numbers_of_every_instant_and_loads_nothing(opened):
             check_numbers(page, episode, step)
             page.press("ARROW_RIGHT")
         legend = [each.text for each in page.all("[data-chart=reward] .u-value")][1:]
-        assert legend == [f"{term[LAST].mean():.3f}" for term in episode.reward_terms.values() if term.any()]
+        assert legend == [
+            f"{term[LAST].mean():.3f}" for term in episode.reward_terms.values() if term.any()
+        ]
         assert page.run("return performance.getEntriesByType('resource').length") == 0
 
 
@@ -186,14 +203,20 @@ def test_a_click_on_a_uav_or_on_its_number_dims_the_others(opened):
         for press in (page.one("canvas.map").click, lambda: button.send_keys(" ")):
             press()
             page.settle()
-            assert (button.get_attribute("aria-pressed"), page.run(dim) == before) == ("true", False)
+            assert (button.get_attribute("aria-pressed"), page.run(dim) == before) == (
+                "true",
+                False,
+            )
             page.press("ESCAPE")
             assert page.run(dim) == before
 
 
 def test_of_many_uavs_the_list_chooses_the_one_that_is_told_apart(opened):
     with opened(crowd()) as page:
-        before, (button, other) = page.map(), (page.all(".numbers tbody button")[uav] for uav in (17, 3))
+        before, (button, other) = (
+            page.map(),
+            (page.all(".numbers tbody button")[uav] for uav in (17, 3)),
+        )
         choose = "const s = document.querySelector('#tools select'); s.value = arguments[0];"
         choose += "s.dispatchEvent(new Event('change'))"
         colour = "return arguments[0].parentElement.style.getPropertyValue('--uav')"
@@ -229,11 +252,20 @@ def test_zones_are_hatched_and_charging_places_marked(opened):
 
 def test_a_drag_shows_a_part_of_the_time_which_follows_the_present(opened):
     with opened(late_flight()) as page:
-        handles = "return [...document.querySelectorAll('.brush input')].map((each) => Number(each.value))"
-        pictures = "return ['.lanes', 'figure canvas'].map((c) => document.querySelector(c).toDataURL())"
+        handles = (
+            "return [...document.querySelectorAll('.brush input')].map((each) => "
+            "Number(each.value))"
+        )
+        pictures = (
+            "return ['.lanes', 'figure canvas'].map((c) => document.querySelector(c).toDataURL())"
+        )
         for selector in ("[data-chart=age] .u-over", "canvas.lanes"):
             before = page.run(pictures)
-            drag = page.actions().move_to_element_with_offset(page.one(selector), -60, 0).click_and_hold()
+            drag = (
+                page.actions()
+                .move_to_element_with_offset(page.one(selector), -60, 0)
+                .click_and_hold()
+            )
             drag.move_by_offset(120, 0).release().perform()
             page.settle()
             first, last = page.run(handles)
@@ -245,7 +277,9 @@ def test_a_drag_shows_a_part_of_the_time_which_follows_the_present(opened):
 
 
 def test_rows_of_many_uavs_scroll_and_show_shares_of_a_long_time(opened):
-    with opened(crowd(300, cells=np.array([[-9.0, 0], [9, 0]]), belief=np.full((301, 1, 2), 0.5))) as page:
+    with opened(
+        crowd(300, cells=np.array([[-9.0, 0], [9, 0]]), belief=np.full((301, 1, 2), 0.5))
+    ) as page:
         assert (page.shown("belief"), page.one(".scale").is_displayed()) == ("belief 1.0 bit", True)
         notes = [page.one(".note").text, page.press("t") or page.one(".note").text]
         assert ["more are late" in notes[0], "bars are late" in notes[1]] == [True, True]

@@ -51,7 +51,10 @@ def test_a_page_holds_the_episodes_as_their_files_do(tmp_path):
     assert replay["colours"] == list(UAV_COLOURS)
     for episode, held in zip(shown, replay["episodes"], strict=True):
         episode.save(tmp_path / "episode.json")
-        assert {**json.loads((tmp_path / "episode.json").read_text()), "title": held["title"]} == held
+        assert {
+            **json.loads((tmp_path / "episode.json").read_text()),
+            "title": held["title"],
+        } == held
 
 
 def test_a_page_is_small_and_loads_nothing():

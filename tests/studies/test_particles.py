@@ -29,7 +29,9 @@ def as_in_mpe2(
         agent.state.p_vel = env.velocity[world, i].double().numpy().copy()
     for i, landmark in enumerate(state.landmarks):
         landmark.state.p_pos = env.landmarks[world, i].double().numpy().copy()
-    observations, rewards, *_ = theirs.step(dict(zip(theirs.agents, actions[world].tolist(), strict=True)))
+    observations, rewards, *_ = theirs.step(
+        dict(zip(theirs.agents, actions[world].tolist(), strict=True))
+    )
     return {
         "position": np.stack([agent.state.p_pos for agent in state.agents]),
         "velocity": np.stack([agent.state.p_vel for agent in state.agents]),
@@ -40,7 +42,11 @@ def as_in_mpe2(
 
 GAMES = {
     "spread": (lambda: SimpleSpread(WORLDS), "spread", {"N": 3, "local_ratio": 0.5}),
-    "spread of five": (lambda: SimpleSpread(WORLDS, 5, 0.2), "spread", {"N": 5, "local_ratio": 0.2}),
+    "spread of five": (
+        lambda: SimpleSpread(WORLDS, 5, 0.2),
+        "spread",
+        {"N": 5, "local_ratio": 0.2},
+    ),
     "tag": (lambda: SimpleTag(WORLDS), "tag", {}),
 }
 
@@ -48,7 +54,9 @@ GAMES = {
 @pytest.mark.parametrize("game", GAMES)
 def test_every_step_is_that_of_mpe2(game):
     make, name, options = GAMES[game]
-    theirs = pytest.importorskip(f"mpe2.simple_{name}_v3").parallel_env(max_cycles=HORIZON, **options)
+    theirs = pytest.importorskip(f"mpe2.simple_{name}_v3").parallel_env(
+        max_cycles=HORIZON, **options
+    )
     torch.manual_seed(0)
     env = make()
     env.set_seed(0)
@@ -68,7 +76,9 @@ def test_every_step_is_that_of_mpe2(game):
         for key, values in found.items():
             twin = np.stack([world[key] for world in expected])
             np.testing.assert_allclose(values.numpy(), twin, atol=1e-5, rtol=1e-5, err_msg=key)
-        touching += sum(int((torch.pdist(places) < 2 * env.size[0]).sum()) for places in env.position)
+        touching += sum(
+            int((torch.pdist(places) < 2 * env.size[0]).sum()) for places in env.position
+        )
     assert touching > 30
 
 

@@ -63,8 +63,11 @@ def test_each_block_is_late_by_itself_and_agents_begin_with_what_they_see_at_the
 
 
 def way(steps: TensorDictBase, t: int, then: int, world: int, agent: int, other: int) -> Tensor:
-    """The way from where an agent is at the ``t``-th observation to where another one was ``then``, [2]."""
-    return at(steps, then, KINEMATICS)[world, other, 2:] - at(steps, t, KINEMATICS)[world, agent, 2:]
+    """The way from where an agent is at the ``t``-th observation to where another one was ``then``,
+    [2]."""
+    return (
+        at(steps, then, KINEMATICS)[world, other, 2:] - at(steps, t, KINEMATICS)[world, agent, 2:]
+    )
 
 
 def test_what_is_registered_stands_where_it_was_as_seen_from_where_the_agent_is_now():
@@ -74,7 +77,9 @@ def test_what_is_registered_stands_where_it_was_as_seen_from_where_the_agent_is_
         block, agents = 5 * agent + 3 + i, (world, agent, others[agent][i])
         found = at(held, t, keys.OBSERVATION)[world, agent, 4:14].view(5, 2)[3 + i]
         torch.testing.assert_close(found, way(held, t, newest(held, t, world, block), *agents))
-        slots = at(timeline, t, keys.OBSERVATION)[world, agent, 4 : 4 + 15 * SLOTS].view(5, SLOTS, 3)[3 + i]
+        slots = at(timeline, t, keys.OBSERVATION)[world, agent, 4 : 4 + 15 * SLOTS].view(
+            5, SLOTS, 3
+        )[3 + i]
         for k in range(min(SLOTS, t + 1)):
             known.append(k >= int(sent(timeline, t - k)[1][world, block]))
             assert slots[k, 2] == known[-1]
@@ -92,12 +97,15 @@ def small(monkeypatch) -> None:
 
 
 def corrected(method: str) -> list[TensorDictBase]:
-    """What the learner of a method learns from, [B, T] each, and [B, T, N, 4 + C + N] for its critic."""
+    """What the learner of a method learns from, [B, T] each, and [B, T, N, 4 + C + N] for its
+    critic."""
     env = make_env(METHODS[method], 4, LATE, 9)
     set_seed(env, 0)
     learner = make_learner(env, METHODS[method], 9)
     with torch.no_grad():
-        batches = env.rollout(3 * HORIZON, learner.actor, break_when_any_done=False).split(HORIZON, 1)
+        batches = env.rollout(3 * HORIZON, learner.actor, break_when_any_done=False).split(
+            HORIZON, 1
+        )
     return [learner.backupdated_batch(batch) for batch in batches][1:]
 
 
@@ -115,8 +123,12 @@ def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, met
             landmarks = slots[..., :3, :, :2]  # they rest, in whichever step they were seen
             expected = landmarks[..., :1, :] * known[:, :, None, None, :, None]
             torch.testing.assert_close(landmarks, expected)
-            critic = torch.cat([critic[..., :4], slots[..., 0, :2].flatten(-2), critic[..., -3:]], -1)
-        undelayed = torch.cat([kinematics, seen.flatten(-2), torch.eye(3).expand(4, HORIZON, 3, 3)], -1)
+            critic = torch.cat(
+                [critic[..., :4], slots[..., 0, :2].flatten(-2), critic[..., -3:]], -1
+            )
+        undelayed = torch.cat(
+            [kinematics, seen.flatten(-2), torch.eye(3).expand(4, HORIZON, 3, 3)], -1
+        )
         assert critic.equal(undelayed)
         assert not late[keys.OBSERVATION][:, 1:, :, :17].equal(undelayed[:, :-1])
 

@@ -4,7 +4,16 @@ import pytest
 import torch
 from delay_twin import ACTION
 from tensordict import TensorDictBase
-from torchrl.data import Binary, Bounded, Categorical, Composite, MultiOneHot, OneHot, TensorSpec, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+    Unbounded,
+)
 from torchrl.envs import EnvBase, TransformedEnv
 
 from damian.transforms import ActionDelay, ActionHistory
@@ -54,7 +63,9 @@ RANGES: dict[str, tuple[TensorSpec, torch.Tensor, torch.Tensor]] = {
         numbered(5),
     ),
     "one possible value": (
-        Bounded(torch.full((*GROUP, 2), 2.0), torch.tensor([2.0, 4.0]).expand(*GROUP, 2), (*GROUP, 2)),
+        Bounded(
+            torch.full((*GROUP, 2), 2.0), torch.tensor([2.0, 4.0]).expand(*GROUP, 2), (*GROUP, 2)
+        ),
         torch.full((*GROUP, 2), 2.0),
         torch.tensor([2.0, 4.0]).expand(*GROUP, 2),
     ),
@@ -81,7 +92,11 @@ LEGAL = {
     "a number for each agent": (Categorical(5, GROUP), [3, 4], torch.tensor([3, 4]).expand(GROUP)),
     "none": (Bounded(2, 7, GROUP, dtype=torch.int64), None, torch.full(GROUP, 2)),
     "index": (OneHot(3, (*GROUP, 3)), 2, torch.tensor([0, 0, 1]).expand(*GROUP, 3)),
-    "indices": (MultiOneHot([2, 3], (*GROUP, 5)), [1, 2], torch.tensor([0, 1, 0, 0, 1]).expand(*GROUP, 5)),
+    "indices": (
+        MultiOneHot([2, 3], (*GROUP, 5)),
+        [1, 2],
+        torch.tensor([0, 1, 0, 0, 1]).expand(*GROUP, 5),
+    ),
     "flags": (Binary(3, (*GROUP, 3)), [0, 1, 1], torch.tensor([0, 1, 1]).expand(*GROUP, 3)),
 }
 
@@ -93,5 +108,7 @@ def test_a_legal_default_is_executed_first(spec, default, expected):
     td = env.reset().set(ACTION, torch.zeros(expected.shape, dtype=spec.dtype))
     executed = delay.inv(td)[ACTION]
     assert executed.equal(expected.to(spec.dtype))
-    history = TransformedEnv(Plain(spec), ActionHistory(2, ACTION, default=default)).reset()[HISTORY]
+    history = TransformedEnv(Plain(spec), ActionHistory(2, ACTION, default=default)).reset()[
+        HISTORY
+    ]
     assert history.isfinite().all()

@@ -29,7 +29,8 @@ LONGEST = 7
 
 
 def tracking(law: object = PAPER, own: bool = False, **changed) -> ScenarioConfig:
-    """A moving, intermittent source in a small square, with a coarse grid, which the slow twin can bear."""
+    """A moving, intermittent source in a small square, with a coarse grid, which the slow twin can
+    bear."""
     return square(
         source=walking(emission="per_step", emission_probability=0.6, position=[100.0, 100.0]),
         observation=ObservationConfig(belief=["belief_gain"], belief_cell=50.0, own=own),
@@ -53,7 +54,8 @@ def episodes(data: TensorDictBase) -> list[tuple[int, int]]:
 def expected(
     env: DelayedEnv, data: TensorDictBase, begin: int, end: int, now: int, viewer: int | None = None
 ):
-    """The slow twin's beliefs after step ``end`` of an episode that begins at ``begin``, of one world [T].
+    """The slow twin's beliefs after step ``end`` of an episode that begins at ``begin``, of one
+    world [T].
 
     Each source is followed as if it were the only one, [K, C].
     """
@@ -98,7 +100,11 @@ SCENARIOS = {
             count=3,
             false_alarm=0.1,
             emission="per_step",
-            each=[{}, {"motion": "static", "level_db": 138.0}, {"miss": 0.3, "emission": "constant"}],
+            each=[
+                {},
+                {"motion": "static", "level_db": 138.0},
+                {"miss": 0.3, "emission": "constant"},
+            ],
         ),
     ),
     "arrival": replace(tracking(), delay=DelayConfig(obs=PAPER, order="arrival")),
@@ -135,7 +141,8 @@ def test_back_updated_beliefs_know_what_has_arrived_since(name):
     for world, raw in zip(stored, data, strict=True):
         for begin, last in episodes(raw):
             for end in range(begin, last + 1):
-                # All that had been generated when the storage looked at the step last had arrived by then.
+                # All that had been generated when the storage looked at the step last had arrived
+                # by then.
                 now = len(raw) - 1
                 wanted = expected(env, raw, begin, end, now)
                 check(world["next"][keys.BELIEF][end], wanted)

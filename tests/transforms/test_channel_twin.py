@@ -45,7 +45,12 @@ class World:
         known: bool = False,
         own_at_reset: bool = True,
     ) -> None:
-        self.agents, self.delay, self.known, self.own_at_reset = range(n_agents), delay, known, own_at_reset
+        self.agents, self.delay, self.known, self.own_at_reset = (
+            range(n_agents),
+            delay,
+            known,
+            own_at_reset,
+        )
         self.clock, self.began = 0, 0
 
     def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
@@ -60,7 +65,9 @@ class World:
             if arrives == self.clock and (link not in self.holds or self.holds[link][0] < sent):
                 self.holds[link] = (sent, content)
         if begins and self.known:
-            self.holds = {(i, j): (self.clock, contents[j]) for i in self.agents for j in self.agents}
+            self.holds = {
+                (i, j): (self.clock, contents[j]) for i in self.agents for j in self.agents
+            }
         self.own = contents
 
     def seen(self, receiver: int, sender: int, zeros: Any) -> tuple[Any, int, bool]:
@@ -122,14 +129,18 @@ def check_against_twin(
 
 def assert_same(twin: World, outputs: TensorDictBase) -> None:
     """The messages that each agent has received from each other one are those of the twin."""
-    got = [outputs["agents", name].tolist() for name in ("received", "received_age", "received_mask")]
+    got = [
+        outputs["agents", name].tolist() for name in ("received", "received_age", "received_mask")
+    ]
     zeros = [0.0] * len(got[0][0][0])
     for i in twin.agents:
         for j in twin.agents:
             assert tuple(part[i][j] for part in got) == tuple(twin.seen(i, j, zeros)), (i, j)
 
 
-def table(law: Any, streams: Tensor, n_steps: int, loss: float = 0.0) -> Callable[[int, int], int | None]:
+def table(
+    law: Any, streams: Tensor, n_steps: int, loss: float = 0.0
+) -> Callable[[int, int], int | None]:
     """The delay that a law draws at a clock for a row; None if the message is lost."""
     sampler = sampler_of(law_of(law), loss=loss)
     delays = drawn(sampler, streams, n_steps).tolist()
@@ -233,7 +244,9 @@ def test_agents_hear_only_those_in_their_range(navigation):
     heard = []
 
     def wants(outputs: Any, _: Any, b: int) -> set:
-        links = {(i, j) for i, j in ALL if math.dist(place(outputs, b, i), place(outputs, b, j)) <= 0.9}
+        links = {
+            (i, j) for i, j in ALL if math.dist(place(outputs, b, i), place(outputs, b, j)) <= 0.9
+        }
         heard.append(len(links))
         return links
 

@@ -1,4 +1,5 @@
-"""What every transform of damian does in every environment, vector, copy, checkpoint, graph and collector."""
+"""What every transform of damian does in every environment, vector, copy, checkpoint, graph and
+collector."""
 
 import copy
 import inspect
@@ -10,7 +11,18 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from environments import ACTION, KINDS, LATE, OBSERVATION, REWARD, Drift, Kind, cartpole, uavs, unserved
+from environments import (
+    ACTION,
+    KINDS,
+    LATE,
+    OBSERVATION,
+    REWARD,
+    Drift,
+    Kind,
+    cartpole,
+    uavs,
+    unserved,
+)
 from helpers import all_same, same, saved_and_loaded, square, walking
 from streams import check_independent
 from tensordict import TensorDictBase
@@ -73,12 +85,16 @@ CASES = {
     "ObservationTimeline, one world": Case(cartpole, lambda: ObservationTimeline(3)),
     "ObservationTimeline, agents": Case(
         uavs,
-        lambda: ObservationTimeline(3, ("agents", "message"), sent_key="message_sent", group=True, own=True),
+        lambda: ObservationTimeline(
+            3, ("agents", "message"), sent_key="message_sent", group=True, own=True
+        ),
     ),
     "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"})),
     "ObservationDelay, agents": Case(
         uavs,
-        lambda: ObservationDelay(LATE, [OBSERVATION], loss=0.2, delay_key="delay", sent_key="message_sent"),
+        lambda: ObservationDelay(
+            LATE, [OBSERVATION], loss=0.2, delay_key="delay", sent_key="message_sent"
+        ),
     ),
     "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
     "RewardDelay, agents": Case(uavs, lambda: RewardDelay(LATE, REWARD)),
@@ -88,13 +104,18 @@ CASES = {
             [[0, LATE, 1], [3, 0, 0], [0, LATE, 0]], OBSERVATION, loss=0.2, sent_key="message_sent"
         ),
     ),
-    "Channel, messages": Case(uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)),
+    "Channel, messages": Case(
+        uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)
+    ),
     "ServerNode": Case(unserved, lambda: ServerNode(unserved().server, ("agents", "message"))),
 }
-"""Every transform on every kind of environment that it works on; the name before the comma is its class."""
+"""Every transform on every kind of environment that it works on; the name before the comma is its
+class."""
 
 
-def onward(env: EnvBase, td: TensorDictBase, n_steps: int = 6, seed: int = 0) -> list[TensorDictBase]:
+def onward(
+    env: EnvBase, td: TensorDictBase, n_steps: int = 6, seed: int = 0
+) -> list[TensorDictBase]:
     """Step with random actions and partial resets; the outputs of every step and every reset."""
     torch.manual_seed(seed)
     outputs = []
@@ -133,14 +154,18 @@ TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
     "RewardDelay": lambda kind, law, **options: RewardDelay(
         law, kind.reward, delay_key="reward_delay", earned_key="earned_reward", **options
     ),
-    "CumulativeReward": lambda kind, law, **options: CumulativeReward(3, 0.5, kind.reward, **options),
+    "CumulativeReward": lambda kind, law, **options: CumulativeReward(
+        3, 0.5, kind.reward, **options
+    ),
     "ActionHistory": lambda kind, law, **options: ActionHistory(3, kind.action, **options),
     "SampleAndHold": lambda kind, law, **options: SampleAndHold(2, kind.observation, **options),
 }
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
-PAIRS = {f"{name} on {kind}": (KINDS[kind], make) for kind in KINDS for name, make in TRANSFORMS.items()} | {
+PAIRS = {
+    f"{name} on {kind}": (KINDS[kind], make) for kind in KINDS for name, make in TRANSFORMS.items()
+} | {
     f"Channel on {name}": (kind, lambda kind, law: Channel(law, kind.observation, loss=0.1))
     for name, kind in GROUPS.items()
 }
@@ -151,7 +176,9 @@ drawing = pytest.mark.parametrize(("kind", "make"), DRAWING.values(), ids=DRAWIN
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 OTHERS = {name: Case(kind.make, partial(make, kind, LATE)) for name, (kind, make) in PAIRS.items()}
-everywhere = pytest.mark.parametrize("case", [*CASES.values(), *OTHERS.values()], ids=[*CASES, *OTHERS])
+everywhere = pytest.mark.parametrize(
+    "case", [*CASES.values(), *OTHERS.values()], ids=[*CASES, *OTHERS]
+)
 AGENTS = {name: case for name, case in CASES.items() if case.env in (uavs, unserved)}
 BATCHED = {name: case for name, case in CASES.items() if case.env is not cartpole}
 
@@ -161,7 +188,9 @@ def test_the_cases_cover_every_exported_transform():
     concrete = {
         name
         for name, value in exported.items()
-        if inspect.isclass(value) and issubclass(value, Transform) and value is not StatefulTransform
+        if inspect.isclass(value)
+        and issubclass(value, Transform)
+        and value is not StatefulTransform
     }
     assert concrete == {name.split(",")[0] for name in CASES}
     assert all(type(case.make()).__name__ == name.split(",")[0] for name, case in CASES.items())
@@ -177,7 +206,9 @@ def test_the_outputs_match_the_specs_and_every_spec_can_do_without_the_batch(cas
     check_env_specs(env, break_when_any_done="both")
     assert env.rollout(12, break_when_any_done=False).shape == (*env.batch_size, 12)
     dims = len(env.batch_size)
-    for name in (name for name in dir(type(env)) if name.endswith("_spec_unbatched") and name[0] != "_"):
+    for name in (
+        name for name in dir(type(env)) if name.endswith("_spec_unbatched") and name[0] != "_"
+    ):
         spec, whole = getattr(env, name), getattr(env, name.removesuffix("_unbatched"))
         assert spec.shape == whole.shape[dims:], name
         assert spec.rand().shape == spec.shape
@@ -192,9 +223,12 @@ def test_a_transform_works_around_a_vector_of_environments(case):
 
 
 def some(cases, fast):
-    """The cases as a parameter; all but the ``fast`` ones are slow tests, because they take seconds."""
+    """The cases as a parameter; all but the ``fast`` ones are slow tests, because they take
+    seconds."""
     slow = pytest.mark.slow
-    values = [pytest.param(case, id=n, marks=() if n in fast else slow) for n, case in cases.items()]
+    values = [
+        pytest.param(case, id=n, marks=() if n in fast else slow) for n, case in cases.items()
+    ]
     return pytest.mark.parametrize("case", values)
 
 
@@ -249,7 +283,8 @@ def test_a_loaded_checkpoint_continues_bit_for_bit(case, whole, n_steps, used):
 @pytest.mark.sample(4)
 @every_case
 def test_a_state_that_is_loaded_after_a_reset_shows_no_message_of_its_own_episode(case):
-    """Only random streams are loaded, so that it is all one whether the state or the reset comes first."""
+    """Only random streams are loaded, so that it is all one whether the state or the reset comes
+    first."""
     other, made = case.build(), []
     begun(other)
     state = saved_and_loaded(other.transform.state_dict())
@@ -291,7 +326,9 @@ def test_a_step_compiles_into_one_graph_that_does_the_same(case):
         after = env.base_env.step(td)["next"]
         one, other = whole_step(env.transform)(td, after.clone()), compiled(td, after.clone())
         assert same(one, other)
-    assert all(a.equal(b) for a, b in zip(memory(env.transform), memory(twin.transform), strict=True))
+    assert all(
+        a.equal(b) for a, b in zip(memory(env.transform), memory(twin.transform), strict=True)
+    )
 
 
 def whole_step(transform):
@@ -335,7 +372,10 @@ def test_a_reset_of_some_worlds_does_not_change_the_others(case):
     assert same(reset[1:], td[1:].select(*reset.keys(True, True)))
     torch.manual_seed(0)
     actions = twin.rand_action(td.clone()).select(*env.action_keys)
-    outputs = [each.step(state.clone().update(actions))["next"] for each, state in ((env, reset), (twin, td))]
+    outputs = [
+        each.step(state.clone().update(actions))["next"]
+        for each, state in ((env, reset), (twin, td))
+    ]
     assert same(outputs[0][1:], outputs[1][1:])
 
 
@@ -369,7 +409,9 @@ def storages(tensors: list[torch.Tensor]) -> set[int]:
 
 IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
     "ObservationDelay": lambda kind: observation_delay(kind, 0),
-    "ObservationDelay, bursts": lambda kind: observation_delay(kind, Burst(good=0, bad=0, bad_loss=0.0)),
+    "ObservationDelay, bursts": lambda kind: observation_delay(
+        kind, Burst(good=0, bad=0, bad_loss=0.0)
+    ),
     "ActionDelay": lambda kind: ActionDelay(Uniform(0, 0, 0.5), kind.action),
     "RewardDelay": lambda kind: RewardDelay("0s", kind.reward),
     "CumulativeReward": lambda kind: CumulativeReward(1, 0.5, kind.reward),
@@ -482,10 +524,13 @@ def two_worlds() -> EnvBase:
 
 @dataclass(frozen=True)
 class ByContent(Law):
-    """Delays that follow from the message, so that what a skipped step would send arrives at another time."""
+    """Delays that follow from the message, so that what a skipped step would send arrives at
+    another time."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return ContextSampler(lambda c: (c.entries["seen"][:, 1] * 100).abs().floor() % 4, 3, reads=["seen"])
+        return ContextSampler(
+            lambda c: (c.entries["seen"][:, 1] * 100).abs().floor() % 4, 3, reads=["seen"]
+        )
 
 
 @pytest.mark.parametrize(
@@ -513,6 +558,8 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
             stepped = skipping.step(td.clone().set("action", chosen).set("_step", mask))["next"]
             assert same(stepped[world], after[world])
             td[world] = stepped[world].select(*td.keys(True, True), strict=False)
-            rest = skipping.step(td.clone().set("action", actions[t]).set("_step", torch.zeros(2).bool()))
+            rest = skipping.step(
+                td.clone().set("action", actions[t]).set("_step", torch.zeros(2).bool())
+            )
             assert rest["next", "observation"].equal(td["observation"])
         other = other.clone().update(after.select(*other.keys(True, True), strict=False))

@@ -23,7 +23,13 @@ from delay_twin import (
 from helpers import play
 from tensordict import TensorDictBase
 
-from damian.transforms import ActionHistory, CumulativeReward, ObservationDelay, RewardDelay, SampleAndHold
+from damian.transforms import (
+    ActionHistory,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    SampleAndHold,
+)
 
 
 @pytest.fixture(params=LAWS)
@@ -53,18 +59,23 @@ def test_the_cumulative_reward_equals_equation_4(steps, gamma):
         for t in range(STEPS):
             episode.append(earned[t][w][n][0])
             latest = episode[::-1][:steps]
-            assert found[t][w][n][0] == sum(gamma**age * reward for age, reward in enumerate(latest))
+            assert found[t][w][n][0] == sum(
+                gamma**age * reward for age, reward in enumerate(latest)
+            )
             episode = [] if done[t][w][0] else episode
 
 
 @pytest.mark.parametrize("period", [1, 2, 3, 5])
 def test_between_two_ticks_entries_and_actions_are_held_and_no_agent_is_ready(period):
     chosen = choices()
-    clock = SampleAndHold(period, [("agents", "message_sent")], [ACTION], ready_key=("agents", "ready"))
+    clock = SampleAndHold(
+        period, [("agents", "message_sent")], [ACTION], ready_key=("agents", "ready")
+    )
     outputs, undelayed = play(delayed(clock), chosen), play(Counting(WORLDS, N_AGENTS), chosen)
     ready, held = column(outputs, "agents", "ready"), column(outputs, "agents", "message_sent")
     ready_now, sent, done = (
-        column(undelayed, *key) for key in (("agents", "ready"), ("agents", "message_sent"), ("done",))
+        column(undelayed, *key)
+        for key in (("agents", "ready"), ("agents", "message_sent"), ("done",))
     )
     executed = column(outputs, *OBSERVATION)
     for w, n in ROWS:
@@ -103,7 +114,9 @@ def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_
 
 
 @pytest.mark.sample(2)
-@pytest.mark.parametrize(("recorded_key", "reflected_after"), [(None, 1), ("ready", 1), ("ready", 2)])
+@pytest.mark.parametrize(
+    ("recorded_key", "reflected_after"), [(None, 1), ("ready", 1), ("ready", 2)]
+)
 def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_does_not_reflect(
     law, recorded_key, reflected_after
 ):
@@ -121,6 +134,8 @@ def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_
             recorded += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
             latest = [*[(-STEPS, default)] * 3, *recorded][-3:]
             since = t + 1 - ages[2 * t + 1][w][n][0]  # when the observation was generated
-            expected = [action if since - at < reflected_after else default for at, action in latest]
+            expected = [
+                action if since - at < reflected_after else default for at, action in latest
+            ]
             assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)
             recorded = [] if done[t][w][0] else recorded

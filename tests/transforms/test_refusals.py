@@ -24,7 +24,9 @@ MISSING = {
 
 @pytest.mark.parametrize("key", MISSING)
 def test_a_key_that_the_environment_does_not_have_is_named(key):
-    with pytest.raises(InputError, match=f": {key} is not among the keys of the environment: ") as error:
+    with pytest.raises(
+        InputError, match=f": {key} is not among the keys of the environment: "
+    ) as error:
         TransformedEnv(GymEnv("Pendulum-v1"), MISSING[key]()).rollout(3)
     assert "\n" not in str(error.value)
 
@@ -37,7 +39,9 @@ IN_USE = {
 
 @pytest.mark.parametrize("transforms", IN_USE.values(), ids=IN_USE)
 def test_an_entry_that_there_is_already_is_not_replaced(transforms):
-    with pytest.raises(InputError, match="is already an entry of the environment: choose another name"):
+    with pytest.raises(
+        InputError, match="is already an entry of the environment: choose another name"
+    ):
         TransformedEnv(uavs(), Compose(*transforms())).rollout(3)
 
 
@@ -56,7 +60,9 @@ def test_a_wrong_argument_is_one_line(line):
 
 @pytest.mark.parametrize("use", [lambda t: t, Compose])
 def test_outside_an_environment_the_error_says_what_to_do(use):
-    with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*late_replay_buffer"):
+    with pytest.raises(
+        RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*late_replay_buffer"
+    ):
         use(ObservationDelay(2))(TensorDict({"observation": torch.zeros(3, 1)}, [3]))
 
 

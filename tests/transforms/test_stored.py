@@ -32,7 +32,9 @@ from damian.transforms import (
     set_seed,
 )
 
-EXAMPLE = runpy.run_path(str(Path(__file__).parents[2] / "examples/transforms/late_replay_buffer.py"))
+EXAMPLE = runpy.run_path(
+    str(Path(__file__).parents[2] / "examples/transforms/late_replay_buffer.py")
+)
 delay_trajectories: Callable[..., TensorDictBase] = EXAMPLE["delay_trajectories"]
 
 LATE = Uniform(0, 3)

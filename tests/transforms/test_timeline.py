@@ -19,8 +19,11 @@ ALL = [(False, False), (True, False), (True, True)]
 """Whether a timeline is that of a group, and whether it has one's own messages at once."""
 
 
-def late_uavs(law: object = LATE, loss: float = 0.2, links: bool = False, **options) -> TransformedEnv:
-    """UAVs that send nothing in half of the steps; ``links``: every receiver has delays of its own."""
+def late_uavs(
+    law: object = LATE, loss: float = 0.2, links: bool = False, **options
+) -> TransformedEnv:
+    """UAVs that send nothing in half of the steps; ``links``: every receiver has delays of its
+    own."""
     uav_env = UavEnv(square(), num_worlds=WORLDS, extras=["message"])
     options |= {"delay_key": "delay", "sent_key": "message_sent"}
     if links:
@@ -37,7 +40,12 @@ def late_uavs(law: object = LATE, loss: float = 0.2, links: bool = False, **opti
 
 
 def twin(
-    data: TensorDictBase, world: int, receiver: int, group: bool, own: bool, until: int | None = None
+    data: TensorDictBase,
+    world: int,
+    receiver: int,
+    group: bool,
+    own: bool,
+    until: int | None = None,
 ) -> list[torch.Tensor]:
     """The timeline of one receiver after every step, from the messages and delays of one world.
 
@@ -105,7 +113,9 @@ def test_stored_timelines_are_corrected_by_what_has_arrived_since(group, own):
         stored = storage.steps[storage.latest()].transpose(0, 1)
         for world in range(WORLDS):
             for receiver in range(AGENTS):
-                expected = torch.stack(twin(data, world, receiver, group, own, until=data.shape[1] - 1))
+                expected = torch.stack(
+                    twin(data, world, receiver, group, own, until=data.shape[1] - 1)
+                )
                 found = stored[world]["next", *key][:, receiver].reshape(expected.shape)
                 assert found.equal(expected)
     assert not stored["next", *key].equal(data["next", *key])
@@ -117,8 +127,12 @@ def test_the_worked_timeline_of_the_docstring():
     def delay(context):
         return delays[context.time.long() - 1].float()
 
-    late = ObservationDelay(ContextSampler(delay, longest=3), "observation", "received", delay_key="delay")
-    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(late, ObservationTimeline(4, delay_key="delay")))
+    late = ObservationDelay(
+        ContextSampler(delay, longest=3), "observation", "received", delay_key="delay"
+    )
+    env = TransformedEnv(
+        GymEnv("Pendulum-v1"), Compose(late, ObservationTimeline(4, delay_key="delay"))
+    )
     steps = env.rollout(4)
     sent = [steps["observation"][0], *steps["next", "observation"]]
     for t, held in ((3, [None, 2, None, 0]), (4, [None, None, 2, 1])):
@@ -129,7 +143,8 @@ def test_the_worked_timeline_of_the_docstring():
 
 
 def test_places_relative_to_the_observer_are_moved_into_its_present_frame():
-    """Pendulum's first two numbers serve as the observer's position; a place at the origin stays there."""
+    """Pendulum's first two numbers serve as the observer's position; a place at the origin stays
+    there."""
     from torchrl.envs import UnaryTransform  # noqa: PLC0415
 
     relative = UnaryTransform(["observation"], ["place"], fn=lambda o: -o[..., :2])

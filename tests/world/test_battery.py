@@ -41,7 +41,12 @@ def test_recorded_levels_are_observed_as_the_same_levels(dtype):
     assert observed(torch.tensor(levels, dtype=dtype), BATTERY).tolist() == list(expected)
 
 
-@given(share=st.floats(0, 1.5), vertical=st.floats(0.1, 20), cruise=st.floats(0, 100), part=st.floats(0, 1))
+@given(
+    share=st.floats(0, 1.5),
+    vertical=st.floats(0.1, 20),
+    cruise=st.floats(0, 100),
+    part=st.floats(0, 1),
+)
 def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical, cruise, part):
     elapsed = share * (2 * vertical + cruise)
     cruised = part * 150.0
@@ -56,7 +61,9 @@ def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical
 def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
     env = fresh(everything(episode=KEEPS_GOING), num_worlds=4)
     battery, motion = env.scenario.battery, env.scenario.motion
-    power = 100 * battery.engine_power_kw / (battery.capacity_kwh * battery.efficiency) / 3600  # % a second
+    power = (
+        100 * battery.engine_power_kw / (battery.capacity_kwh * battery.efficiency) / 3600
+    )  # % a second
     gain = 100 * battery.charging_power_kw / (3600 * battery.capacity_kwh)
     hardest, generator, flown = 10 * math.sqrt(3) / 3, torch.Generator().manual_seed(0), 0
     levels, before = env.state.battery.tolist(), env.state.position[..., :2].tolist()
@@ -64,7 +71,10 @@ def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
         act(env, random_actions(env, generator))
         after = env.state.position[..., :2].tolist()
         for b, n in [(b, n) for b in range(4) for n in range(3)]:
-            way, height = math.dist(before[b][n], after[b][n]), motion.min_level + n * motion.level_separation
+            way, height = (
+                math.dist(before[b][n], after[b][n]),
+                motion.min_level + n * motion.level_separation,
+            )
             hard = math.sqrt(hardest * height / motion.max_acceleration)
             up = max(15 / 8 * height / motion.max_speed, hard)
             drain = power * (2 * up / 0.9 + way / battery.reference_speed) if way else -gain

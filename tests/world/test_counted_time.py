@@ -18,7 +18,9 @@ from damian.world.motion import MotionConfig
     tenths=st.integers(0, 10**4),
 )
 @settings(max_examples=settings.default.max_examples // 5)
-def test_a_flight_ends_after_exactly_its_duration_but_for_its_float_error(period, vertical, cruise, tenths):
+def test_a_flight_ends_after_exactly_its_duration_but_for_its_float_error(
+    period, vertical, cruise, tenths
+):
     motion = MotionConfig("polynomial", sensing_time=tenths / 10)
     env = fresh(one_uav(motion=motion, clock=clock(f"{period}s")))
     flight = {"vertical": torch.tensor([[vertical]]), "cruise": torch.tensor([[cruise]])}

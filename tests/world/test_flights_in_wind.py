@@ -30,7 +30,9 @@ SPEED, HARDEST, LEAST = [8.0, 12.0, 20.0], [1.0, 2.0, 4.0], 2.0
 WORLD = ScenarioConfig(
     agents=3,
     region=RegionConfig(kind="vertices", vertices=DENTED, lattice_step=50.0),
-    motion=MotionConfig(kind="polynomial", max_speed=SPEED, max_acceleration=HARDEST, min_ground_speed=LEAST),
+    motion=MotionConfig(
+        kind="polynomial", max_speed=SPEED, max_acceleration=HARDEST, min_ground_speed=LEAST
+    ),
     battery=BatteryConfig(enabled=True, capacity_kwh=[0.5, 1.0, 2.0]),
     actions=ActionConfig(distances=[0.0, 110.0, 230.0]),
     clock=clock("2s"),
@@ -72,13 +74,19 @@ def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
                 air, slowest = through_the_air(way, blows, SPEED[uav])
                 drained = 100 * 10 / (12 * [0.5, 1.0, 2.0][uav])
                 vertical = env.simulation.vehicles.vertical(stands)[uav].item()
-                reach = (stands.battery[world, uav].item() - drained * 2 * vertical / 3240) * 72000 / drained
+                reach = (
+                    (stands.battery[world, uav].item() - drained * 2 * vertical / 3240)
+                    * 72000
+                    / drained
+                )
                 good = not outside and (goal == origin or (slowest >= LEAST and air <= reach))
                 assert mask[world, uav, action] == good, (world, uav, action)
         td = env.rand_step(td)["next"]
         after = env.state
         for world, uav in (ready & (after.goal != stands.goal)).nonzero().tolist():
-            way = env.simulation.airspace.way(after.origin[world, uav], after.goal[world, uav]).tolist()
+            way = env.simulation.airspace.way(
+                after.origin[world, uav], after.goal[world, uav]
+            ).tolist()
             air, slowest = through_the_air(way, blows, SPEED[uav])
             assert slowest >= LEAST
             fast = 15 / 8 * air / SPEED[uav]
@@ -91,7 +99,9 @@ def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
 
 def test_equal_values_for_each_uav_are_bit_for_bit_one_value():
     one = replace(
-        WORLD, motion=replace(WORLD.motion, max_speed=12.3, max_acceleration=1.7), battery=BatteryConfig(True)
+        WORLD,
+        motion=replace(WORLD.motion, max_speed=12.3, max_acceleration=1.7),
+        battery=BatteryConfig(True),
     )
     motion = replace(one.motion, max_speed=[12.3] * 3, max_acceleration=[1.7] * 3)
     each = replace(one, motion=motion, battery=BatteryConfig(True, capacity_kwh=[9.0] * 3))
@@ -134,7 +144,10 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
 
 @pytest.mark.parametrize(("kind", "belief"), [("instant", True), ("polynomial", False)])
 def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
-    levels, flying = [138.0, 142.0, 145.0], MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
+    levels, flying = (
+        [138.0, 142.0, 145.0],
+        MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0),
+    )
     base = replace(
         STILL,
         motion=flying,
@@ -166,14 +179,20 @@ def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
             one = steps[1 + levels.index(level)]["agents"][world]
             met.add(level)
             for name in ("observation", "reward"):
-                torch.testing.assert_close(steps[0]["agents", name][world], one[name], rtol=0, atol=3e-3)
+                torch.testing.assert_close(
+                    steps[0]["agents", name][world], one[name], rtol=0, atol=3e-3
+                )
     assert met == {*levels}
 
 
-@pytest.mark.parametrize("seen", [{"global_features": ["coverage_map"]}, {"belief": ["belief_map"]}])
+@pytest.mark.parametrize(
+    "seen", [{"global_features": ["coverage_map"]}, {"belief": ["belief_map"]}]
+)
 def test_what_has_tables_for_each_level_refuses_a_range_of_them(seen):
     drawn = {"source.level_db": [138, 142]}
-    with pytest.raises(InputError, match=r"randomise.source.level_db: .* is a range, .* give a list"):
+    with pytest.raises(
+        InputError, match=r"randomise.source.level_db: .* is a range, .* give a list"
+    ):
         make_env(replace(STILL, observation=ObservationConfig(**seen), randomise=drawn))
 
 
@@ -182,7 +201,9 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
     scenarios = [replace(STILL, delay=DelayConfig(law), randomise={"delay.loss": losses})]
     scenarios += [replace(STILL, delay=DelayConfig(law, loss=loss)) for loss in losses]
     envs = [make_env(each, 12, 0, extras=["message"]) for each in scenarios]
-    actions = [torch.randint(24, (12, 3), generator=torch.Generator().manual_seed(i)) for i in range(60)]
+    actions = [
+        torch.randint(24, (12, 3), generator=torch.Generator().manual_seed(i)) for i in range(60)
+    ]
     flown = []
     for env in envs:
         td, steps = env.reset(), []
@@ -249,9 +270,13 @@ def test_reports_of_two_sources_are_those_of_a_plain_loop():
     assert min(missed, alarms, successes) > 5
 
 
-@pytest.mark.parametrize("ends", [{"success_share": 0.6}, {"all_sources": True, "since_detection": True}])
+@pytest.mark.parametrize(
+    "ends", [{"success_share": 0.6}, {"all_sources": True, "since_detection": True}]
+)
 def test_the_truth_pays_and_ends_as_if_there_were_no_misses_and_false_alarms(ends):
-    reward = RewardConfig(spotted=1.0, spotting_agents=1.0, source_distance=0.5, bonus=7.0, penalty=3.0)
+    reward = RewardConfig(
+        spotted=1.0, spotting_agents=1.0, source_distance=0.5, bonus=7.0, penalty=3.0
+    )
     source, episode = SourceConfig(count=2, level_db=150.0), EpisodeConfig(12, **ends)
     clear = replace(STILL, reward=reward, source=source, episode=episode)
     reported = replace(clear, source=replace(clear.source, miss=0.5, false_alarm=0.2))
@@ -305,9 +330,18 @@ def test_a_battery_is_empty_where_it_allows_no_flight_in_this_wind(kind):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"motion": MotionConfig("polynomial", max_speed=[1.0, 2.0])}, "motion.max_speed: .* each of the 3"),
-        ({"motion": MotionConfig(), "wind": WindConfig(speed=3.0)}, "wind: .* needs motion=polynomial"),
-        ({"randomise": {"agents": [1, 2]}}, "randomise.agents: .* cannot be drawn, only motion.max_speed"),
+        (
+            {"motion": MotionConfig("polynomial", max_speed=[1.0, 2.0])},
+            "motion.max_speed: .* each of the 3",
+        ),
+        (
+            {"motion": MotionConfig(), "wind": WindConfig(speed=3.0)},
+            "wind: .* needs motion=polynomial",
+        ),
+        (
+            {"randomise": {"agents": [1, 2]}},
+            "randomise.agents: .* cannot be drawn, only motion.max_speed",
+        ),
         ({"randomise": {"wind.speed": [0, 1000]}}, "wind.speed: 1000"),
         ({"randomise": {"wind.speed": 3}}, "randomise.wind.speed: 3 is not a range"),
         (

@@ -20,7 +20,8 @@ def test_distance_and_bearing_agree_with_vector_geometry_on_the_sphere():
 
 
 def _local_by_vectors(lat, lon, origin):
-    """Distance from the angle between two vectors, and bearing from the tangent plane at the origin."""
+    """Distance from the angle between two vectors, and bearing from the tangent plane at the
+    origin."""
     phi, lam = np.radians(origin)
     up = np.array([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)])
     east = np.array([-np.sin(lam), np.cos(lam), 0.0])

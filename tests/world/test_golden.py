@@ -69,7 +69,9 @@ def test_recorded_actions_lead_to_the_recorded_points(case, compared, reasons):
 
 
 @pytest.mark.parametrize(("case", "n_flags", "after_detection"), [(1, 168, 24), (2, 564, 181)])
-def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(case, n_flags, after_detection):
+def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(
+    case, n_flags, after_detection
+):
     records = recorded(case, EPISODES, PERSISTENT, CUMULATIVE)
     env = ready_env(usecase(case), len(records))
     set_state(env, records, [transition.after["positions"] for transition in records])
@@ -100,11 +102,15 @@ def test_the_recorded_geometry_and_action_table_are_reproduced(case):
     table = action_table(usecase(case).actions)
     for ours, row in zip(table.tolist(), GOLDEN[case]["action_table"], strict=True):
         assert ours[0] == row["distance_m"]
-        assert math.remainder(ours[1] - row["heading_rad"], 2 * math.pi) == pytest.approx(0, abs=1e-6)
+        assert math.remainder(ours[1] - row["heading_rad"], 2 * math.pi) == pytest.approx(
+            0, abs=1e-6
+        )
 
 
 def test_recorded_flights_have_the_same_ends_and_durations():
-    run = json.loads((DATA / "motion_energy_coverage.json").read_text())["action_delay_env_run_usecase1_FL2"]
+    run = json.loads((DATA / "motion_energy_coverage.json").read_text())[
+        "action_delay_env_run_usecase1_FL2"
+    ]
     flights = [row for row in run if row["counters"] == [1.0, 0.0, 0.0]]
     assert len(flights) == 4
     motion = MotionConfig("polynomial", max_speed=5.0, max_acceleration=2.0, min_level=2.0)

@@ -1,4 +1,5 @@
-"""Actions against plain loops: booking in index order, nearest points, inside tests, the action table."""
+"""Actions against plain loops: booking in index order, nearest points, inside tests, the action
+table."""
 
 import math
 from fractions import Fraction
@@ -25,7 +26,8 @@ from damian.world.simulation import Simulation
 
 
 def random_bookings(seed, n_worlds, n_agents, n_points, together):
-    """Random preferences, standing points (at most 3 if ``together``), and reach, below 0 for some UAVs."""
+    """Random preferences, standing points (at most 3 if ``together``), and reach, below 0 for some
+    UAVs."""
     rng = np.random.default_rng(seed)
     n_candidates = min(2 * n_agents - 1, n_points)
     ranked = np.stack([rng.permutation(n_points)[:n_candidates] for _ in range(40)])
@@ -36,7 +38,9 @@ def random_bookings(seed, n_worlds, n_agents, n_points, together):
     else:
         standing = np.stack([rng.permutation(n_points)[:n_agents] for _ in range(n_worlds)])
     # Rounded, so that some distances are just in reach.
-    ranking = Ranking(torch.as_tensor(ranked).int(), torch.as_tensor(rng.random(ranked.shape).round(1)))
+    ranking = Ranking(
+        torch.as_tensor(ranked).int(), torch.as_tensor(rng.random(ranked.shape).round(1))
+    )
     reach = torch.as_tensor(rng.uniform(-0.3, 1.2, row.shape).round(1))
     return ranking, torch.as_tensor(row), torch.as_tensor(standing), reach
 
@@ -46,7 +50,10 @@ def booked_by_twin(ranking, row, standing, reach):
     reached = ranking.distance[row] <= reach.unsqueeze(-1)
     wishes = torch.where(reached, ranking.point[row].long(), standing.unsqueeze(-1)).tolist()
     ready = [True] * row.shape[1]
-    return [twin.assign_landing_points(*each, ready) for each in zip(wishes, standing.tolist(), strict=True)]
+    return [
+        twin.assign_landing_points(*each, ready)
+        for each in zip(wishes, standing.tolist(), strict=True)
+    ]
 
 
 @pytest.mark.parametrize("few", [0, 25])
@@ -57,7 +64,9 @@ def booked_by_twin(ranking, row, standing, reach):
     spare=st.integers(0, 20),
     together=st.booleans(),
 )
-def test_booking_at_once_and_one_by_one_equals_a_sequential_loop(few, seed, n_agents, spare, together):
+def test_booking_at_once_and_one_by_one_equals_a_sequential_loop(
+    few, seed, n_agents, spare, together
+):
     n_points = n_agents + spare
     case = random_bookings(seed, 6, n_agents, n_points, together)
     with pytest.MonkeyPatch.context() as patch:
@@ -74,7 +83,9 @@ def centimetres(point, target) -> int:
 
     The boundary lies 1e-8 m below the half, so that float error cannot move a true half across it.
     """
-    squared = sum((100 * (Fraction(p) - Fraction(t))) ** 2 for p, t in zip(point, target, strict=True))
+    squared = sum(
+        (100 * (Fraction(p) - Fraction(t))) ** 2 for p, t in zip(point, target, strict=True)
+    )
     up = Fraction(500_001, 1_000_000)
     whole = math.isqrt(squared.numerator // squared.denominator)
     return whole + ((whole + 1 - up) ** 2 <= squared)
@@ -87,7 +98,8 @@ def nearest_by_loop(points, target, n) -> list[int]:
 
 
 def some_points(rng, kind, n) -> np.ndarray:
-    """Scattered points, points in two far clusters, or a lattice whose points are often equally far."""
+    """Scattered points, points in two far clusters, or a lattice whose points are often equally
+    far."""
     if kind == "lattice":
         east, north = np.divmod(np.arange(n), math.ceil(math.sqrt(n)))
         return np.stack([east * 30.0, north * 30 * math.sin(math.pi / 4)], -1)[rng.permutation(n)]
@@ -105,7 +117,9 @@ def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds,
     rng = np.random.default_rng(seed)
     lattices = [some_points(rng, kind, int(rng.integers(1, 40))) for kind in kinds]
     radii = rng.uniform(20, 500, len(kinds))
-    polygons = [shapely.MultiPoint(points).buffer(r) for points, r in zip(lattices, radii, strict=True)]
+    polygons = [
+        shapely.MultiPoint(points).buffer(r) for points, r in zip(lattices, radii, strict=True)
+    ]
     region, target = rng.integers(len(kinds), size=12), np.empty((12, 2))
     for i, (points, radius) in enumerate((lattices[r], radii[r]) for r in region):
         distance, angle = rng.uniform(0, 0.9 * radius), rng.uniform(0, 2 * math.pi)
@@ -115,7 +129,9 @@ def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds,
         move = distance * np.array([math.sin(angle), math.cos(angle)])
         target[i] = points[rng.integers(len(points))] + move
     most = max(map(len, lattices))
-    padded = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), constant_values=np.inf) for p in lattices])
+    padded = np.stack(
+        [np.pad(p, ((0, most - len(p)), (0, 0)), constant_values=np.inf) for p in lattices]
+    )
     n = min(n, most)
     cells = build_cells(lattices, polygons, n)
     with pytest.MonkeyPatch.context() as patch:
@@ -129,7 +145,9 @@ HORSESHOE = Polygon([(0, 0), (10, 0), (10, 8), (7, 8), (7, 3), (3, 3), (3, 8), (
 HOLED = Polygon([(-4, -3), (9, -5), (12, 4), (3, 9), (-6, 5)], [[(0, 0), (4, 0), (4, 4), (0, 4)]])
 
 
-@pytest.mark.parametrize("polygon", [HORSESHOE, HOLED, MultiPolygon([HORSESHOE, translate(HOLED, 20, 3)])])
+@pytest.mark.parametrize(
+    "polygon", [HORSESHOE, HOLED, MultiPolygon([HORSESHOE, translate(HOLED, 20, 3)])]
+)
 def test_inside_equals_shapelys_contains(polygon):
     rng = np.random.default_rng(3)
     airspace = build_airspace([Region(polygon, "test")], RegionConfig(lattice_step=1.0), 1)
@@ -149,9 +167,13 @@ def test_inside_equals_shapelys_contains(polygon):
 @both_kinds
 def test_actions_that_lead_nowhere_are_refused_unless_there_is_one_landing_point(kind):
     def build(distance, kept=None):
-        region = RegionConfig("vertices", vertices=SQUARE, n_landing_points=kept, initial_conditions=1)
+        region = RegionConfig(
+            "vertices", vertices=SQUARE, n_landing_points=kept, initial_conditions=1
+        )
         actions = ActionConfig(kind, distances=[0.0, distance], headings=[90.0])
-        return Simulation(WorldConfig(agents=1, region=region, actions=actions), 1.0, stops=1, seed=0)
+        return Simulation(
+            WorldConfig(agents=1, region=region, actions=actions), 1.0, stops=1, seed=0
+        )
 
     with pytest.raises(InputError, match=r"actions.distances: .* lead from no landing point"):
         build(10.0)

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from damian.common.errors import InputError
 from damian.world.motion import MotionConfig, flight_levels, minimum_time, poses, time_law
 
-GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
+GOLDEN = json.loads(
+    (Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text()
+)
 CASES = GOLDEN["uav_trajectories"]["cases"]
 limits = st.floats(0.1, 50.0)
 
@@ -35,8 +37,12 @@ def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(c
     elapsed = torch.tensor([start[r[0]] + r[1] for r in rows], dtype=torch.float64)
     elapsed.requires_grad_(True)
     names = ("A", "B", "flight_level", "T_takeoff", "T_flight")
-    origin, target, level, *times = (torch.tensor([case[name]] * 15, dtype=torch.float64) for name in names)
-    position, crossed = poses(torch.stack([origin, target], -2), level, elapsed, *times, case["degree"])
+    origin, target, level, *times = (
+        torch.tensor([case[name]] * 15, dtype=torch.float64) for name in names
+    )
+    position, crossed = poses(
+        torch.stack([origin, target], -2), level, elapsed, *times, case["degree"]
+    )
     velocity, acceleration = [], []
     for axis in position.unbind(-1):
         (v,) = torch.autograd.grad(axis.sum(), elapsed, create_graph=True)
@@ -48,8 +54,12 @@ def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(c
     torch.testing.assert_close((crossed * length).detach(), way, atol=1e-4, rtol=0)
     # Derivatives jump where two phases meet, so they are compared only inside the phases.
     inside = [i for i in range(15) if i % 5 in (1, 2, 3)]
-    torch.testing.assert_close(torch.stack(velocity, -1)[inside], expected[inside, 3:6], atol=1e-4, rtol=0)
-    torch.testing.assert_close(torch.stack(acceleration, -1)[inside], expected[inside, 6:], atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        torch.stack(velocity, -1)[inside], expected[inside, 3:6], atol=1e-4, rtol=0
+    )
+    torch.testing.assert_close(
+        torch.stack(acceleration, -1)[inside], expected[inside, 6:], atol=1e-4, rtol=0
+    )
 
 
 @pytest.mark.parametrize("degree", [3, 5, 7])

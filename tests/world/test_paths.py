@@ -21,7 +21,8 @@ WAYS = shapely.Polygon(DENTED) - shapely.union_all([shapely.Polygon(zone) for zo
 
 
 def shortest(polygon, origin, goal):
-    """Length of the shortest way in a polygon by Dijkstra's search over all corners, if there is one."""
+    """Length of the shortest way in a polygon by Dijkstra's search over all corners, if there is
+    one."""
     places = [tuple(origin), tuple(goal), *set(map(tuple, shapely.get_coordinates(polygon)))]
     best, queue = {}, [(0.0, 0)]
     while queue:
@@ -32,7 +33,8 @@ def shortest(polygon, origin, goal):
         for other in set(range(len(places))) - set(best):
             if shapely.covers(polygon, shapely.LineString([places[here], places[other]])):
                 heapq.heappush(
-                    queue, (length + float(np.hypot(*np.subtract(places[here], places[other]))), other)
+                    queue,
+                    (length + float(np.hypot(*np.subtract(places[here], places[other]))), other),
                 )
     return best.get(1)
 
@@ -56,7 +58,9 @@ def test_ways_between_all_landing_points_are_the_shortest_ones(apart):
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 def test_no_uav_leaves_the_region_or_enters_a_zone(kind):
-    region = RegionConfig(kind="vertices", vertices=DENTED, zones=ZONES, zone_margin=5.0, lattice_step=25.0)
+    region = RegionConfig(
+        kind="vertices", vertices=DENTED, zones=ZONES, zone_margin=5.0, lattice_step=25.0
+    )
     motion = MotionConfig(kind="polynomial", max_speed=30.0, max_acceleration=10.0)
     actions = ActionConfig(kind=kind, distances=[0.0, 80.0, 160.0])
     settings = {"region": region, "motion": motion, "actions": actions, "clock": clock("0.5s")}
@@ -76,7 +80,9 @@ def test_no_uav_leaves_the_region_or_enters_a_zone(kind):
 
 def test_a_flight_around_a_zone_takes_the_time_of_its_way():
     region = RegionConfig(kind="vertices", vertices=DENTED, zones=ZONES, lattice_step=45.0)
-    env = UavEnv(ScenarioConfig(agents=1, region=region, motion=MotionConfig(kind="polynomial")), 1, 0)
+    env = UavEnv(
+        ScenarioConfig(agents=1, region=region, motion=MotionConfig(kind="polynomial")), 1, 0
+    )
     airspace, vehicles = env.simulation.airspace, env.simulation.vehicles
     first = divmod(int(airspace.detours.pair[0]), airspace.max_points)
     origin, goal = (torch.tensor([[each]]) for each in first)
@@ -93,9 +99,14 @@ def test_a_flight_around_a_zone_takes_the_time_of_its_way():
         (-1, "region.zones: -1 is not a list"),
         ([[[0, 0], [1, 1]]], "region.zones: .* three or more corners"),
         ([[[-10, -10], [500, -10], [500, 500], [-10, 500]]], "region.zones: .* leave nothing"),
-        ("zones.geojson", "region.zones: zones.geojson is a map, but vertices region 0 has no position"),
+        (
+            "zones.geojson",
+            "region.zones: zones.geojson is a map, but vertices region 0 has no position",
+        ),
     ],
 )
 def test_zones_that_cannot_be_are_refused(zones, message):
     with pytest.raises(ValueError, match=message):
-        UavEnv(ScenarioConfig(region=RegionConfig(kind="vertices", vertices=DENTED, zones=zones)), 1, 0)
+        UavEnv(
+            ScenarioConfig(region=RegionConfig(kind="vertices", vertices=DENTED, zones=zones)), 1, 0
+        )

@@ -1,4 +1,5 @@
-"""Places in settings, as metres or latitude and longitude, and the one-line errors of wrong ones."""
+"""Places in settings, as metres or latitude and longitude, and the one-line errors of wrong
+ones."""
 
 import json
 import math
@@ -15,12 +16,18 @@ from damian.world.regions.sources import RegionConfig, regions_of
 from damian.world.signal_source import SourceConfig
 from damian.world.simulation import Simulation
 
-SQUARE = RegionConfig("vertices", vertices=[[0, 0], [200, 0], [200, 200], [0, 200]], initial_conditions=4)
+SQUARE = RegionConfig(
+    "vertices", vertices=[[0, 0], [200, 0], [200, 200], [0, 200]], initial_conditions=4
+)
 CORNERS = [[8.0, 45.0], [8.003, 45.0], [8.003, 45.002], [8.0, 45.002], [8.0, 45.0]]
 
 
 def build(region, **settings) -> Simulation:
-    places = {name: settings.pop(name) for name in ("start_positions", "start_together") if name in settings}
+    places = {
+        name: settings.pop(name)
+        for name in ("start_positions", "start_together")
+        if name in settings
+    }
     region = RegionConfig(**(vars(region) | places))
     return Simulation(WorldConfig(region=region, **settings), 1.0, 2, 0)
 
@@ -31,7 +38,9 @@ def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(tmp_path):
     park = RegionConfig(kind="geojson", path=str(file), initial_conditions=4)
     origin = regions_of(park, np.random.default_rng(0))[0].origin
     metres = [[-80.0, 0.0], [0.0, 50.0], [60.0, -70.0]]
-    degrees = [dict(zip(("lat", "lon"), map(float, to_latlon(*xy, origin)), strict=True)) for xy in metres]
+    degrees = [
+        dict(zip(("lat", "lon"), map(float, to_latlon(*xy, origin)), strict=True)) for xy in metres
+    ]
     worlds = [
         build(
             park,
@@ -44,7 +53,9 @@ def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(tmp_path):
     for other in worlds[1:]:
         assert other.initial.goal.equal(worlds[0].initial.goal)
         assert other.vehicles.chargers.equal(worlds[0].vehicles.chargers)
-        torch.testing.assert_close(other.initial.source, worlds[0].initial.source, atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            other.initial.source, worlds[0].initial.source, atol=1e-4, rtol=0
+        )
     assert int(worlds[0].vehicles.chargers.sum()) == 2
     places = worlds[0].initial.position[0, :, :2]
     assert (places - torch.tensor(metres)).norm(dim=-1).max() < 20
@@ -53,7 +64,12 @@ def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(tmp_path):
 @pytest.mark.parametrize(
     "place",
     [[math.nan, 1.0], {"lat": 1.0, "lng": 2.0}, [0.0, 100.0], {"lat": 53.1, "lon": -4.5}],
-    ids=["not finite", "a misspelt key", "on the boundary", "of a region without a position on Earth"],
+    ids=[
+        "not finite",
+        "a misspelt key",
+        "on the boundary",
+        "of a region without a position on Earth",
+    ],
 )
 def test_a_wrong_place_is_refused_by_its_key(place):
     with pytest.raises(InputError, match=r"^source.position\b"):
@@ -63,7 +79,9 @@ def test_a_wrong_place_is_refused_by_its_key(place):
 @pytest.mark.parametrize("second", [[10.0, 10.0], [10.5, 10.0]])
 def test_two_start_positions_lead_to_one_landing_point_only_if_uavs_start_together(second):
     places = [[10.0, 10.0], second, [150.0, 150.0]]
-    with pytest.raises(InputError, match=r"^region.start_positions: .* lead to the same landing point"):
+    with pytest.raises(
+        InputError, match=r"^region.start_positions: .* lead to the same landing point"
+    ):
         build(SQUARE, start_positions=places)
     goal = build(SQUARE, start_positions=places, start_together=True).initial.goal
     assert goal[0, 0] == goal[0, 1] != goal[0, 2]

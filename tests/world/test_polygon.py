@@ -21,7 +21,9 @@ from damian.world.regions.polygon import (
     sample_interior,
 )
 
-GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
+GOLDEN = json.loads(
+    (Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text()
+)
 SQUARE = Polygon([(0, 0), (100, 0), (100, 100), (0, 100)])
 L_SHAPE = Polygon([(0, 0), (300, 0), (300, 100), (100, 100), (100, 300), (0, 300)])
 WITH_HOLE = Polygon(SQUARE.buffer(100).exterior, [SQUARE.exterior])
@@ -41,8 +43,18 @@ def test_the_lattice_has_the_landing_points_of_the_original_for_other_polygons(e
     ("step", "degrees", "n", "message"),
     [
         (500, 45, None, r"region\.lattice_step: 500 m lays no landing point inside the polygon"),
-        (30, 45, 50, r"region\.n_landing_points: 50 is more than the 12 inside the polygon: lower it, or"),
-        (0.01, 45, None, r"region\.lattice_step: 0\.01 m is too fine for a polygon of 100 m x 100 m"),
+        (
+            30,
+            45,
+            50,
+            r"region\.n_landing_points: 50 is more than the 12 inside the polygon: lower it, or",
+        ),
+        (
+            0.01,
+            45,
+            None,
+            r"region\.lattice_step: 0\.01 m is too fine for a polygon of 100 m x 100 m",
+        ),
     ],
 )
 def test_an_impossible_lattice_is_refused(step, degrees, n, message):
@@ -103,6 +115,8 @@ def test_sampled_points_are_strictly_inside_and_uniform(shape):
     xs, ys = np.linspace(shape.bounds[:2], shape.bounds[2:], 5).T
     counts = np.histogram2d(*points.T, bins=[xs, ys])[0]
     for i, j in np.ndindex(4, 4):
-        share = shape.intersection(shapely.box(xs[i], ys[j], xs[i + 1], ys[j + 1])).area / shape.area
+        share = (
+            shape.intersection(shapely.box(xs[i], ys[j], xs[i + 1], ys[j + 1])).area / shape.area
+        )
         spread = math.sqrt(4000 * share * (1 - share))
         assert counts[i, j] == pytest.approx(4000 * share, abs=4.5 * spread + 1e-6)

@@ -88,11 +88,18 @@ FOLDED = {"type": "GeometryCollection", "geometries": [POINT["geometry"], _polyg
 
 @pytest.mark.parametrize(
     "geometry",
-    [_polygon(*UNEVEN), PARTLY_EMPTY, FOLDED, {"type": "GeometryCollection", "geometries": [FOLDED]}],
+    [
+        _polygon(*UNEVEN),
+        PARTLY_EMPTY,
+        FOLDED,
+        {"type": "GeometryCollection", "geometries": [FOLDED]},
+    ],
 )
 def test_heights_empty_parts_and_collections_do_not_hide_an_area(tmp_path, geometry):
     empty = _feature(_polygon())
-    file = _written(tmp_path, "square.geojson", _collection(empty, _feature(None), _feature(geometry)))
+    file = _written(
+        tmp_path, "square.geojson", _collection(empty, _feature(None), _feature(geometry))
+    )
     plain = read_area(_written(tmp_path, "plain.json", _polygon(RING)))
     assert read_area(file).polygon.equals(plain.polygon)
 
@@ -103,7 +110,9 @@ def _crs(name):
 
 @pytest.mark.parametrize("holder", ["collection", "feature", "geometry"])
 def test_the_coordinate_reference_system_of_geojson_is_obeyed(tmp_path, holder):
-    grid = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:3035", always_xy=True)  # its axes: north, east
+    grid = pyproj.Transformer.from_crs(
+        "EPSG:4326", "EPSG:3035", always_xy=True
+    )  # its axes: north, east
     geometry = _polygon([list(grid.transform(*corner)) for corner in RING])
     feature = _feature(geometry)
     document = _collection(feature) | {"crs": _crs("EPSG:3857")}  # the innermost counts
@@ -137,7 +146,9 @@ def _map(file: Path, crs: str = "EPSG:4326", ring: list = RING) -> Path:
         "yard": [[x + 0.01, y, 0.0] for x, y in ring],
     }
     if file.suffix == ".kml":
-        rings = {n: " ".join(",".join(map(str, corner)) for corner in area) for n, area in areas.items()}
+        rings = {
+            n: " ".join(",".join(map(str, corner)) for corner in area) for n, area in areas.items()
+        }
         folders = "".join(PLACEMARK.format(name, ring) for name, ring in rings.items())
         kml = f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{folders}</Document></kml>'
         return _written(file.parent, file.name, kml)
@@ -163,7 +174,11 @@ def test_maps_of_other_kinds_are_read_by_their_suffix(tmp_path, suffix):
 
 def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(tmp_path):
     def fence(ring, inclusion):
-        return {"inclusion": inclusion, "polygon": [[lat, lon] for lon, lat in ring[:-1]], "version": 1}
+        return {
+            "inclusion": inclusion,
+            "polygon": [[lat, lon] for lon, lat in ring[:-1]],
+            "version": 1,
+        }
 
     inner = [[8.0, 45.0], [8.005, 45.0], [8.005, 45.01], [8.0, 45.01], [8.0, 45.0]]
     fences = {"circles": [], "polygons": [fence(inner, False), fence(RING, True)]}
@@ -194,7 +209,10 @@ def test_only_areas_of_a_map_count_and_what_else_is_in_it_is_told_once(tmp_path,
     assert not capsys.readouterr().err
     for _ in range(2):
         assert read_area(file, every=True).polygon.equals(drawn)
-    told = "features[0] is a picture (GroundOverlay), features[1] is a Point, features[2] has no geometry"
+    told = (
+        "features[0] is a picture (GroundOverlay), features[1] is a Point, features[2] has no "
+        "geometry"
+    )
     assert capsys.readouterr().err == f"{file}: left out: {told}\n"
     both = read_area(file, where=["name:Łąka: a=b", "NAME=yard"])
     assert both.polygon.equals(drawn)
@@ -210,7 +228,8 @@ def test_layers_without_shapes_are_skipped(tmp_path, capsys):
         tables.execute("CREATE TABLE layer_styles (id INTEGER PRIMARY KEY, styleQML TEXT)")
         tables.execute("INSERT INTO layer_styles VALUES (1, '<qgis/>')")
         tables.execute(
-            "INSERT INTO gpkg_contents (table_name, data_type) VALUES ('layer_styles', 'attributes')"
+            "INSERT INTO gpkg_contents (table_name, data_type) VALUES ('layer_styles', "
+            "'attributes')"
         )
         tables.commit()
     assert read_area(file, index=1).name == "yard"
@@ -218,9 +237,14 @@ def test_layers_without_shapes_are_skipped(tmp_path, capsys):
     assert not capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("key", "sign", "value"), [("name", ":", "12:30"), ("ISO 3166:2", "=", "x=y:z")])
+@pytest.mark.parametrize(
+    ("key", "sign", "value"), [("name", ":", "12:30"), ("ISO 3166:2", "=", "x=y:z")]
+)
 def test_a_property_and_its_value_may_have_any_characters(tmp_path, key, sign, value):
-    features = [_feature(_polygon(RING), **{key: "other"}), _feature(_polygon(RING), **{key: value})]
+    features = [
+        _feature(_polygon(RING), **{key: "other"}),
+        _feature(_polygon(RING), **{key: value}),
+    ]
     file = _written(tmp_path, "two.geojson", _collection(*features))
     assert read_area(file, where=f"{key}{sign}{value}").name in (value, "two features[1]")
 
@@ -228,7 +252,10 @@ def test_a_property_and_its_value_may_have_any_characters(tmp_path, key, sign, v
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ({"where": "park"}, "region.where: park must be PROPERTY:VALUE, for example region.where=name:park"),
+        (
+            {"where": "park"},
+            "region.where: park must be PROPERTY:VALUE, for example region.where=name:park",
+        ),
         ({"where": []}, "region.where: it must be PROPERTY:VALUE"),
         ({"index": [0, -1]}, "region.index: .* is not a feature's number"),
         ({"index": 0, "where": "name:park"}, "region.where: .* both choose"),
@@ -241,7 +268,10 @@ def test_a_wrong_choice_of_features_is_refused_by_its_key(choice, message):
 
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyogrio", None)
-    file, message = tmp_path / "map.gpkg", "needs pyogrio, which is missing: pip install 'damian[gis]'"
+    file, message = (
+        tmp_path / "map.gpkg",
+        "needs pyogrio, which is missing: pip install 'damian[gis]'",
+    )
     _assert_one_line_error(file, message, lambda: read_area(file))
 
 
@@ -262,11 +292,19 @@ HEADER = b"Airspace ID,Min Flight Level,Max Flight Level,Sequence Number,Latitud
     [
         (b"Airspace ID\xff", "byte 11 is not UTF-8"),
         (HEADER + b"A,0,60,0,95,-4.13", "line 2: Latitude 95 deg is not between -90"),
-        (HEADER + b"A,0,60,0,52,-4.13\nA,0,60,2,52,-4.12", "Sequence Number [0.0, 2.0] do not count from 0"),
-        (HEADER + b"A,0,60,0,52,-4.13\nA,0,70,1,52,-4.12", "its rows differ in their flight levels [FL]"),
+        (
+            HEADER + b"A,0,60,0,52,-4.13\nA,0,60,2,52,-4.12",
+            "Sequence Number [0.0, 2.0] do not count from 0",
+        ),
+        (
+            HEADER + b"A,0,60,0,52,-4.13\nA,0,70,1,52,-4.12",
+            "its rows differ in their flight levels [FL]",
+        ),
     ],
 )
-def test_an_invalid_table_raises_one_line_that_names_the_file_and_the_fault(tmp_path, text, message):
+def test_an_invalid_table_raises_one_line_that_names_the_file_and_the_fault(
+    tmp_path, text, message
+):
     file = tmp_path / "bad.csv"
     file.write_bytes(text)
     _assert_one_line_error(file, message, lambda: read_fir(file, "A"))
@@ -285,18 +323,32 @@ METRES = _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]])
     ("content", "choice", "message"),
     [
         ('{"type":\n oops}', {}, "is not GeoJSON: JSONDecodeError"),
-        (TWO_FEATURES, {}, "2 features are areas: choose by region.index=NUMBER or region.where=PROPERTY"),
+        (
+            TWO_FEATURES,
+            {},
+            "2 features are areas: choose by region.index=NUMBER or region.where=PROPERTY",
+        ),
         (TWO_FEATURES, {"where": "zone=c"}, "fits 0 features, not one; the file has 'a', 'b'"),
         (TWO_FEATURES, {"index": [0, 2]}, "region.index: 2 is not between 0 and 1"),
         (LINE, {}, "feature is a LineString; a region is an area: draw a closed outline (Polygon)"),
         (METRES, {}, "[500000.0, 4000000.0] is not a longitude"),
         (_polygon(RING) | {"crs": _crs("EPSG:999999")}, {}, "reference system is not understood: "),
-        (_polygon(RING[:-1]), {}, "geometry: its outline is open: repeat the first corner at the end"),
-        (_polygon(*RING), {}, "geometry: its outline is not a list of corners [longitude, latitude]"),
+        (
+            _polygon(RING[:-1]),
+            {},
+            "geometry: its outline is open: repeat the first corner at the end",
+        ),
+        (
+            _polygon(*RING),
+            {},
+            "geometry: its outline is not a list of corners [longitude, latitude]",
+        ),
         (_polygon(RING, FAR_HOLE), {}, "hole lies outside shell at [18, 45] deg"),
     ],
 )
-def test_an_invalid_map_raises_one_line_that_names_the_file_and_the_fault(tmp_path, content, choice, message):
+def test_an_invalid_map_raises_one_line_that_names_the_file_and_the_fault(
+    tmp_path, content, choice, message
+):
     file = _written(tmp_path, "bad.geojson", content)
     _assert_one_line_error(file, message, lambda: read_area(file, **choice))
 
@@ -306,8 +358,14 @@ def test_an_invalid_map_raises_one_line_that_names_the_file_and_the_fault(tmp_pa
     [
         ({}, "geoFence: the plan has none, and a survey is no area: draw a polygon as its fence"),
         ({"geoFence": {"polygons": [], "version": 2}}, "geoFence: the plan has none"),
-        ({"geoFence": {"polygon": CORNERS}}, "geoFence: its version, before 2, is not read: draw a polygon"),
-        ({"geoFence": {"polygons": [{"inclusion": True, "polygon": CORNERS[:2]}]}}, "2 distinct points"),
+        (
+            {"geoFence": {"polygon": CORNERS}},
+            "geoFence: its version, before 2, is not read: draw a polygon",
+        ),
+        (
+            {"geoFence": {"polygons": [{"inclusion": True, "polygon": CORNERS[:2]}]}},
+            "2 distinct points",
+        ),
     ],
 )
 def test_a_plan_without_the_outline_of_a_fence_is_refused_with_the_remedy(tmp_path, fence, message):

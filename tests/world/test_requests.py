@@ -24,7 +24,9 @@ def scenario(**changed) -> ScenarioConfig:
         "region": RegionConfig(kind="vertices", vertices=[[0, 0], [400, 0], [400, 300], [0, 300]]),
         "source": SourceConfig(level_db=138.0),
         "requests": RequestConfig(rate=RATE, most=MOST),
-        "observation": ObservationConfig(local_features=["served"], global_features=["others", "requests"]),
+        "observation": ObservationConfig(
+            local_features=["served"], global_features=["others", "requests"]
+        ),
         "reward": RewardConfig(spotted=0.0, served=1.0),
         "episode": EpisodeConfig(40),
     }
@@ -47,7 +49,9 @@ def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
         after, td = env.step_and_maybe_reset(env.rand_action(td))
         state, rewards = env.state, after["next", "agents", "reward"]
         shares = counter_rng.uniform(state.seed, tag.expand(6), state.episode, state.steps).tolist()
-        lands = env.simulation.vehicles.new_stop(state, env.simulation.vehicles.on_ground(state), None)
+        lands = env.simulation.vehicles.new_stop(
+            state, env.simulation.vehicles.on_ground(state), None
+        )
         for b in range(6):
             if state.steps[b] == 0:
                 slots[b] = [(*row,) for row in state.requests[b].tolist()]
@@ -71,7 +75,9 @@ def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
                     and math.dist(slots[b][m][:2], at) <= radius
                 ]
                 best = min(near, key=lambda m: slots[b][m][2], default=None)
-                serves = (lands is None or bool(lands[b, n])) and best is not None and best not in taken
+                serves = (
+                    (lands is None or bool(lands[b, n])) and best is not None and best not in taken
+                )
                 if serves:
                     taken.add(best)
                     memory[b][n][best] = slots[b][best][2]
@@ -91,7 +97,9 @@ def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
 
 def test_with_a_range_uavs_know_what_they_have_heard_on_the_ground():
     flying, reach = MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0), 120.0
-    env = UavEnv(scenario(motion=flying, requests=RequestConfig(RATE, MOST, range=reach)), 6, seed=2)
+    env = UavEnv(
+        scenario(motion=flying, requests=RequestConfig(RATE, MOST, range=reach)), 6, seed=2
+    )
     td, heard = env.reset(), 0
     known = torch.full((6, 3, MOST, 3), -1.0).tolist()
     for _ in range(40):
@@ -139,7 +147,9 @@ def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
         for t in range(39):
             now = [field[b, t].tolist() for field in (held.time, held.serves, held.target)]
             known, done = held.requests[b, t].tolist(), held.served[b, t].tolist()
-            newest = [max((row[m] for row in known), key=lambda request: request[2]) for m in range(6)]
+            newest = [
+                max((row[m] for row in known), key=lambda request: request[2]) for m in range(6)
+            ]
             last = [max(row[m] for row in done) for m in range(6)]
             overtaken += any(row[m] != newest[m] for row in known for m in range(6))
             opened = [x for x, when in zip(newest, last, strict=True) if x[2] > max(when, -0.5)]
@@ -168,13 +178,17 @@ def test_the_dispatcher_serves_more_than_chance(reach):
     for policy in (script_policy(env), None):
         env.set_seed(0)
         returns.append(
-            env.rollout(40, policy, break_when_any_done=False)["next", "agents", "reward"].sum(1).mean()
+            env.rollout(40, policy, break_when_any_done=False)["next", "agents", "reward"]
+            .sum(1)
+            .mean()
         )
     assert returns[0] > 1.5 * returns[1]
 
 
 def test_what_needs_requests_is_refused_without_them():
-    with pytest.raises(InputError, match=r"requests.rate: 0 is 0, so that no request appears|requests.rate"):
+    with pytest.raises(
+        InputError, match=r"requests.rate: 0 is 0, so that no request appears|requests.rate"
+    ):
         scenario(requests=RequestConfig())
 
 
@@ -183,8 +197,12 @@ def test_a_uav_observes_the_nearest_open_requests_by_the_newest_that_anybody_kno
     sent, half = env.state.sent, env.simulation.airspace.scale.item() / 2
     at = torch.tensor([[0.0, 0.0], [10.0, 0.0], [-60.0, 0.0]])
     old, near, far, done = [50.0, 0, 1], [20.0, 0, 4], [-90.0, 0, 8], [5.0, 0, 6]
-    requests = torch.tensor([[old, far, [0, 0, -1.0]], [near, [0, 0, -1.0], done], [near, far, done]])
-    served = torch.tensor([[1.0, -1, -1], [-1, -1, 6], [-1, -1, -1]])  # the one before `near`, and `done`
+    requests = torch.tensor(
+        [[old, far, [0, 0, -1.0]], [near, [0, 0, -1.0], done], [near, far, done]]
+    )
+    served = torch.tensor(
+        [[1.0, -1, -1], [-1, -1, 6], [-1, -1, -1]]
+    )  # the one before `near`, and `done`
     messages = sent._replace(target=at[None], requests=requests[None], served=served[None])
     seen = env.server.features(messages, torch.tensor([12]), ["requests"])["requests"][0].unflatten(
         -1, (4, 4)

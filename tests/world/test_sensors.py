@@ -1,4 +1,5 @@
-"""Readings of your own sensors equal those of a plain loop, and change nothing else in a message."""
+"""Readings of your own sensors equal those of a plain loop, and change nothing else in a
+message."""
 
 import torch
 from helpers import both_motions, everything, random_actions
@@ -19,7 +20,9 @@ def sensing(motion: str = "instant", **changed) -> ScenarioConfig:
 
 
 @both_motions
-def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_last_messages(motion):
+def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_last_messages(
+    motion,
+):
     env, generator = UavEnv(sensing(motion), num_worlds=4, seed=2), torch.Generator().manual_seed(0)
     td, expected, kept, resets = env.reset(), readings_of(env), 0, 0
     for _ in range(30):
@@ -28,7 +31,9 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
         observation = td["agents", "observation"]
         assert observation[..., -2:].equal(read[..., :2].sin())
         assert observation[..., 1].equal(read[..., 2].amax(-1, keepdim=True).expand(4, 3))
-        after, td = env.step_and_maybe_reset(td.set(("agents", "action"), random_actions(env, generator)))
+        after, td = env.step_and_maybe_reset(
+            td.set(("agents", "action"), random_actions(env, generator))
+        )
         sends = td["agents", "message_sent"]
         expected = torch.where(sends.unsqueeze(-1), readings_of(env), expected)
         kept, resets = kept + int((~sends).sum()), resets + int(after["next", "done"].sum())

@@ -1,4 +1,5 @@
-"""Several sources, against one source at a time and plain loops; and the script that shares them out."""
+"""Several sources, against one source at a time and plain loops; and the script that shares them
+out."""
 
 import pytest
 import torch
@@ -68,7 +69,9 @@ def test_each_source_is_detected_as_if_it_were_the_only_one():
 
 def test_success_needs_somebody_at_each_source_at_the_same_time():
     env = UavEnv(
-        scenario(SourceConfig(count=3, each=EACH), episode=EpisodeConfig(60, all_sources=True)), 8, 1
+        scenario(SourceConfig(count=3, each=EACH), episode=EpisodeConfig(60, all_sources=True)),
+        8,
+        1,
     )
     env.reset()
     airspace, state = env.simulation.airspace, env.state
@@ -83,7 +86,9 @@ def test_success_needs_somebody_at_each_source_at_the_same_time():
 
 
 def test_alike_sources_walk_and_fall_silent_independently():
-    source = SourceConfig(count=4, motion="dynamic", emission="per_step", min_wait=1.0, max_wait=2.0)
+    source = SourceConfig(
+        count=4, motion="dynamic", emission="per_step", min_wait=1.0, max_wait=2.0
+    )
     env = UavEnv(scenario(source), 16, seed=0)
     states = env.rollout(40, break_when_any_done=False)["state"]
     truth = Truth.unpack(states, env.simulation.widths)
@@ -98,7 +103,9 @@ def test_alike_sources_walk_and_fall_silent_independently():
 
 def test_the_script_finds_more_than_chance():
     source = SourceConfig(count=3, level_db=140.0)
-    told = scenario(source, episode=EpisodeConfig(60, all_sources=True), reward=RewardConfig(bonus=1.0))
+    told = scenario(
+        source, episode=EpisodeConfig(60, all_sources=True), reward=RewardConfig(bonus=1.0)
+    )
     env, found = make_env(told, 64, 0, "cpu", ["message", "state"]), []
     for policy in (script_policy(env), None):
         env.set_seed(0)

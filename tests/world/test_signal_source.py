@@ -65,7 +65,8 @@ POLYGONS = {
 
 
 def recorded_legs():
-    """Whether a leg of the original is the first of its run, its length [m] and its duration [s]."""
+    """Whether a leg of the original is the first of its run, its length [m] and its duration
+    [s]."""
     for run in GOLDEN["source_motion_action_delay"]:
         places = [place[:2] for place in run["hotspot_walk"]]
         moving = [dict(zip(run["columns"], row, strict=True)) for row in run["rows"]]
@@ -141,8 +142,16 @@ def test_a_position_equals_the_integrated_speed_profile(seed, share, changed):
     dt=st.sampled_from([0.1, 1.0, 3.0, 60.0, 1 / 3]),
     n_hotspots=st.integers(1, 3),
 )
-def test_after_any_number_of_rounds_the_source_is_where_exact_arithmetic_says(seed, steps, dt, n_hotspots):
-    few = {"n_hotspots": n_hotspots, "min_stops": 1, "max_stops": 2, "min_wait": 0.5, "max_wait": 5.0}
+def test_after_any_number_of_rounds_the_source_is_where_exact_arithmetic_says(
+    seed, steps, dt, n_hotspots
+):
+    few = {
+        "n_hotspots": n_hotspots,
+        "min_stops": 1,
+        "max_stops": 2,
+        "min_wait": 0.5,
+        "max_wait": 5.0,
+    }
     walk = dynamic_walks(n=1, seed=seed, after_walk="loop", **few)
     located = locate(walk, torch.tensor([steps], dtype=torch.float64) * dt, loops=True)
     time = Fraction(steps * dt)  # as a float64 has it

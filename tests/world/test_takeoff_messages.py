@@ -1,4 +1,5 @@
-"""Messages of UAVs that take off, fly and land, against a slow reference (twin), and what flights earn."""
+"""Messages of UAVs that take off, fly and land, against a slow reference (twin), and what flights
+earn."""
 
 import math
 from dataclasses import dataclass, field
@@ -46,7 +47,8 @@ class FlyingUav:
             self.duration = sum(max(fast * length, math.sqrt(hard * length)) for length in phases)
 
     def listen(self, now: float, dt: float, source: tuple, radius: float) -> bool:
-        """Pass a step, and send a message on the ground or as the flight begins; returns if one is sent."""
+        """Pass a step, and send a message on the ground or as the flight begins; returns if one is
+        sent."""
         self.elapsed += 1
         landed = self.elapsed * dt >= self.duration
         if not landed and self.elapsed > 1:
@@ -73,7 +75,9 @@ class FlyingUav:
 def twins(env: UavEnv) -> list[list[FlyingUav]]:
     """The UAVs of all worlds as they begin an episode."""
     levels, places = env.simulation.vehicles.levels.tolist(), env.state.position[..., :2].tolist()
-    worlds = [[FlyingUav(*uav) for uav in zip(levels, map(tuple, row), strict=True)] for row in places]
+    worlds = [
+        [FlyingUav(*uav) for uav in zip(levels, map(tuple, row), strict=True)] for row in places
+    ]
     for world, source in zip(worlds, env.state.source[:, 0].tolist(), strict=True):
         for uav in world:
             uav.listen(0.0, env.simulation.dt, source, env.simulation.radius)
@@ -82,7 +86,9 @@ def twins(env: UavEnv) -> list[list[FlyingUav]]:
 
 @pytest.mark.parametrize("sensing_time", [0.0, 2.5])
 def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
-    motion = MotionConfig("polynomial", max_speed=20.0, max_acceleration=10.0, sensing_time=sensing_time)
+    motion = MotionConfig(
+        "polynomial", max_speed=20.0, max_acceleration=10.0, sensing_time=sensing_time
+    )
     scenario = ScenarioConfig(
         region=REGIONS["fixed"],
         motion=motion,
@@ -111,7 +117,10 @@ def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
                     )
                 told_stops = zip(sent.landed[b, n].tolist(), sent.trail[b, n].tolist(), strict=True)
                 for (time, point), stop in zip(told_stops, uav.told, strict=False):
-                    assert (time, env.simulation.points[point].tolist()) == (stop[0], pytest.approx(stop[1]))
+                    assert (time, env.simulation.points[point].tolist()) == (
+                        stop[0],
+                        pytest.approx(stop[1]),
+                    )
                 begun += uav.message["position"] != uav.message["target"]
             spots = [uav.message["spotted"] for uav in world]
             shared = 0.5 * sum(spots) / len(world)

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import torch
 import twin
-from helpers import KEEPS_GOING, act, both_kinds, clock, everything, fresh, random_actions, sent_messages
+from helpers import (
+    KEEPS_GOING,
+    act,
+    both_kinds,
+    clock,
+    everything,
+    fresh,
+    random_actions,
+    sent_messages,
+)
 from twin import GLOBAL, LOCAL
 
 from damian.envs.config import ScenarioConfig
@@ -24,18 +33,32 @@ OBSERVED = [*TWIN_FEATURES, *LOCAL]
 
 
 def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
-    """Every reward term and feature except the coverage; uneven distances, so that no two points tie."""
-    task = dict.fromkeys(BUILT_IN, 0.5) | {"coverage": 0.0, "served": 0.0, "individual": 0.8, "system": 1.5}
-    task |= {"drift": "printed" if since else "smooth", "desired_spotting": 0.7, "desired_distance": 0.4}
+    """Every reward term and feature except the coverage; uneven distances, so that no two points
+    tie."""
+    task = dict.fromkeys(BUILT_IN, 0.5) | {
+        "coverage": 0.0,
+        "served": 0.0,
+        "individual": 0.8,
+        "system": 1.5,
+    }
+    task |= {
+        "drift": "printed" if since else "smooth",
+        "desired_spotting": 0.7,
+        "desired_distance": 0.4,
+    }
     task |= {"desired_distance_not_spotting": 0.6, "desired_distance_spotting": 0.2}
     return ScenarioConfig(
         agents=n_agents,
         region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, initial_conditions=24),
         source=SourceConfig(level_db=138.0),
         actions=ActionConfig(
-            kind=kind, distances=[0.0, 33.3, 71.9, 118.4], headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4]
+            kind=kind,
+            distances=[0.0, 33.3, 71.9, 118.4],
+            headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4],
         ),
-        observation=ObservationConfig(local_features=LOCAL, global_features=TWIN_FEATURES, time_scale=9.0),
+        observation=ObservationConfig(
+            local_features=LOCAL, global_features=TWIN_FEATURES, time_scale=9.0
+        ),
         reward=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
         episode=EpisodeConfig(5, since_detection=since, success_share=None if since else 0.5),
         clock=clock("2s"),
@@ -94,7 +117,9 @@ def test_rollouts_equal_those_of_the_twin(n_agents, kind, since):
             check_observation(world, output["agents", "global_observation"][b])
         for _ in range(8):
             action = random_actions(env, generator)
-            moves = table[action] if kind == "discrete" else action * torch.tensor([118.4, math.tau])
+            moves = (
+                table[action] if kind == "discrete" else action * torch.tensor([118.4, math.tau])
+            )
             output = act(env, action)
             for b, world in enumerate(worlds):
                 if any(world.ended):

@@ -1,4 +1,5 @@
-"""What a feature is: computed from messages, in a shape and range that it declares, under a name."""
+"""What a feature is: computed from messages, in a shape and range that it declares, under a
+name."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +22,8 @@ from damian.world.signal_source import footprint_radius
 from damian.world.simulation import Simulation
 
 MakeTable = Callable[[Simulation, ObservationConfig], Any]
-"""Makes what a feature looks up: tensors, or (nested) tuples and mappings of tensors, moved with the device."""
+"""Makes what a feature looks up: tensors, or (nested) tuples and mappings of tensors, moved with
+the device."""
 
 
 class ServerContext(NamedTuple):
@@ -44,18 +46,21 @@ class ServerContext(NamedTuple):
     radius: float | Tensor = 0.0
     """Radius of a UAV's footprint [m]; [*] if it is drawn."""
     level: Tensor | None = None
-    """Number of the drawn level of the source, and so of the radius, in tables, [*]; None if none is drawn."""
+    """Number of the drawn level of the source, and so of the radius, in tables, [*]; None if none
+    is drawn."""
     readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
     """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
     tables: Mapping[MakeTable, Any] = MappingProxyType({})
     """The tables that features declare, by the function that has made each."""
     belief: Tensor | None = None
-    """Probability that each source is in each cell, [*, K, C]; None: as after these first messages."""
+    """Probability that each source is in each cell, [*, K, C]; None: as after these first
+    messages."""
     timeline: Tensor | None = None
-    """By sender and age in steps, where it is known to have stopped, east and north [m], and 1, else zeros,
-    [*, N, slots, 3]; None: as after these first messages."""
+    """By sender and age in steps, where it is known to have stopped, east and north [m], and 1,
+    else zeros, [*, N, slots, 3]; None: as after these first messages."""
     coverage: KnownCoverage | None = None
-    """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be computed."""
+    """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be
+    computed."""
 
 
 def drawn_levels(simulation: Simulation) -> list[dict[str, float]]:
@@ -78,7 +83,8 @@ def footprint_radii(simulation: Simulation) -> list[float]:
 
 
 def source_grid(simulation: Simulation, observation: ObservationConfig) -> SourceGrid:
-    """The cells in which the sources may be, with the tables of the belief for each level of the source."""
+    """The cells in which the sources may be, with the tables of the belief for each level of the
+    source."""
     levels = drawn_levels(simulation)
     kinds = [replace(each, **level) for level in levels for each in simulation.sources]
     grid = build_source_grids(simulation.airspace, kinds, simulation.dt, observation.belief_cell)
@@ -86,10 +92,11 @@ def source_grid(simulation: Simulation, observation: ObservationConfig) -> Sourc
 
 
 class FeatureCache:
-    """Messages, and intermediate results that several features share, each computed once and on demand.
+    """Messages, and intermediate results that several features share, each computed once and on
+    demand.
 
-    With ``own_only``, messages are [*, N, N] (receiver, sender), and of the values of UAV j that follow from
-    what receiver i knows, only those with i = j are wanted.
+    With ``own_only``, messages are [*, N, N] (receiver, sender), and of the values of UAV j that
+    follow from what receiver i knows, only those with i = j are wanted.
     """
 
     def __init__(self, messages: Messages, context: ServerContext, own_only: bool = False) -> None:
@@ -110,10 +117,13 @@ class FeatureCache:
         return field.diagonal(0, sender - 1, sender).movedim(-1, sender - 1).unsqueeze(sender)
 
     def reading(self, name: str) -> Tensor:
-        """Values of a sensor of the settings (``damian.sensor``), [*, N] or, if several, [*, N, width]."""
+        """Values of a sensor of the settings (``damian.sensor``), [*, N] or, if several,
+        [*, N, width]."""
         known = self.context.readings
         if name not in known:
-            problem = f"is not one of {', '.join(known)}" if known else "is missing: no sensor is given"
+            problem = (
+                f"is not one of {', '.join(known)}" if known else "is missing: no sensor is given"
+            )
             raise InputError(f"sensors: {name}, which a feature reads, {problem}")
         first, width = known[name]
         values = self.messages.readings.narrow(-1, first, width)
@@ -129,13 +139,19 @@ class FeatureCache:
 
     @property
     def trail(self) -> Tensor:
-        """Flat ids of the latest landing points that coverage counts, newest first, [*, N, window]."""
+        """Flat ids of the latest landing points that coverage counts, newest first,
+        [*, N, window]."""
         return self.messages.trail[..., : self.context.observation.window]
 
     def tabled(self, point: Tensor) -> Tensor:
-        """Ids in tables for each radius of footprints, from the flat ids of landing points [*, ...]."""
+        """Ids in tables for each radius of footprints, from the flat ids of landing points
+        [*, ...]."""
         number = self.context.level
-        return point if number is None else point + expand_mask(number, point) * len(self.context.points)
+        return (
+            point
+            if number is None
+            else point + expand_mask(number, point) * len(self.context.points)
+        )
 
     @property
     def region(self) -> Tensor:
@@ -165,7 +181,9 @@ def _belief(v: FeatureCache) -> Tensor:
     if v.context.belief is not None:
         return v.context.belief
     level = v.context.level
-    return first_belief(v.grid, report_rows(v.grid, v.messages, level), places(v.grid, v.region, level))
+    return first_belief(
+        v.grid, report_rows(v.grid, v.messages, level), places(v.grid, v.region, level)
+    )
 
 
 class Feature(NamedTuple):
@@ -209,22 +227,23 @@ def feature(
 
     The function reads ``cache.messages`` (fields [*, N]), ``cache.reading`` (your own sensors) and
     ``cache.context`` (time, scales, landing points), and must be pure, batched over * and, for
-    ``env.compile()``, free of branches on data. ``cache(other)`` shares an intermediate result between
-    features.
+    ``env.compile()``, free of branches on data. ``cache(other)`` shares an intermediate result
+    between features.
 
     Args:
-        scope: ``local`` (follows from the UAV's own message alone: its actor sees that without delay where it
-            knows its own messages), ``global`` (from the messages of all UAVs) or ``belief`` (from all
-            messages so far, by ``cache.belief`` and ``cache.grid``).
-        shape: shape of the values of one UAV: the function returns [*, N, *shape], for a single value
-            [*, N]. A size that depends on the settings, such as the number of UAVs, is None.
-        low, high: lowest and highest possible value; networks learn best from values about 1 in size.
+        scope: ``local`` (follows from the UAV's own message alone: its actor sees that without
+            delay where it knows its own messages), ``global`` (from the messages of all UAVs) or
+            ``belief`` (from all messages so far, by ``cache.belief`` and ``cache.grid``).
+        shape: shape of the values of one UAV: the function returns [*, N, *shape], for a single
+            value [*, N]. A size that depends on the settings, such as the number of UAVs, is None.
+        low, high: lowest and highest possible value; networks learn best from values about 1 in
+            size.
         name: a short name under which settings know it, too.
         entries: what each value of the last dimension is.
-        rows: whether the first dimension lists things whose order does not matter, those that do not exist as
-            zeros; the last value of a row is 1 if it is known.
-        tables: functions of the simulation and the settings of the observation, each of which makes, once,
-            something that the feature looks up by ``cache.table(function)``.
+        rows: whether the first dimension lists things whose order does not matter, those that do
+            not exist as zeros; the last value of a row is 1 if it is known.
+        tables: functions of the simulation and the settings of the observation, each of which
+            makes, once, something that the feature looks up by ``cache.table(function)``.
 
     Examples:
         >>> @feature("local")
@@ -241,7 +260,9 @@ def feature(
     return declare
 
 
-FEATURES = Registry[Feature]("feature", Feature, "is not a feature: decorate a function with damian.feature")
+FEATURES = Registry[Feature](
+    "feature", Feature, "is not a feature: decorate a function with damian.feature"
+)
 """Features by name; those outside the package as ``package.module:name``."""
 
 
@@ -252,7 +273,11 @@ def feature_of(name: str) -> Feature:
 
 def check_features(config: ObservationConfig) -> None:
     """Require that every feature of an observation exists and has the scope in which it is used."""
-    for scope, key in (("local", "local_features"), ("global", "global_features"), ("belief", "belief")):
+    for scope, key in (
+        ("local", "local_features"),
+        ("global", "global_features"),
+        ("belief", "belief"),
+    ):
         for name in getattr(config, key):
             found = FEATURES.get(name, f"observation.{key}")
             problem = f"is a {found.scope} feature, not a {scope} one"
@@ -260,7 +285,8 @@ def check_features(config: ObservationConfig) -> None:
 
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
-    """Features by name of messages [*, N], each [*, N, ...] in the shape and range that it declares."""
+    """Features by name of messages [*, N], each [*, N, ...] in the shape and range that it
+    declares."""
     cache, found = FeatureCache(messages, context), {}
     for name in names:
         found[name] = feature_of(name).compute(cache)
@@ -306,6 +332,9 @@ def layout_of(features: Mapping[str, Tensor], names: Sequence[str]) -> Layout:
 
 
 def stack(features: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
-    """Observation vector in the order of ``names``, [*, N, F] float32, whatever the features' types are."""
+    """Observation vector in the order of ``names``, [*, N, F] float32, whatever the features' types
+    are."""
     values = [(features[name], len(feature_of(name).shape)) for name in names]
-    return torch.cat([each.flatten(-n) if n else each.unsqueeze(-1) for each, n in values], -1).float()
+    return torch.cat(
+        [each.flatten(-n) if n else each.unsqueeze(-1) for each, n in values], -1
+    ).float()

@@ -1,4 +1,5 @@
-"""Features of where the sources are believed to be (``damian.server.belief``), beyond the paper's Table 2."""
+"""Features of where the sources are believed to be (``damian.server.belief``), beyond the paper's
+Table 2."""
 
 import math
 
@@ -19,7 +20,8 @@ from damian.server.features.base import FeatureCache, feature
 from damian.world.simulation import Simulation
 
 BELIEF_RINGS = (1.0, 3.0)
-"""Outer radii of the inner rings of ``belief_map``, in footprint radii; the outermost ring has no end."""
+"""Outer radii of the inner rings of ``belief_map``, in footprint radii; the outermost ring has no
+end."""
 RINGS = len(BELIEF_RINGS) + 1
 """Number of rings of ``belief_map``."""
 BELIEF_SECTORS = 8
@@ -35,25 +37,36 @@ def goals_of_actions(simulation: Simulation, _: ObservationConfig) -> Tensor:
 def _belief_gain(v: FeatureCache) -> Tensor:
     """Probability of detecting any source next from where each discrete action leads, [*, N, A].
 
-    Actions begin at the latest landing point, are taken to be flown at once, and lead to the nearest landing
-    point, or to the second nearest if another UAV is known to stand there.
+    Actions begin at the latest landing point, are taken to be flown at once, and lead to the
+    nearest landing point, or to the second nearest if another UAV is known to stand there.
     """
     everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
     standing, level = v.wanted(v.messages.trail[..., 0]), v.context.level
     rows = v.wanted(report_rows(v.grid, v.messages, level).movedim(-2, -1)).movedim(-1, -2)
     stays = any_of(chance_of_staying(v.grid, v.belief, rows)).unsqueeze(-1)
     chance = any_of(detection_chance(v.grid, v.belief, places(v.grid, v.region, level)))
-    chance = chance.scatter(-1, everyone, -chance.gather(-1, everyone))  # negative where a UAV stands
+    chance = chance.scatter(
+        -1, everyone, -chance.gather(-1, everyone)
+    )  # negative where a UAV stands
     chance = chance.unsqueeze(-2).expand(*standing.shape, -1)
     chance = chance.scatter(-1, (standing % n_points).unsqueeze(-1), stays)
     goals = v.table(goals_of_actions)
-    nearest, second = (chance.gather(-1, gather_rows(each, standing)) for each in (goals[0], goals[-1]))
+    nearest, second = (
+        chance.gather(-1, gather_rows(each, standing)) for each in (goals[0], goals[-1])
+    )
     return torch.where(nearest < 0, second.abs(), nearest).clamp(max=1)
 
 
-@feature("belief", [None, 4], low=-1.0, name="belief_moments", entries=["east", "north", "spread", "unsure"])
+@feature(
+    "belief",
+    [None, 4],
+    low=-1.0,
+    name="belief_moments",
+    entries=["east", "north", "spread", "unsure"],
+)
 def _belief_moments(v: FeatureCache) -> Tensor:
-    """Way to the mean place (east, north), spread (over the region's size), share of the largest entropy.
+    """Way to the mean place (east, north), spread (over the region's size), share of the largest
+    entropy.
 
     These four of each source, [*, N, K, 4].
     """
@@ -70,11 +83,14 @@ def _belief_moments(v: FeatureCache) -> Tensor:
 
 @feature("belief", [None, RINGS, BELIEF_SECTORS], name="belief_map")
 def _belief_map(v: FeatureCache) -> Tensor:
-    """Probability that each source is in each sector of three rings about the UAV, [*, N, K, 3, 8]."""
+    """Probability that each source is in each sector of three rings about the UAV,
+    [*, N, K, 3, 8]."""
     position = v.wanted(v.messages.position)
     east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, C]
     radius = v.context.radius
-    distance = torch.hypot(east, north) / (radius[..., None, None] if isinstance(radius, Tensor) else radius)
+    distance = torch.hypot(east, north) / (
+        radius[..., None, None] if isinstance(radius, Tensor) else radius
+    )
     ring = sum((distance > edge).long() for edge in BELIEF_RINGS)
     turn = torch.atan2(east, north) / (2 * math.pi)
     part = ring * BELIEF_SECTORS + (turn * BELIEF_SECTORS).round().long() % BELIEF_SECTORS

@@ -26,11 +26,15 @@ RINGS = (0.6, 1.25, 2.5)
 SECTORS = 8
 """Number of places on each ring; the first one lies north, the others follow clockwise."""
 _OLDEST = 0.5
-"""How new ground in the oldest footprint of the window nearly is, in [0, 1]; in the newest one it is 0."""
+"""How new ground in the oldest footprint of the window nearly is, in [0, 1]; in the newest one it
+is 0."""
 
 
-def footprint_tables(simulation: Simulation, _: ObservationConfig) -> tuple[FootprintTables, Tensor]:
-    """Masks of all footprints, and the landing points, each for every radius, in the unit of the first one."""
+def footprint_tables(
+    simulation: Simulation, _: ObservationConfig
+) -> tuple[FootprintTables, Tensor]:
+    """Masks of all footprints, and the landing points, each for every radius, in the unit of the
+    first one."""
     airspace, radii = simulation.airspace, footprint_radii(simulation)
     polygons = [region.polygon for region in airspace.regions]
     tables = tables_of_all(polygons, airspace.points.double().cpu().numpy(), radii)
@@ -39,7 +43,8 @@ def footprint_tables(simulation: Simulation, _: ObservationConfig) -> tuple[Foot
 
 
 def map_places_inside(simulation: Simulation, _: ObservationConfig) -> Tensor:
-    """Whether the places of ``coverage_map`` lie in the region, for every radius, [V*R*L, 24] of 0 and 1."""
+    """Whether the places of ``coverage_map`` lie in the region, for every radius, [V*R*L, 24] of 0
+    and 1."""
     radii = footprint_radii(simulation)
     return torch.cat([places_inside(simulation.airspace, radius) for radius in radii])
 
@@ -55,7 +60,8 @@ def ring_places(radius: float | Tensor, device: torch.device | None = None) -> T
 
 
 def places_inside(airspace: Airspace, radius: float) -> Tensor:
-    """Whether the places about each landing point lie in its region, by flat id, [R*L, 24] of 0 and 1."""
+    """Whether the places about each landing point lie in its region, by flat id, [R*L, 24] of 0 and
+    1."""
     points = airspace.points.nan_to_num(posinf=0.0).double().cpu().numpy()
     places = points[:, :, None] + ring_places(radius).double().numpy()
     inside = [
@@ -80,10 +86,11 @@ def _coverage(v: FeatureCache) -> Tensor:
 
 @feature("global", [len(RINGS) * SECTORS], name="coverage_map", tables=[map_places_inside])
 def _coverage_map(v: FeatureCache) -> Tensor:
-    """How new the ground at the places about the UAV is, from 0 (just covered, or outside) to 1, [*, N, 24].
+    """How new the ground at the places about the UAV is, from 0 (just covered, or outside) to 1,
+    [*, N, 24].
 
-    It is the distance of a place from the nearest of all UAVs' latest landing points, over the diameter of a
-    footprint; older landing points of ``observation.window`` count as further away.
+    It is the distance of a place from the nearest of all UAVs' latest landing points, over the
+    diameter of a footprint; older landing points of ``observation.window`` count as further away.
     """
     context, trail = v.context, v.trail
     standing, radius = v.wanted(trail[..., 0]), context.radius

@@ -14,7 +14,8 @@ WAYS = ("east", "north", "target east", "target north", "exists")
 
 
 def pairwise_distances(v: FeatureCache) -> Tensor:
-    """Distances from the wanted UAVs to all, over the largest vertex distance of the region, [*, N, N]."""
+    """Distances from the wanted UAVs to all, over the largest vertex distance of the region,
+    [*, N, N]."""
     position = v.messages.position
     return distances(v.wanted(position), position) / v.scale.unsqueeze(-1)
 
@@ -33,7 +34,8 @@ def of_others(v: FeatureCache, pairs: Tensor) -> Tensor:
 
 @feature("global", [None], name="agent_distances")
 def _agent_distances(v: FeatureCache) -> Tensor:
-    """Distances to the other UAVs in their order, over the largest vertex distance, [*, N, N - 1]."""
+    """Distances to the other UAVs in their order, over the largest vertex distance,
+    [*, N, N - 1]."""
     return of_others(v, v(pairwise_distances).unsqueeze(-1)).squeeze(-1).clamp(max=1)
 
 
@@ -45,7 +47,8 @@ def _mean_distance(v: FeatureCache) -> Tensor:
 
 @feature("global", name="mean_distance_not_spotting")
 def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
-    """Mean distance to the other UAVs that do not spot; 0 for a spotting UAV, or if there are no others."""
+    """Mean distance to the other UAVs that do not spot; 0 for a spotting UAV, or if there are no
+    others."""
     silent = (~v.messages.spotted).to(v.scale.dtype)
     others = silent.sum(-1, keepdim=True) - 1
     total = (v(pairwise_distances) * silent.unsqueeze(-2)).sum(-1) * v.wanted(silent)
@@ -57,8 +60,8 @@ def _others(v: FeatureCache) -> Tensor:
     """The nearest other UAVs, the nearest first, [*, N, 4, 5]; zeros stand for those that do not
     exist.
 
-    Of each: the way to its place and to its target, east and north, over half the largest vertex distance of
-    the region, clamped to [-1, 1], and 1.
+    Of each: the way to its place and to its target, east and north, over half the largest vertex
+    distance of the region, clamped to [-1, 1], and 1.
     """
     messages = v.messages
     places = torch.stack([messages.position, messages.target], -2)
@@ -74,7 +77,8 @@ def _ages(v: FeatureCache) -> Tensor:
 
 
 def _nearest(v: FeatureCache) -> Tensor:
-    """Indices of at most four other UAVs, those with the nearest targets, the nearest first, [*, N, 4]."""
+    """Indices of at most four other UAVs, those with the nearest targets, the nearest first,
+    [*, N, 4]."""
     target, half = v.messages.target, (v.context.scale / 2)[..., None, None, None]
     ways = (target.unsqueeze(-3) - v.wanted(target).unsqueeze(-2)) / half
     distance = of_others(v, ways.square().sum(-1, keepdim=True)).squeeze(-1)
@@ -91,7 +95,8 @@ def _of_nearest(v: FeatureCache, table: Tensor) -> Tensor:
 
 
 def ways_to_nearest(v: FeatureCache, places: Tensor) -> Tensor:
-    """Ways to places of the nearest other UAVs, and 1; zeros where a place is not known, [*, N, 4, P, 3].
+    """Ways to places of the nearest other UAVs, and 1; zeros where a place is not known,
+    [*, N, 4, P, 3].
 
     ``places`` [*, N, P, 3]: east, north, and 1 if it is known, else 0.
     """

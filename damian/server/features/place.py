@@ -23,15 +23,18 @@ def battery_settings(simulation: Simulation, _: ObservationConfig) -> BatteryCon
 
 @feature("local", [2], low=-1.0, name="place", entries=["east", "north"])
 def _place(v: FeatureCache) -> Tensor:
-    """Where the UAV stands or will land, east and north, over half the largest vertex distance, [*, N, 2]."""
+    """Where the UAV stands or will land, east and north, over half the largest vertex distance,
+    [*, N, 2]."""
     return (v.messages.target / (v.scale.unsqueeze(-1) / 2)).clamp(-1, 1)
 
 
 @feature("local", [OTHERS + 1], name="number")
 def _number(v: FeatureCache) -> Tensor:
-    """Which UAV it is: 1 in one of five columns, in the first one for the first and the sixth, [*, N, 5].
+    """Which UAV it is: 1 in one of five columns, in the first one for the first and the sixth,
+    [*, N, 5].
 
-    UAVs that share a network and decide at once share out the ground only if something tells them apart.
+    UAVs that share a network and decide at once share out the ground only if something tells them
+    apart.
     """
     known = v.messages.time
     columns = torch.arange(known.shape[-1], device=known.device) % (OTHERS + 1)
@@ -46,7 +49,8 @@ def _kind(v: FeatureCache) -> Tensor:
 
 @feature("local", name="time_left")
 def _time_left(v: FeatureCache) -> Tensor:
-    """Time left of ``observation.time_scale``, by default that of an episode, as its share, [*, N]."""
+    """Time left of ``observation.time_scale``, by default that of an episode, as its share,
+    [*, N]."""
     left = 1 - v.context.now / v.context.time_scale
     return left.clamp(0, 1).unsqueeze(-1).expand(v.messages.time.shape)
 

@@ -24,7 +24,8 @@ def _to_source(v: FeatureCache) -> Tensor:
 
 
 def nearest_way(ways: Tensor, known: Tensor | None = None) -> Tensor:
-    """The shortest of ways [*, K, 2], of those that are ``known`` [*, K] if there are any, [*, 2]."""
+    """The shortest of ways [*, K, 2], of those that are ``known`` [*, K] if there are any,
+    [*, 2]."""
     if ways.shape[-2] == 1:
         return ways.squeeze(-2)
     length = ways.square().sum(-1)
@@ -40,32 +41,37 @@ def _raw_source_distance(v: FeatureCache) -> Tensor:
 def _bearing(v: FeatureCache) -> Tensor:
     """Bearing of the source, clockwise from north, [*, N] in (-pi, pi]."""
     east, north = v(_to_source).unbind(-1)
-    # Within a millimetre of the source the bearing would be a rounding error: it is set to 0 (north).
+    # Within a millimetre of the source the bearing would be a rounding error: it is set to 0
+    # (north).
     return torch.atan2(east, north) * (east.abs() + north.abs() > 1e-3)
 
 
 @feature("global", name="source_distance")
 def _source_distance(v: FeatureCache) -> Tensor:
-    """Distance to the estimated source, over the largest vertex distance; 1 if it is unknown, [*, N]."""
+    """Distance to the estimated source, over the largest vertex distance; 1 if it is unknown,
+    [*, N]."""
     return torch.where(v(_any_has_detected), v(_raw_source_distance).clamp(max=1), 1.0)
 
 
 @feature("global", name="source_bearing")
 def _source_bearing(v: FeatureCache) -> Tensor:
-    """Bearing of the estimated source, clockwise from north, in turns; 1 if it is unknown, [*, N]."""
+    """Bearing of the estimated source, clockwise from north, in turns; 1 if it is unknown,
+    [*, N]."""
     return torch.where(v(_any_has_detected), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
 
 
 @feature("global", name="source_drift")
 def _source_drift(v: FeatureCache) -> Tensor:
-    """((bearing - track) wrapped to [-pi, pi) + pi) / 2 pi: 0.5 if the UAV flies straight at the source."""
+    """((bearing - track) wrapped to [-pi, pi) + pi) / 2 pi: 0.5 if the UAV flies straight at the
+    source."""
     turn = (v(_bearing) - v.messages.track) / (2 * math.pi)
     return torch.where(v(_any_has_detected), torch.remainder(turn + 0.5, 1.0), 1.0)
 
 
 @feature("global", name="source_time")
 def _source_time(v: FeatureCache) -> Tensor:
-    """Time since any UAV detected the source, over ``observation.time_scale``; 1 if unknown, [*, N]."""
+    """Time since any UAV detected the source, over ``observation.time_scale``; 1 if unknown,
+    [*, N]."""
     latest = v.messages.detected_time.flatten(-2).amax(-1, keepdim=True)
     since = (v.context.now.unsqueeze(-1) - latest) / v.context.time_scale
     return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)

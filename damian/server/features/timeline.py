@@ -16,7 +16,8 @@ def stop_places(messages: Messages, context: ServerContext) -> Tensor:
 
 
 def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
-    """How long ago they were when the message was generated [steps], [*, S]; -1 for those before the reset.
+    """How long ago they were when the message was generated [steps], [*, S]; -1 for those before
+    the reset.
 
     A stop is a landing, or the choice to hold, at its instant.
     """
@@ -32,15 +33,21 @@ def first_timeline(messages: Messages, context: ServerContext) -> Tensor:
 
 
 @feature(
-    "timeline", [OTHERS, None, 3], low=-1.0, name="timeline", entries=["east", "north", "known"], rows=True
+    "timeline",
+    [OTHERS, None, 3],
+    low=-1.0,
+    name="timeline",
+    entries=["east", "north", "known"],
+    rows=True,
 )
 def _timeline(v: FeatureCache) -> Tensor:
-    """What is known of the four nearest other UAVs by when it was true, [*, N, 4, ``slots`` + 1, 3].
+    """What is known of the four nearest other UAVs by when it was true,
+    [*, N, 4, ``slots`` + 1, 3].
 
-    Of each, slot k tells where it landed, or held, k steps ago: the way to that place, east and north, over
-    half the largest vertex distance of the region, and 1. It is zeros if no message that has arrived tells of
-    that step. Behind the slots stands the same of the destination of a UAV in flight. Ways begin where the
-    observer is bound for.
+    Of each, slot k tells where it landed, or held, k steps ago: the way to that place, east and
+    north, over half the largest vertex distance of the region, and 1. It is zeros if no message
+    that has arrived tells of that step. Behind the slots stands the same of the destination of a
+    UAV in flight. Ways begin where the observer is bound for.
     """
     messages, context = v.messages, v.context
     known = first_timeline(messages, context) if context.timeline is None else context.timeline

@@ -1,4 +1,5 @@
-"""Reads areas of maps: GeoJSON (RFC 7946), fences of QGroundControl plans, KML, GeoPackage, shapefiles."""
+"""Reads areas of maps: GeoJSON (RFC 7946), fences of QGroundControl plans, KML, GeoPackage,
+shapefiles."""
 
 import json
 import os
@@ -36,7 +37,8 @@ class _Feature(NamedTuple):
     geometry: dict[str, Any]
     """As in GeoJSON."""
     crs: Any = None
-    """Coordinate reference system: a name, an object of GeoJSON, or None for longitude and latitude."""
+    """Coordinate reference system: a name, an object of GeoJSON, or None for longitude and
+    latitude."""
     is_excluded: bool = False
     """Whether UAVs must keep out of it."""
 
@@ -54,22 +56,22 @@ def read_area(
 ) -> Region:
     """Read one area of a file, or unite several; the suffix of the file says how it is read.
 
-    An area is a Polygon, a MultiPolygon, or what a GeometryCollection has of them. Heights are ignored.
-    Parts that touch or overlap are united; those that a plan excludes are cut out.
+    An area is a Polygon, a MultiPolygon, or what a GeometryCollection has of them. Heights are
+    ignored. Parts that touch or overlap are united; those that a plan excludes are cut out.
 
-    Neither ``index`` nor ``where`` is needed if only one feature is an area. What is no area is left out,
-    which a line on stderr tells if nothing was chosen.
+    Neither ``index`` nor ``where`` is needed if only one feature is an area. What is no area is
+    left out, which a line on stderr tells if nothing was chosen.
 
     Args:
         path: the file.
         index: the feature's index, counted from 0 over all features of the file, or a list of them.
-        where: a property that only the feature has, as ``property:value`` or ``property=value``, or a list;
-            the property's name may be in capitals or not.
+        where: a property that only the feature has, as ``property:value`` or ``property=value``, or
+            a list; the property's name may be in capitals or not.
         every: unite all features that are areas.
 
     Raises:
-        InputError: the file cannot be read, the chosen geometry is invalid, or the choice does not single
-            out features.
+        InputError: the file cannot be read, the chosen geometry is invalid, or the choice does not
+            single out features.
     """
     path = Path(path)
     read, kind = _READERS.get(path.suffix.lower(), (_from_geojson, "GeoJSON"))
@@ -94,7 +96,9 @@ def read_area(
         if left_out and (every or index is where is None):
             _tell(f"{path}: left out: {listed(f'{each.place} {each.fault}' for each in left_out)}")
         names = [_name(each) or f"{path.stem} {each.place}" for each in chosen]
-        return local_region(parts, listed(names), None, listed(each.place for each in chosen), excluded)
+        return local_region(
+            parts, listed(names), None, listed(each.place for each in chosen), excluded
+        )
 
 
 @cache
@@ -104,7 +108,8 @@ def _tell(line: str) -> None:
 
 
 def _value(feature: _Feature, key: str) -> Any:
-    """A property of a feature, or the one whose name differs only in capitals: KML writes ``Name``."""
+    """A property of a feature, or the one whose name differs only in capitals: KML writes
+    ``Name``."""
     named_so = {each.lower(): value for each, value in feature.properties.items()}
     return feature.properties.get(key, named_so.get(key.lower()))
 
@@ -129,7 +134,8 @@ def _from_geojson(path: Path) -> list[_Feature]:
 
 
 def _from_plan(path: Path) -> list[_Feature]:
-    """The polygons of the fence of a plan, whose corners are latitude and longitude, the first once."""
+    """The polygons of the fence of a plan, whose corners are latitude and longitude, the first
+    once."""
     fence, found = json.loads(read_text(path)).get("geoFence") or {}, []
     if fence.get("circles"):
         raise InputError("geoFence.circles: a circle is not read; draw a polygon in its place")
@@ -146,16 +152,21 @@ def _from_plan(path: Path) -> list[_Feature]:
 
 
 def _from_map(path: Path) -> list[_Feature]:
-    """All features of all layers of a file that GDAL reads, but of tables without shapes, such as styles."""
+    """All features of all layers of a file that GDAL reads, but of tables without shapes, such as
+    styles."""
     pyogrio, found = _extra("pyogrio", f"a file {path.suffix}"), []
     if not path.is_file():
         raise InputError("no such file")
     for layer in (name for name, kind in pyogrio.list_layers(path) if kind is not None):
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of outlines that are open
+        with warnings.catch_warnings(
+            action="ignore", category=RuntimeWarning
+        ):  # of outlines that are open
             about, _, shapes, columns = pyogrio.raw.read(path, layer=layer, force_2d=True)
         columns = [column.tolist() for column in columns]
         for i, shape in enumerate(shapes):
-            properties = {name: column[i] for name, column in zip(about["fields"], columns, strict=True)}
+            properties = {
+                name: column[i] for name, column in zip(about["fields"], columns, strict=True)
+            }
             place = f"features[{len(found)}]"
             if path.suffix.lower() in _KML and shape and _is_picture(properties):
                 geometry: dict[str, Any] = {"type": "picture (GroundOverlay)"}
@@ -166,7 +177,8 @@ def _from_map(path: Path) -> list[_Feature]:
 
 
 def _is_picture(properties: dict[str, Any]) -> bool:
-    """Is a shape of a KML the outline of a picture? Of all others GDAL says whether they are extruded."""
+    """Is a shape of a KML the outline of a picture? Of all others GDAL says whether they are
+    extruded."""
     return properties.get("extrude", 0) not in (0, 1)  # but None, or nan
 
 
@@ -189,7 +201,9 @@ def _extra(module: str, what: str) -> Any:
     try:
         return import_module(module)
     except ModuleNotFoundError:
-        raise InputError(f"{what} needs {module}, which is missing: pip install 'damian[gis]'") from None
+        raise InputError(
+            f"{what} needs {module}, which is missing: pip install 'damian[gis]'"
+        ) from None
 
 
 def _choose(features: list[_Feature], index: Any, where: Any) -> list[_Feature]:
@@ -197,10 +211,14 @@ def _choose(features: list[_Feature], index: Any, where: Any) -> list[_Feature]:
     if index is not None:
         numbers = index if isinstance(index, list) else [index]
         if max(numbers) >= len(features):
-            raise InputError(f"region.index: {max(numbers)} is not between 0 and {len(features) - 1}")
+            raise InputError(
+                f"region.index: {max(numbers)} is not between 0 and {len(features) - 1}"
+            )
         chosen = [features[number] for number in numbers]
     elif where is not None:
-        chosen = [_fitting(features, each) for each in (where if isinstance(where, list) else [where])]
+        chosen = [
+            _fitting(features, each) for each in (where if isinstance(where, list) else [where])
+        ]
     else:
         chosen = [each for each in features if not each.fault]
         if len(chosen) > 1:
@@ -215,7 +233,8 @@ def _choose(features: list[_Feature], index: Any, where: Any) -> list[_Feature]:
 
 
 def _fitting(features: list[_Feature], where: str) -> _Feature:
-    """Find the only feature with this property value, which may be written as in Python or as in JSON."""
+    """Find the only feature with this property value, which may be written as in Python or as in
+    JSON."""
     # Properties and values may have : and = in them, too.
     pairs = [(where[: sign.start()], where[sign.end() :]) for sign in re.finditer("[:=]", where)]
 
@@ -234,7 +253,8 @@ def _fitting(features: list[_Feature], where: str) -> _Feature:
 
 
 def _polygons(geometry: dict[str, Any]) -> Iterator[list[Any]]:
-    """The rings of each polygon of a geometry, the shell first; those without corners are left out."""
+    """The rings of each polygon of a geometry, the shell first; those without corners are left
+    out."""
     kind = geometry.get("type")
     if kind == "GeometryCollection":
         for each in geometry["geometries"]:
@@ -249,7 +269,9 @@ def _polygons(geometry: dict[str, Any]) -> Iterator[list[Any]]:
 def _degrees(ring: Any, feature: _Feature) -> Floats:
     """Corners without their heights in degrees (longitude, latitude), [V, 2]."""
     try:
-        corners = np.array([position[:2] for position in ring], dtype=np.float64).reshape(len(ring), 2)
+        corners = np.array([position[:2] for position in ring], dtype=np.float64).reshape(
+            len(ring), 2
+        )
     except (TypeError, ValueError):
         problem = "its outline is not a list of corners [longitude, latitude]"
         raise InputError(f"{feature.place}: {problem}; a Polygon is a list of outlines") from None
@@ -257,18 +279,25 @@ def _degrees(ring: Any, feature: _Feature) -> Floats:
     # Areas across the antimeridian have corners beyond 180 degrees.
     outside = np.flatnonzero(~(np.abs(degrees) <= [360, 90]).all(axis=1))
     if len(outside):
-        problem = "is not a longitude between -360 and 360 deg and a latitude between -90 and 90 deg"
+        problem = (
+            "is not a longitude between -360 and 360 deg and a latitude between -90 and 90 deg"
+        )
         raise InputError(f"{feature.place}: {corners[outside[0]].tolist()} {problem}; {_REMEDY}")
     if not np.array_equal(corners[0], corners[-1]):
-        raise InputError(f"{feature.place}: its outline is open: repeat the first corner at the end")
+        raise InputError(
+            f"{feature.place}: its outline is open: repeat the first corner at the end"
+        )
     return degrees
 
 
 def _from_crs(corners: Floats, crs: Any) -> Floats:
-    """Convert corners [V, 2] (east, north) of a coordinate reference system to longitude and latitude."""
+    """Convert corners [V, 2] (east, north) of a coordinate reference system to longitude and
+    latitude."""
     name = crs if isinstance(crs, str) else crs.get("properties", {}).get("name")
     if not isinstance(name, str):
-        raise InputError(f"its coordinate reference system has no name (crs, or a file .prj): {_REMEDY}")
+        raise InputError(
+            f"its coordinate reference system has no name (crs, or a file .prj): {_REMEDY}"
+        )
     if _DEGREES.search(name):
         return corners
     pyproj = _extra("pyproj", f"the coordinate reference system {show(name)}")
@@ -276,4 +305,6 @@ def _from_crs(corners: Floats, crs: Any) -> Floats:
         to_degrees = pyproj.Transformer.from_crs(name, "OGC:CRS84", always_xy=True)
         return np.column_stack(to_degrees.transform(*corners.T))
     except pyproj.exceptions.ProjError as error:
-        raise InputError(f"its coordinate reference system is not understood: {error}; {_REMEDY}") from None
+        raise InputError(
+            f"its coordinate reference system is not understood: {error}; {_REMEDY}"
+        ) from None

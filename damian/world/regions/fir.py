@@ -24,10 +24,12 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
 
     The table needs the columns ``Airspace ID, Min Flight Level, Max Flight Level, Sequence Number,
     Latitude, Longitude`` and may have others. Its rows may be in any order: the sequence numbers
-    0, 1, 2, ... number the corners around the polygon. Only the rows of the chosen airspace are checked.
+    0, 1, 2, ... number the corners around the polygon. Only the rows of the chosen airspace are
+    checked.
 
     Raises:
-        InputError: the file cannot be read, its table is malformed, or the airspace is missing or invalid.
+        InputError: the file cannot be read, its table is malformed, or the airspace is missing or
+            invalid.
     """
     with named(path):
         table = parse_table(read_text(Path(path)), [_ID, *_BOUNDS])
@@ -38,10 +40,16 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
         rows.sort(key=lambda row: _number(row, _SEQUENCE))
         numbers = [_number(row, _SEQUENCE) for row in rows]
         if numbers != [*range(len(rows))]:
-            raise InputError(f"{show(airspace_id)}: {_SEQUENCE} {numbers} do not count from 0 upwards")
-        levels = {(_number(row, "Min Flight Level"), _number(row, "Max Flight Level")) for row in rows}
+            raise InputError(
+                f"{show(airspace_id)}: {_SEQUENCE} {numbers} do not count from 0 upwards"
+            )
+        levels = {
+            (_number(row, "Min Flight Level"), _number(row, "Max Flight Level")) for row in rows
+        }
         if len(levels) > 1:
-            raise InputError(f"{show(airspace_id)}: its rows differ in their flight levels [FL], {levels}")
+            raise InputError(
+                f"{show(airspace_id)}: its rows differ in their flight levels [FL], {levels}"
+            )
         corners = [[_number(row, "Longitude"), _number(row, "Latitude")] for row in rows]
         return local_region([[np.array(corners)]], airspace_id, levels.pop(), airspace_id)
 

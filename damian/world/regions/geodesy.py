@@ -1,9 +1,10 @@
 """Converts latitude and longitude to local metres and back, on a sphere.
 
-Local metres are an azimuthal equidistant projection about an origin: x points east, y points north, and
-distance and bearing from the origin are exact. Formulas: R. W. Sinnott, "Virtues of the Haversine" (1984),
-and the direct geodesic problem on a sphere. Distances on the sphere differ by up to 0.6 % from those on the
-WGS 84 ellipsoid.
+Local metres are an azimuthal equidistant projection about an origin: x points east, y points north,
+and
+distance and bearing from the origin are exact. Formulas: R. W. Sinnott, "Virtues of the Haversine"
+(1984), and the direct geodesic problem on a sphere. Distances on the sphere differ by up to 0.6 %
+from those on the WGS 84 ellipsoid.
 """
 
 from collections.abc import Sequence
@@ -17,33 +18,41 @@ EARTH_RADIUS_M = 6_371_008.8
 """Mean radius of the Earth (IUGG R1)."""
 
 
-def to_local(lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Convert latitudes in [-90, 90] and longitudes, [*] degrees, to metres [*] east and north of ``origin``.
+def to_local(
+    lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]
+) -> tuple[Floats, Floats]:
+    """Convert latitudes in [-90, 90] and longitudes, [*] degrees, to metres [*] east and north of
+    ``origin``.
 
-    They are ``x = d sin b`` and ``y = d cos b``, by the haversine distance d and the initial bearing b from
-    the origin (latitude, longitude) in degrees. The bearing of its antipode is arbitrary.
+    They are ``x = d sin b`` and ``y = d cos b``, by the haversine distance d and the initial
+    bearing b from the origin (latitude, longitude) in degrees. The bearing of its antipode is
+    arbitrary.
     """
     lat, lat_0 = np.radians(np.asarray(lat_deg, float)), np.radians(origin[0])
     d_lon = np.radians(np.asarray(lon_deg, float) - origin[1])
-    haversine = np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
+    haversine = (
+        np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
+    )
     distance = 2 * EARTH_RADIUS_M * np.arcsin(np.sqrt(np.clip(haversine, 0, 1)))
     east = np.cos(lat) * np.sin(d_lon)
-    # Equals cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(d_lon), without cancellation near the origin.
+    # Equals cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(d_lon), without cancellation near the
+    # origin.
     north = np.sin(lat - lat_0) + 2 * np.sin(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
     bearing = np.arctan2(east, north)
     return distance * np.sin(bearing), distance * np.cos(bearing)
 
 
 def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Convert metres east and north [*] to latitudes and longitudes [*]; the inverse of ``to_local``.
+    """Convert metres east and north [*] to latitudes and longitudes [*]; the inverse of
+    ``to_local``.
 
     Latitudes are in [-90, 90] and longitudes in [-180, 180) degrees.
     """
     x, y, lat_0 = np.asarray(x_m, float), np.asarray(y_m, float), np.radians(origin[0])
     arc, bearing = np.hypot(x, y) / EARTH_RADIUS_M, np.arctan2(x, y)
     east, north = np.sin(arc) * np.sin(bearing), np.sin(arc) * np.cos(bearing)
-    # Cartesian coordinates on the unit sphere, with the origin's meridian as the x-z plane. Near the
-    # poles an arcsine would lose half the digits of the latitude; the arctangent keeps them.
+    # Cartesian coordinates on the unit sphere, with the origin's meridian as the x-z plane. Near
+    # the poles an arcsine would lose half the digits of the latitude; the arctangent keeps them.
     out = np.cos(arc) * np.cos(lat_0) - north * np.sin(lat_0)
     up = np.cos(arc) * np.sin(lat_0) + north * np.cos(lat_0)
     lat = np.degrees(np.arctan2(up, np.hypot(out, east)))
@@ -53,11 +62,12 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tu
 def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
     """Centroid of a polygon's area on the sphere, as (latitude, longitude) in degrees.
 
-    It is the place below the mean of all points of the area in space. For a polygon whose edges are great
-    circles this mean has a closed form, the sum over the edges of their length times the normal of their
-    plane (J. E. Brock, "The Inertia Tensor for a Spherical Triangle", 1975), so that regions of any size,
-    across the antimeridian or around a pole, have it exactly. The area lies to the left of each closed ring,
-    [V, 2] degrees (longitude, latitude): shells run counter-clockwise and holes clockwise.
+    It is the place below the mean of all points of the area in space. For a polygon whose edges are
+    great circles this mean has a closed form, the sum over the edges of their length times the
+    normal of their plane (J. E. Brock, "The Inertia Tensor for a Spherical Triangle", 1975), so
+    that regions of any size, across the antimeridian or around a pole, have it exactly. The area
+    lies to the left of each closed ring, [V, 2] degrees (longitude, latitude): shells run
+    counter-clockwise and holes clockwise.
     """
     base = (float(rings[0][0, 1]), float(rings[0][0, 0]))
     moment = np.zeros(3)
@@ -65,8 +75,9 @@ def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
         x, y = to_local(ring[:, 1], ring[:, 0], base)
         distance = np.hypot(x, y) / EARTH_RADIUS_M
         outward = np.column_stack([x, y]) / EARTH_RADIUS_M * np.sinc(distance / np.pi)[:, None]
-        # Corners east, north and up of the base, in Earth radii. Near the base the closed form would lose
-        # all digits; the part of it that cancels over a closed ring is therefore left out.
+        # Corners east, north and up of the base, in Earth radii. Near the base the closed form
+        # would lose all digits; the part of it that cancels over a closed ring is therefore left
+        # out.
         offset = np.column_stack([outward, -2 * np.sin(distance / 2) ** 2])
         start, end, up = offset[:-1], offset[1:], np.array([0.0, 0.0, 1.0])
         bent = np.cross(start, end)

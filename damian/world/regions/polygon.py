@@ -1,4 +1,5 @@
-"""Polygons of operative regions and the landing points in them, in local metres (paper, section 3.2).
+"""Polygons of operative regions and the landing points in them, in local metres
+(paper, section 3.2).
 
 Polygons may be concave, have holes or consist of several parts.
 """
@@ -36,7 +37,8 @@ def polygon_from_vertices(vertices: Sequence[Any], source: str) -> Polygon:
 
 
 def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polygon:
-    """Build a polygon from its shell and holes, [V, 2] in ``unit`` each; refuse any that is not valid.
+    """Build a polygon from its shell and holes, [V, 2] in ``unit`` each; refuse any that is not
+    valid.
 
     ``source`` and ``unit`` are for error messages.
     """
@@ -53,8 +55,8 @@ def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polyg
 def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
     """Draw a random convex polygon: the hull of points uniform in the disc of area ``max_area_m2``.
 
-    The hull grows by one point at a time until its area reaches ``min_area_m2``; if a thousand points do not
-    suffice, it is scaled up to the mean of the two areas.
+    The hull grows by one point at a time until its area reaches ``min_area_m2``; if a thousand
+    points do not suffice, it is scaled up to the mean of the two areas.
     """
     points = _disc(rng, max_area_m2, _MAX_POINTS)
     hull = _hull(points[:3])
@@ -77,17 +79,21 @@ def largest_vertex_distance(polygon: Polygon | MultiPolygon) -> float:
 def landing_lattice(
     polygon: Polygon | MultiPolygon, step_m: float, degrees: float, n_points: int | None = None
 ) -> Floats:
-    """Lay a serpentine lattice over the polygon; its points inside the polygon are the landing points.
+    """Lay a serpentine lattice over the polygon; its points inside the polygon are the landing
+    points.
 
-    Points are ``step_m`` [m] apart in a row and rows ``step_m sin(degrees)`` apart, with a slant in (0, 90]
-    deg, so no two points coincide. The ``n_points`` nearest to the centroid are kept, or all. A landing
-    point's id is its row in the result, [L, 2] metres. They are ordered counter-clockwise about the centroid
-    from due west, with due west itself last; of two in one direction, the nearer comes first.
+    Points are ``step_m`` [m] apart in a row and rows ``step_m sin(degrees)`` apart, with a slant in
+    (0, 90] deg, so no two points coincide. The ``n_points`` nearest to the centroid are kept, or
+    all. A landing point's id is its row in the result, [L, 2] metres. They are ordered
+    counter-clockwise about the centroid from due west, with due west itself last; of two in one
+    direction, the nearer comes first.
     """
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
     shapely.prepare(polygon)
     inside = lattice[shapely.contains_xy(polygon, lattice)]
-    problem = f"lays no landing point inside the polygon of {polygon.area:g} m^2; take a shorter one"
+    problem = (
+        f"lays no landing point inside the polygon of {polygon.area:g} m^2; take a shorter one"
+    )
     checks.require(len(inside) > 0, "region.lattice_step", f"{step_m:g} m", problem)
     if n_points is not None:
         remedy = f"lower it, or region.lattice_step ({step_m:g} m)"
@@ -99,8 +105,9 @@ def landing_lattice(
 def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Generator) -> Floats:
     """Draw points uniformly in the polygon, strictly inside, [n, 2] metres.
 
-    First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it (Osada
-    et al., "Shape Distributions", 2002, eq. 1). Points that rounding has put on the boundary are drawn again.
+    First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it
+    (Osada et al., "Shape Distributions", 2002, eq. 1). Points that rounding has put on the boundary
+    are drawn again.
     """
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
@@ -123,7 +130,8 @@ def _require_area(corners: Floats, source: str) -> Floats:
     n_distinct = len(np.unique(corners, axis=0))
     if n_distinct < 3:
         raise InputError(f"{source}: {n_distinct} distinct points; a polygon needs at least 3")
-    # The hull, not the ring itself: a bow tie has zero area too, but its fault is that its edges cross.
+    # The hull, not the ring itself: a bow tie has zero area too, but its fault is that its edges
+    # cross.
     if _hull(corners).area <= 1e-12 * np.ptp(corners, axis=0).max() ** 2:
         raise InputError(f"{source}: no area: all {len(corners)} points lie on one line")
     return corners
@@ -147,7 +155,9 @@ def _lattice(bounds: tuple[float, float, float, float], step: float, slant: floa
     width, height, rise = max_x - min_x, max_y - min_y, step * np.sin(slant)
     # Compared as products, since a quotient by a tiny step could overflow.
     if (width + 4 * step) * (height + rise) > MAX_CANDIDATES * step * rise:
-        problem = f"is too fine for a polygon of {width:g} m x {height:g} m: over {MAX_CANDIDATES} points"
+        problem = (
+            f"is too fine for a polygon of {width:g} m x {height:g} m: over {MAX_CANDIDATES} points"
+        )
         raise InputError(f"region.lattice_step: {step:g} m {problem}; take a longer one")
     rows, start, ends = [], min_x, itertools.cycle([(max_x, 1), (min_x, -1)])
     for y, (end, sign) in zip(min_y + rise * np.arange(int(height / rise) + 1), ends, strict=False):
@@ -160,8 +170,10 @@ def _lattice(bounds: tuple[float, float, float, float], step: float, slant: floa
 
 
 def _by_direction(points: Floats, centre: Floats, n: int | None) -> Floats:
-    """The ``n`` points nearest to the centre (all if not given), counter-clockwise from due west, [n, 2]."""
-    # Rounded, so that ties are ties on every machine; 0.0 removes negative zeros, which would move due west.
+    """The ``n`` points nearest to the centre (all if not given), counter-clockwise from due west,
+    [n, 2]."""
+    # Rounded, so that ties are ties on every machine; 0.0 removes negative zeros, which would move
+    # due west.
     x, y = (np.round(points - centre, 9) + 0.0).T
     distance, angle = np.round(np.hypot(x, y), 6), np.round(np.arctan2(y, x), 12)
     order = np.lexsort([distance, angle])

@@ -25,11 +25,11 @@ class Region:
     Attributes:
         polygon: in local metres, x east and y north. The worlds compute in these coordinates.
         name: its name in the file, or one made up from its kind.
-        origin: (latitude, longitude) of the local origin (0, 0) in degrees; ``None`` for a region without a
-            position on Earth.
+        origin: (latitude, longitude) of the local origin (0, 0) in degrees; ``None`` for a region
+            without a position on Earth.
         levels: lowest and highest flight level [FL, hundreds of feet]; ``None`` if not known.
-        offset: place of the local origin in the coordinates of the settings (east, north) [m]; not (0, 0)
-            if vertices were given, or drawn, about another origin.
+        offset: place of the local origin in the coordinates of the settings (east, north) [m]; not
+            (0, 0) if vertices were given, or drawn, about another origin.
     """
 
     polygon: Polygon | MultiPolygon
@@ -42,8 +42,8 @@ class Region:
 def centred(region: Region) -> Region:
     """The region in metres about its centroid; one with a position on Earth is so already.
 
-    Corners are rounded to a grid of 1/65536 m about the lower left one, so that the same shape has the same
-    local coordinates, bit for bit, wherever its origin lies.
+    Corners are rounded to a grid of 1/65536 m about the lower left one, so that the same shape has
+    the same local coordinates, bit for bit, wherever its origin lies.
     """
     if region.origin is not None:
         return region
@@ -51,10 +51,14 @@ def centred(region: Region) -> Region:
     polygon = shapely.transform(region.polygon, lambda xy: to_grid(xy - corner))
     centroid = to_grid(shapely.get_coordinates(polygon.centroid)[0])
     reason = shapely.is_valid_reason(polygon)
-    checks.require(polygon.is_valid, region.name, reason, "[m] once rounded to 1/65536 m: draw it larger")
+    checks.require(
+        polygon.is_valid, region.name, reason, "[m] once rounded to 1/65536 m: draw it larger"
+    )
     east, north = (corner + centroid).tolist()
     polygon = shapely.transform(polygon, lambda xy: xy - centroid)
-    return replace(region, polygon=polygon, offset=(region.offset[0] + east, region.offset[1] + north))
+    return replace(
+        region, polygon=polygon, offset=(region.offset[0] + east, region.offset[1] + north)
+    )
 
 
 def to_grid(metres: Floats) -> Floats:
@@ -65,8 +69,9 @@ def to_grid(metres: Floats) -> Floats:
 def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
     """Places of the settings in local metres of a region, [P, 2]; all of them must lie inside.
 
-    Each is ``[x, y]``, metres east and north in the coordinates in which the region is given (those of
-    ``region.vertices``; of a file: about the area's centroid), or, where a file gives the region,
+    Each is ``[x, y]``, metres east and north in the coordinates in which the region is given
+    (those of ``region.vertices``; of a file: about the area's centroid), or, where a file gives the
+    region,
     ``{lat: 53.1, lon: -4.5}`` in degrees. ``key`` is that of the setting, for errors.
     """
     local = to_local_places(key, places, region)
@@ -91,7 +96,8 @@ def _local_place(key: str, place: Any, region: Region) -> Floats:
     if not isinstance(place, Mapping):
         return to_grid(np.array(place, float) - region.offset)
     problem = (
-        f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in metres, or "
+        f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in "
+        "metres, or "
         "take a region from a FIR table or GeoJSON file"
     )
     checks.require(region.origin is not None, key, place, problem)
@@ -105,10 +111,11 @@ def local_region(
     source: str,
     excluded: Sequence[Sequence[Floats]] = (),
 ) -> Region:
-    """Build a region in metres about the centroid of its area on the sphere from polygon parts in degrees.
+    """Build a region in metres about the centroid of its area on the sphere from polygon parts in
+    degrees.
 
-    Edges are straight in local metres: nearly great circles, not parallels of latitude. ``source`` begins
-    error messages.
+    Edges are straight in local metres: nearly great circles, not parallels of latitude. ``source``
+    begins error messages.
 
     Args:
         parts: for each part its rings, the shell first; each [V, 2] degrees (longitude, latitude).
@@ -118,8 +125,12 @@ def local_region(
     """
 
     def united(some: Sequence[Sequence[Floats]]) -> Polygon | MultiPolygon:
-        unwrapped = [[_unwrap_longitude(ring, parts[0][0][0, 0]) for ring in rings] for rings in some]
-        polygons = [polygon_from_rings(rings, source, "deg (longitude, latitude)") for rings in unwrapped]
+        unwrapped = [
+            [_unwrap_longitude(ring, parts[0][0][0, 0]) for ring in rings] for rings in some
+        ]
+        polygons = [
+            polygon_from_rings(rings, source, "deg (longitude, latitude)") for rings in unwrapped
+        ]
         return cast(Polygon | MultiPolygon, shapely.union_all(polygons))
 
     # Parts that were cut at the antimeridian share an edge, which a valid MultiPolygon must not.
@@ -137,7 +148,8 @@ def local_region(
 
 
 def _made_valid(local: Polygon | MultiPolygon, source: str) -> Polygon | MultiPolygon:
-    """A polygon in metres without the little by which holes cross the edges that they touch in degrees."""
+    """A polygon in metres without the little by which holes cross the edges that they touch in
+    degrees."""
     if local.is_valid:
         return local
     valid = shapely.make_valid(local, method="structure", keep_collapsed=False)

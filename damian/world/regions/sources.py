@@ -55,12 +55,15 @@ def _region_of_map(config: RegionConfig, rng: np.random.Generator) -> list[Regio
 
 
 def _without_zones(region: Region, config: RegionConfig, rng: np.random.Generator) -> Region:
-    """The region without the zones where nobody lands or flies, which become holes of it or cut its edge."""
+    """The region without the zones where nobody lands or flies, which become holes of it or cut its
+    edge."""
     if not config.zones:
         return region
     if isinstance(config.zones, list):
         zones = [
-            polygon_from_rings([to_local_places("region.zones", corners, region)], "region.zones", "m")
+            polygon_from_rings(
+                [to_local_places("region.zones", corners, region)], "region.zones", "m"
+            )
             for corners in config.zones
         ]
     elif isinstance(config.zones, str):
@@ -69,7 +72,9 @@ def _without_zones(region: Region, config: RegionConfig, rng: np.random.Generato
         zones = [_random_zone(region.polygon, config, rng) for _ in range(int(config.zones))]
     margin = config.zone_margin
     kept = region.polygon - shapely.union_all(shapely.buffer(zones, margin, join_style="mitre"))
-    checks.require(not kept.is_empty, "region.zones", config.zones, f"leave nothing of {region.name}")
+    checks.require(
+        not kept.is_empty, "region.zones", config.zones, f"leave nothing of {region.name}"
+    )
     return replace(region, polygon=cast(Polygon | MultiPolygon, kept))
 
 
@@ -87,7 +92,9 @@ def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
     return shapely.transform(area.polygon, moved)
 
 
-def _random_zone(polygon: Polygon | MultiPolygon, config: RegionConfig, rng: np.random.Generator) -> Polygon:
+def _random_zone(
+    polygon: Polygon | MultiPolygon, config: RegionConfig, rng: np.random.Generator
+) -> Polygon:
     """A random convex zone about a place in the region."""
     zone = random_polygon(rng, config.zone_area, 2 * config.zone_area)
     place = sample_interior(polygon, 1, rng)[0]
@@ -100,5 +107,7 @@ def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     source = REGION_SOURCES.get(config.kind, "region.kind")
     found = [_without_zones(centred(region), config, rng) for region in source(config, rng)]
     most, problem = config.initial_conditions, "regions: each needs at least one initial condition"
-    checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
+    checks.require(
+        len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem
+    )
     return found

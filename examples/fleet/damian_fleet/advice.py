@@ -23,14 +23,17 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 class Adviser(Tracker):
     """A tracker that asks a policy, and keeps its hidden states.
 
-    With ``drawn``, actions are drawn from torch's generator; if not, the most likely ones are taken. Other
-    arguments as of ``Tracker``.
+    With ``drawn``, actions are drawn from torch's generator; if not, the most likely ones are
+    taken. Other arguments as of ``Tracker``.
     """
 
     def __init__(
         self, node: Node, uavs: Sequence[str], policy: Policy, drawn: bool = False, **more: Any
     ) -> None:
-        self.policy, self.kind = policy, ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC
+        self.policy, self.kind = (
+            policy,
+            ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC,
+        )
         modules = policy.modules() if isinstance(policy, torch.nn.Module) else ()
         sizes = [each.cell.hidden_size for each in modules if isinstance(each, AgentGRU)]
         self._start = torch.zeros(1, len(uavs), sizes[0]) if sizes else None
@@ -39,7 +42,8 @@ class Adviser(Tracker):
         super().__init__(node, uavs, **more)
 
     def read(self, asking: Sequence[str]) -> TensorDictBase:
-        """The observation that the policy gets in this step; the UAVs that ask are ready to choose."""
+        """The observation that the policy gets in this step; the UAVs that ask are ready to
+        choose."""
         read = self.observe().clone(False)
         if keys.ACTION_MASK in read.keys(True):
             read[keys.ACTION_MASK] = self.node.simulation.action_mask(self.state(asking))
@@ -66,14 +70,18 @@ class Adviser(Tracker):
         self.hidden = self._hidden_after = self._start
 
 
-def next_landings(rows: Rows, node: Node, policy: Policy, now: float, drawn: bool = False) -> pd.DataFrame:
+def next_landings(
+    rows: Rows, node: Node, policy: Policy, now: float, drawn: bool = False
+) -> pd.DataFrame:
     """Where each UAV should land next, as the policy chooses once all rows have come in.
 
-    Columns: ``ID``; ``state``, ``fly``, ``hold``, or ``in flight``, where it goes on; ``lat``, ``lon`` [deg],
-    or over a region without a place on Earth ``x``, ``y`` [m], of the landing point; ``distance`` [m] and
-    ``heading``, clockwise from north [deg], from where it stands; ``age`` of its newest report [s].
+    Columns: ``ID``; ``state``, ``fly``, ``hold``, or ``in flight``, where it goes on; ``lat``,
+    ``lon`` [deg], or over a region without a place on Earth ``x``, ``y`` [m], of the landing point;
+    ``distance`` [m] and ``heading``, clockwise from north [deg], from where it stands; ``age`` of
+    its newest report [s].
 
-    A row that does not say when it came in came in ``now`` [s since 1970]. ``drawn`` as of ``Adviser``.
+    A row that does not say when it came in came in ``now`` [s since 1970]. ``drawn`` as of
+    ``Adviser``.
     """
     for where, report in rows:
         with named(where):
@@ -94,8 +102,13 @@ def next_landings(rows: Rows, node: Node, policy: Policy, now: float, drawn: boo
         here, there = int(before.goal[0, i]), int(after.goal[0, i])
         answer: dict[str, Any] = {"ID": uav, "state": "in flight"}
         if uav in asking:
-            answer["state"], (distance, heading) = "hold" if here == there else "fly", ground.way(here, there)
+            answer["state"], (distance, heading) = (
+                "hold" if here == there else "fly",
+                ground.way(here, there),
+            )
             answer |= dict(zip(ground.columns, ground.place(there), strict=True))
             answer |= {"distance": distance, "heading": None if here == there else heading}
         answers.append(answer | {"age": round(max(latest - adviser.held[uav].report.time, 0.0), 3)})
-    return pd.DataFrame(answers, columns=["ID", "state", *ground.columns, "distance", "heading", "age"])
+    return pd.DataFrame(
+        answers, columns=["ID", "state", *ground.columns, "distance", "heading", "age"]
+    )

@@ -1,8 +1,9 @@
-"""The bridge between the service and one copter with ArduPilot: a state machine without sockets or clock.
+"""The bridge between the service and one copter with ArduPilot: a state machine without sockets or
+clock.
 
-``Bridge.step`` takes the time, and the MAVLink messages and answers of the service that have come; it
-returns the messages and requests to send. What is missing is read off the telemetry: a command is sent again
-until its effect is seen or its acknowledgement has come.
+``Bridge.step`` takes the time, and the MAVLink messages and answers of the service that have come;
+it returns the messages and requests to send. What is missing is read off the telemetry: a command
+is sent again until its effect is seen or its acknowledgement has come.
 
 | state | commands | ends | limit |
 |:--|:--|:--|:--|
@@ -18,14 +19,15 @@ until its effect is seen or its acknowledgement has come.
 | watch | nothing; reports on the ground | the pilot hands over: *join* | |
 | left | nothing | | |
 
-**The pilot has the last word**: a mode, motors on or off, or an aim in the air that the bridge has not
-commanded, a move of the mode switch, a restart of the vehicle, and before the flight a refusal or a failsafe,
-lead to *watch* from every state; so does what has changed while the bridge was off. Nothing is commanded
-unless mode and motors were heard since the last command; if they are not for 5 s: *watch*. Where a vehicle is
-in the air in GUIDED and nobody is known to command it, the bridge is silent: so its failsafe lands it. **To
-hand over again**, the pilot switches the vehicle from another mode to GUIDED, on the ground with its motors
-off. An operator's hold leads from each state of a flight to *landing*;
-a missing answer of the service ends none. In a state that lasts, the log says every 30 s what is waited for.
+**The pilot has the last word**: a mode, motors on or off, or an aim in the air that the bridge has
+not commanded, a move of the mode switch, a restart of the vehicle, and before the flight a refusal
+or a failsafe, lead to *watch* from every state; so does what has changed while the bridge was off.
+Nothing is commanded unless mode and motors were heard since the last command; if they are not for 5
+s: *watch*. Where a vehicle is in the air in GUIDED and nobody is known to command it, the bridge is
+silent: so its failsafe lands it. **To hand over again**, the pilot switches the vehicle from
+another mode to GUIDED, on the ground with its motors off. An operator's hold leads from each state
+of a flight to *landing*; a missing answer of the service ends none. In a state that lasts, the log
+says every 30 s what is waited for.
 """
 
 import logging
@@ -45,7 +47,8 @@ os.environ.setdefault("MAVLINK20", "1")
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 STATION, AUTOPILOT = (255, 191), 1
-"""MAVLink system and component of the bridge, beside a pilot's station; component of the vehicle."""
+"""MAVLink system and component of the bridge, beside a pilot's station; component of the
+vehicle."""
 GUIDED, LAND = 4, 9
 """Custom modes of ArduCopter."""
 COPTERS = (2, 3, 4, 13, 14, 15, 29, 35)
@@ -53,14 +56,19 @@ COPTERS = (2, 3, 4, 13, 14, 15, 29, 35)
 SILENCE = 5.0  # age of the newest message above which a link counts as lost [s]
 FRESH = 2.5  # age of mode and motors above which nothing is commanded [s]
 ABOUT = 0.3  # how well it is known when a heartbeat was sent, which has no time [s]
-ALONE = 15.0  # how long a vehicle may be in the air in GUIDED while nobody is known to command it [s]
+ALONE = (
+    15.0  # how long a vehicle may be in the air in GUIDED while nobody is known to command it [s]
+)
 AIM = 3.0  # difference of its aim to its goal from which somebody else has given it [m]
 SETTLED = 3.0  # how long a switch of a pilot may be told late after he has handed over [s]
 IDENTITY = 10.0  # how long it is waited for which vehicle it is [s]
 TIMEOUT = 10.0  # when an answer counts as missing [s]
 NEAR, THERE = 2.0, 10.0  # how near to its goal it begins to land, and must have landed [m]
 LEVEL = 1.0  # difference to its flight level at which it has climbed enough [m]
-TOP_SPEED, SCATTER = 40.0, 20.0  # a place farther away than this speed [m/s] and scatter [m] explain ...
+TOP_SPEED, SCATTER = (
+    40.0,
+    20.0,
+)  # a place farther away than this speed [m/s] and scatter [m] explain ...
 STEADY = 10.0  # ... counts after so long there [s]
 FALL = 3.0  # descent above which a vehicle whose motors go off has fallen, not landed [m/s]
 GRACE = 3.0  # what was refused may have been done before: its effect counts for so long [s]
@@ -69,11 +77,18 @@ RETRY = 2.0  # after which a command that nobody has acknowledged is sent again 
 WORD = 30.0  # how often the log says what a state waits for [s]
 LIMITS = {"accept": 30.0, "guided": 15.0, "arm": 15.0, "landing": 30.0}
 """Longest times in states [s], as the table of states says."""
-MOTORS = dict.fromkeys(("join", "ground", "accept", "guided"), False) | {"climb": True, "cruise": True}
+MOTORS = dict.fromkeys(("join", "ground", "accept", "guided"), False) | {
+    "climb": True,
+    "cruise": True,
+}
 """Whether the motors are on in a state, unless somebody else has a hand in it."""
 FAILSAFES = (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
 """States of a vehicle in which it does not take off."""
-INTERVALS = {"GLOBAL_POSITION_INT": (33, 0.25), "EXTENDED_SYS_STATE": (245, 0.5), "SYS_STATUS": (1, 1.0)}
+INTERVALS = {
+    "GLOBAL_POSITION_INT": (33, 0.25),
+    "EXTENDED_SYS_STATE": (245, 0.5),
+    "SYS_STATUS": (1, 1.0),
+}
 INTERVALS |= {"GPS_RAW_INT": (24, 1.0), "BATTERY_STATUS": (147, 2.0), "RC_CHANNELS": (65, 0.5)}
 INTERVALS |= {"POSITION_TARGET_GLOBAL_INT": (87, 0.5)}
 """Messages that it asks for while they do not come: their numbers, and the time between two [s]."""
@@ -87,7 +102,8 @@ _LOG = logging.getLogger("damian_mavlink")
 class Request(NamedTuple):
     """A request to the service; its answer has the same ``number``.
 
-    ``take`` gets the status and the content of an answer that came at all; it was asked ``at`` a time [s].
+    ``take`` gets the status and the content of an answer that came at all; it was asked ``at`` a
+    time [s].
     """
 
     method: str
@@ -99,7 +115,8 @@ class Request(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """The answer to a request: status and JSON; None if there is none (no link, time-out, garbage)."""
+    """The answer to a request: status and JSON; None if there is none
+    (no link, time-out, garbage)."""
 
     status: int | None
     body: Any
@@ -126,7 +143,8 @@ class Memory(BaseModel):
 
 
 def way(origin: Sequence[float], goal: Sequence[float]) -> tuple[float, float]:
-    """Distance [m] and heading, clockwise from north [deg], between near latitudes and longitudes [deg]."""
+    """Distance [m] and heading, clockwise from north [deg], between near latitudes and longitudes
+    [deg]."""
     east = math.radians(goal[1] - origin[1]) * 6_378_137 * math.cos(math.radians(origin[0]))
     north = math.radians(goal[0] - origin[0]) * 6_378_137
     return math.hypot(east, north), math.degrees(math.atan2(east, north)) % 360
@@ -173,7 +191,8 @@ class Bridge:
         self.armed = self.on_ground = self.in_air = self.is_linked = False
         self.is_ready = True
         self.ahead, self._trip, self._timed = math.nan, math.inf, -math.inf
-        """How far the clock of the service is ahead [s]; how long that answer took [s], and when it came."""
+        """How far the clock of the service is ahead [s]; how long that answer took [s], and when it
+        came."""
         self.order = Order()
         self.seen: dict[str, Any] = {}
         """The newest messages of the vehicle by their types."""
@@ -191,7 +210,9 @@ class Bridge:
         self._sent: dict[int, float] = {}
         self._results: dict[int, tuple[bool, float]] = {}
         self._is_flying = not self.memory.stops or self.memory.taken_off
-        self._was_linked = self._has_switched = self._has_joined = self._is_other = self._is_quiet = False
+        self._was_linked = self._has_switched = self._has_joined = self._is_other = (
+            self._is_quiet
+        ) = False
         self._spotted = self._was_spotted = False
         self._track = self._turned = self._held = None
         self._offer: Advice | None = None
@@ -203,7 +224,8 @@ class Bridge:
     def step(
         self, now: float, messages: Iterable[Any] = (), answers: Iterable[Answer] = ()
     ) -> tuple[list[Any], list[Request]]:
-        """Take what has come, and return the messages and requests to send; ``now`` [s] never goes back."""
+        """Take what has come, and return the messages and requests to send; ``now`` [s] never goes
+        back."""
         if self.state == "left":
             return [], []
         if self._since == -math.inf:
@@ -214,7 +236,9 @@ class Bridge:
         self._look()
         if self.is_linked != self._was_linked:
             self._was_linked = self.is_linked
-            self._say("the vehicle is heard" if self.is_linked else "the vehicle is not heard any more")
+            self._say(
+                "the vehicle is heard" if self.is_linked else "the vehicle is not heard any more"
+            )
             self._need_fresh()
         if self.is_linked:
             self._is_flying = self._is_flying or self.in_air
@@ -267,7 +291,11 @@ class Bridge:
     def _hear(self, message: Any) -> None:
         """Take a message, if it is one of the vehicle."""
         kind, system = message.get_type(), message.get_srcSystem()
-        if kind == "NAMED_VALUE_FLOAT" and system == self.memory.system and message.name == "spotted":
+        if (
+            kind == "NAMED_VALUE_FLOAT"
+            and system == self.memory.system
+            and message.name == "spotted"
+        ):
             self._spotted = message.value >= 0.5  # the payload may be a component of its own
         if message.get_srcComponent() != AUTOPILOT or kind == "BAD_DATA":
             return
@@ -275,7 +303,9 @@ class Bridge:
             self.memory.system = system
         if self.memory.system != system:
             if kind == "HEARTBEAT" and self._is_due(f"system {system}", 600):
-                self._say(f"system {system} is on this link; commands go to {self.memory.system} alone")
+                self._say(
+                    f"system {system} is on this link; commands go to {self.memory.system} alone"
+                )
             return
         if kind == "HEARTBEAT" and not self._is_copter(message):
             return
@@ -338,7 +368,9 @@ class Bridge:
         if not 800 < message.chan5_raw < 2200:
             return  # no receiver, or no pilot
         stands, memory = sum(message.chan5_raw > edge for edge in SWITCH), self.memory
-        is_settled = self.state not in ("connect", "watch", "left") and self.now > self._handed_at + SETTLED
+        is_settled = (
+            self.state not in ("connect", "watch", "left") and self.now > self._handed_at + SETTLED
+        )
         self._has_switched |= is_settled and memory.switch not in (None, stands)
         memory.switch = stands if is_settled or self.state != "connect" else memory.switch
 
@@ -349,15 +381,23 @@ class Bridge:
         if (ack.target_system, ack.target_component) != STATION or ack.command not in self._sent:
             return
         self.memory.lands |= ack.command == mavlink.MAV_CMD_NAV_LAND and ack.result == 0
-        if ack.result not in (mavlink.MAV_RESULT_IN_PROGRESS, mavlink.MAV_RESULT_TEMPORARILY_REJECTED):
-            self._results.setdefault(ack.command, (ack.result == mavlink.MAV_RESULT_ACCEPTED, self.now))
+        if ack.result not in (
+            mavlink.MAV_RESULT_IN_PROGRESS,
+            mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+        ):
+            self._results.setdefault(
+                ack.command, (ack.result == mavlink.MAV_RESULT_ACCEPTED, self.now)
+            )
         if ack.result != mavlink.MAV_RESULT_ACCEPTED:
             self._say(f"{name_of('MAV_CMD', ack.command)}: {name_of('MAV_RESULT', ack.result)}")
 
-    def _command(self, command: int, *params: float, place: tuple[float, float] | None = None) -> bool:
+    def _command(
+        self, command: int, *params: float, place: tuple[float, float] | None = None
+    ) -> bool:
         """Send a command, and again until there is a result; returns whether it was accepted.
 
-        None is sent on an old picture: mode and motors were heard since the command before, and lately.
+        None is sent on an old picture: mode and motors were heard since the command before, and
+        lately.
         """
         if command in self._results:
             return self._results[command][0]
@@ -371,7 +411,9 @@ class Bridge:
         else:
             about = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, command, 0, 0
             x, y = (round(each * 1e7) for each in place)
-            self._out.append(mavlink.MAVLink_command_int_message(*target, *about, *own[:4], x, y, own[6]))
+            self._out.append(
+                mavlink.MAVLink_command_int_message(*target, *about, *own[:4], x, y, own[6])
+            )
         return False
 
     def _is_refused(self, command: int) -> bool:
@@ -380,7 +422,8 @@ class Bridge:
         return not is_accepted and self.now > at + GRACE
 
     def _keep_in_touch(self) -> None:
-        """Heartbeats, and the messages that do not come; silent where its failsafe shall land the vehicle."""
+        """Heartbeats, and the messages that do not come; silent where its failsafe shall land the
+        vehicle."""
         if self._is_alone() != self._is_quiet:
             self._is_quiet = not self._is_quiet
             if self._is_quiet:
@@ -389,19 +432,36 @@ class Bridge:
             self._out.append(mavlink.MAVLink_timesync_message(0, self.order.ask_time(self.now)))
         if not self._is_quiet and self._is_due("heartbeat", 1.0):
             kind, none = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
-            self._out.append(mavlink.MAVLink_heartbeat_message(kind, none, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
+            self._out.append(
+                mavlink.MAVLink_heartbeat_message(kind, none, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
+            )
         if self.memory.system is None or not self._is_due("intervals", SILENCE):
             return
         for kind, (number, interval) in INTERVALS.items():
             if self.now > self._came.get(kind, -math.inf) + max(SILENCE, 3 * interval):
-                asked = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval * 1e6, 0, 0, 0, 0, 0
-                self._out.append(mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked))
+                asked = (
+                    mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+                    0,
+                    number,
+                    interval * 1e6,
+                    0,
+                    0,
+                    0,
+                    0,
+                    0,
+                )
+                self._out.append(
+                    mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked)
+                )
 
     def _is_alone(self) -> bool:
-        """Whether the vehicle may have been in the air in GUIDED for long while nobody commands it."""
+        """Whether the vehicle may have been in the air in GUIDED for long while nobody commands
+        it."""
         is_left = self.state == "watch" and self.mode == GUIDED and self.armed and self.in_air
         position = self.seen.get("GLOBAL_POSITION_INT")
-        if not is_left or math.hypot(position.vx, position.vy) > 100:  # somebody lets it fly on [cm/s]
+        if (
+            not is_left or math.hypot(position.vx, position.vy) > 100
+        ):  # somebody lets it fly on [cm/s]
             self._stood_since = self.now
         is_lost = (self.state in FLIGHT or is_left) and self.now > self._heard_at + ALONE
         return is_lost or self.now > self._stood_since + ALONE
@@ -415,7 +475,8 @@ class Bridge:
     # The service.
 
     def _talk(self) -> list[Request]:
-        """The next request, one at a time: the time, what has happened, then what the state wants."""
+        """The next request, one at a time: the time, what has happened, then what the state
+        wants."""
         if self._pending is not None and self.now > self._pending.at + TIMEOUT:
             self._hear_answer(Answer(None, None, self._pending.number))
         if self._pending is not None or self.now < self._retry:
@@ -432,7 +493,8 @@ class Bridge:
         return [self._pending]
 
     def _hear_answer(self, answer: Answer) -> None:
-        """Take an answer; an error of the service, or what is not as it should be, is a missing one."""
+        """Take an answer; an error of the service, or what is not as it should be, is a missing
+        one."""
         request = self._pending
         if request is None or answer.number != request.number:
             return
@@ -446,14 +508,16 @@ class Bridge:
             self._retry = self.now + 1.0
             if self._is_due("no service", 10):
                 problem = " ".join(str(error).split())[:200]
-                self._say(f"no answer of the service to {request.method} {request.path} ({problem})")
+                self._say(
+                    f"no answer of the service to {request.method} {request.path} ({problem})"
+                )
 
     def _hear_time(self, _: int, body: dict[str, Any]) -> None:
         """Note how far the clock of the service is ahead, as of the middle of the trip.
 
-        Worked timeline: asked at 10.0 s, answered 1000.2 s, came in at 10.4 s: it is 990 s ahead, give or
-        take 0.2 s. A later answer counts if it came as fast, contradicts the one that counts (a clock was
-        set), or if that is older than 5 minutes (clocks drift).
+        Worked timeline: asked at 10.0 s, answered 1000.2 s, came in at 10.4 s: it is 990 s ahead,
+        give or take 0.2 s. A later answer counts if it came as fast, contradicts the one that
+        counts (a clock was set), or if that is older than 5 minutes (clocks drift).
         """
         if not 0 < (said := float(body["time"])) < 4e9:
             raise ValueError(f"{said} is no time [s since 1970]")
@@ -486,9 +550,16 @@ class Bridge:
         memory, flies = self.memory, self.in_air
         if math.isnan(self.time) or self.here is None or self._place_at <= self._reported:
             return
-        memory.number = memory.number or int(self.time) % 2**30  # mostly none of a lost memory; < 2**31
+        memory.number = (
+            memory.number or int(self.time) % 2**30
+        )  # mostly none of a lost memory; < 2**31
         row = {"ID": self.uav, "number": memory.number, "time": self._place_at + self.ahead}
-        row |= {"lat": self.here[0], "lon": self.here[1], "FLA": self.height, "on ground": int(not flies)}
+        row |= {
+            "lat": self.here[0],
+            "lon": self.here[1],
+            "FLA": self.height,
+            "on ground": int(not flies),
+        }
         row |= {"battery": self.battery, "source spotted": int(self._spotted and not flies)}
         row |= {"track": self._track, "takeoff-landing time": self._turned}
         row |= {"bridge": memory.bridge, "vehicle": memory.vehicle or None}
@@ -498,12 +569,20 @@ class Bridge:
         memory.outbox.append(("/reports", row))
 
     def _report_in_turn(self) -> None:
-        if self._place_at > self._reported and not self.memory.outbox and self._is_due("report", self.period):
+        if (
+            self._place_at > self._reported
+            and not self.memory.outbox
+            and self._is_due("report", self.period)
+        ):
             self._report()
 
     def _want(self, period: float, take: Any, method: str, path: str, body: Any = None) -> None:
         """Request something once in a period, if nothing else is under way."""
-        is_free = self._pending is None is self._wish and self.now >= self._retry and not self.memory.outbox
+        is_free = (
+            self._pending is None is self._wish
+            and self.now >= self._retry
+            and not self.memory.outbox
+        )
         if is_free and self._is_due("want", period):
             self._wish = Request(method, self.path + path, body, take)
 
@@ -521,11 +600,18 @@ class Bridge:
             self.why = f"the service says {body.get('error')}"
             return
         told, goal = Advice.model_validate(body["advice"][0]), self.memory.goal
-        if told.state not in ("hold", "none") and None in (told.answer, told.lat, told.lon, told.altitude):
+        if told.state not in ("hold", "none") and None in (
+            told.answer,
+            told.lat,
+            told.lon,
+            told.altitude,
+        ):
             raise ValueError("a flight needs answer, lat, lon and altitude")
         is_new = told.answer not in (None, self._held, goal and goal.answer)
         if self.state == "ground":
-            self.why = f"it is told {told.state}" + (f" because {told.reason}" if told.reason else "")
+            self.why = f"it is told {told.state}" + (
+                f" because {told.reason}" if told.reason else ""
+            )
             self._offer = told if is_new and told.state != "none" else None
             if self._offer is not None and told.state != "hold":
                 self._turn("accept", f"the service to confirm {told.state} {told.answer}")
@@ -582,7 +668,9 @@ class Bridge:
             own |= {LAND} if mavlink.MAV_CMD_NAV_LAND in self._sent else set()
         if self.mode in own and (self.mode == LAND or self.state in ("join", "ground", "accept")):
             memory.mode = self.mode  # from now on no other
-        failed = self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(self.state, True)
+        failed = self.seen["HEARTBEAT"].system_status in FAILSAFES and not MOTORS.get(
+            self.state, True
+        )
         is_other = self.mode not in {memory.mode, *own}
         has_armed = self.armed != MOTORS.get(self.state, self.armed)
         acts = {
@@ -596,10 +684,16 @@ class Bridge:
         return next((what for what, is_so in acts.items() if is_so), "")
 
     def _aims_elsewhere(self) -> bool:
-        """Whether the vehicle flies to a place that is not its goal, because another station has told it."""
+        """Whether the vehicle flies to a place that is not its goal, because another station has
+        told it."""
         aim, goal = self.seen.get("POSITION_TARGET_GLOBAL_INT"), self.memory.goal
         flies = self.state in ("climb", "cruise", "landing") and self.mode == GUIDED and self.in_air
-        if not flies or aim is None or goal is None or self._came[aim.get_type()] < self._climbs_from:
+        if (
+            not flies
+            or aim is None
+            or goal is None
+            or self._came[aim.get_type()] < self._climbs_from
+        ):
             return False
         here = self.seen["GLOBAL_POSITION_INT"]
         height = aim.alt - (here.alt - here.relative_alt) / 1e3
@@ -612,14 +706,20 @@ class Bridge:
             self._say_fact(self._offer.answer, "aborted")
             self._offer = None
         self._end()
-        self._turn("watch", f"{reason}: a pilot to land it, and to hand over by GUIDED with its motors off")
+        self._turn(
+            "watch", f"{reason}: a pilot to land it, and to hand over by GUIDED with its motors off"
+        )
         self._warn(f"watches: {reason}")
 
     def _check_limit(self) -> None:
         """End what has taken too long."""
         if self.state in FLIGHT and self._heard_at - ABOUT <= self._commanded < self.now - SILENCE:
             self._hands_off(f"mode and motors not heard for {SILENCE:.0f} s after a command")
-        goal, lasting, limit = self.memory.goal, self.now - self._since, LIMITS.get(self.state, math.inf)
+        goal, lasting, limit = (
+            self.memory.goal,
+            self.now - self._since,
+            LIMITS.get(self.state, math.inf),
+        )
         if self.state == "climb":
             limit = 30 + 2 * goal.altitude
         elif self.state == "cruise":
@@ -648,13 +748,22 @@ class Bridge:
         """Note that a decision has been followed: where, and when."""
         memory = self.memory
         memory.motions = (0 if self._was_spotted else memory.motions) + bool(memory.stops)
-        memory.stops, memory.landed = [self.here, *memory.stops][:17], [self.time, *memory.landed][:17]
+        memory.stops, memory.landed = (
+            [self.here, *memory.stops][:17],
+            [self.time, *memory.landed][:17],
+        )
 
     def _stand(self) -> bool:
-        """Note when it has come to stand on the ground; returns whether it does, and has listened."""
+        """Note when it has come to stand on the ground; returns whether it does, and has
+        listened."""
         if self._is_flying and self.on_ground and not self.armed and not math.isnan(self.time):
             self._decided()
-            self._landed_at, self._turned, self._is_flying, self._spotted = self.now, self.time, False, False
+            self._landed_at, self._turned, self._is_flying, self._spotted = (
+                self.now,
+                self.time,
+                False,
+                False,
+            )
             self._need_fresh()
         return not self._is_flying and self.now >= self._landed_at + self.listen
 
@@ -667,7 +776,9 @@ class Bridge:
             self.why = "which vehicle it is"
             if self._is_due("identity", 1.0):
                 asked = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, 148, *[0.0] * 6
-                self._out.append(mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked))
+                self._out.append(
+                    mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked)
+                )
             return
         state, mode, is_told = self.memory.state, self.memory.mode, self.memory.goal is not None
         if state in ("watch", "cruise", "landing") or (is_told and self.in_air):
@@ -679,7 +790,9 @@ class Bridge:
             self._turn("landing", "on the ground as before")
             self.memory.mode = mode
         elif self.armed or (mode not in (-1, self.mode) and state != "left"):
-            self._hands_off(f"motors on or mode {name_of('COPTER_MODE', self.mode)} by somebody else")
+            self._hands_off(
+                f"motors on or mode {name_of('COPTER_MODE', self.mode)} by somebody else"
+            )
         else:
             self._turn("join", "the service to know the UAV")
 
@@ -690,8 +803,14 @@ class Bridge:
         """Create the fleet, join it, or go on as its member."""
         if status == 404:
             self._wish = Request("PUT", self.path, {"uavs": self.uavs}, self._hear_change)
-        elif status == 200 and not self._has_joined and self.uav not in [row["ID"] for row in body["uavs"]]:
-            self._wish = Request("POST", f"{self.path}/uavs", {"join": [self.uav]}, self._hear_change)
+        elif (
+            status == 200
+            and not self._has_joined
+            and self.uav not in [row["ID"] for row in body["uavs"]]
+        ):
+            self._wish = Request(
+                "POST", f"{self.path}/uavs", {"join": [self.uav]}, self._hear_change
+            )
         elif status == 200 and self.state == "join" and self.is_linked:
             self._has_joined, self.period = True, float(body["dt"])
             self._turn("ground", "a report to be taken")
@@ -703,7 +822,8 @@ class Bridge:
     def _hear_change(self, _: int, body: dict[str, Any]) -> None:
         self._has_joined = True
         self._turn(
-            "join" if self.state == "join" else "left", f"the service says {body.get('error', 'welcome')}"
+            "join" if self.state == "join" else "left",
+            f"the service says {body.get('error', 'welcome')}",
         )
 
     def _ground(self) -> None:
@@ -784,7 +904,9 @@ class Bridge:
             self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0)
         elif self.armed:
             self.why = "the vehicle to turn its motors off"
-        elif self.now > self._down + 2 and max((fall for _, fall in self._falls), default=0.0) > FALL:
+        elif (
+            self.now > self._down + 2 and max((fall for _, fall in self._falls), default=0.0) > FALL
+        ):
             self._hands_off("its motors went off in the air")
         elif self.now > self._down + 2 and self.memory.mode == LAND and not self.memory.lands:
             self._hands_off("it has landed, and has not said that it did so for the bridge")
@@ -797,10 +919,14 @@ class Bridge:
             self._report_in_turn()
             if self.leaving:
                 self._leave()
-        if self.mode != GUIDED or self.now < self._commanded + QUIET:  # or by a command that came late
+        if (
+            self.mode != GUIDED or self.now < self._commanded + QUIET
+        ):  # or by a command that came late
             self._is_other = self.mode != GUIDED
         elif self._is_other and self.on_ground and not self.armed:
             self._need_fresh()
             self._turn("join", "the pilot has handed over")
         elif self._is_other and self._is_due("hand over", 60):
-            self._say("GUIDED in flight hands nothing over: land it, motors off, another mode, GUIDED")
+            self._say(
+                "GUIDED in flight hands nothing over: land it, motors off, another mode, GUIDED"
+            )

@@ -8,7 +8,8 @@ from damian_fleet.reports import Rows
 
 
 def wrong_clocks(rows: Rows) -> tuple[set[int], pd.DataFrame]:
-    """Which reports tell the time of a wrong clock, which is printed, and the others as of ``delays_of``.
+    """Which reports tell the time of a wrong clock, which is printed, and the others as of
+    ``delays_of``.
 
     Of a UAV whose clock was never right, what it says counts.
     """
@@ -16,7 +17,7 @@ def wrong_clocks(rows: Rows) -> tuple[set[int], pd.DataFrame]:
     cells = [(where, each.id, each.time, each.received, each.sequence) for where, each in rows]
     messages = in_order(pd.DataFrame(cells, columns=columns).astype({"sequence": float}))
     right = are_right(messages)
-    right |= ~pd.Series(right, messages.index).groupby(messages.uav).transform("any").to_numpy(bool)
+    right |= ~right.groupby(messages.uav).transform("any")
     if not right.all():
         print(note_on(messages, right))
     return {*messages.index[~right]}, delays_of(messages, right)

@@ -1,12 +1,14 @@
 """A fleet of real UAVs: what it knows, what each UAV may be told, and what it does of that.
 
-What happens to a fleet is a list of events, plain data. ``reported``, ``advised`` and so on look at a request
-and give its event, and change nothing; ``apply`` takes an event into account. So a fleet that applies the
+What happens to a fleet is a list of events, plain data. ``reported``, ``advised`` and so on look at
+a request and give its event, and change nothing; ``apply`` takes an event into account. So a fleet
+that applies the
 stored events again knows what was answered: it reads that from them, and never decides again.
 
-Worked timeline, an answer that holds for 10 s: at 100 s the UAV asks and is offered a landing point until
-110 s; if it asks again before, it gets the same answer. At 103 s it says ``accepted``, and from then on the
-service takes it to fly to that landing point. Without an acceptance by 110 s, it is taken to stay.
+Worked timeline, an answer that holds for 10 s: at 100 s the UAV asks and is offered a landing point
+until 110 s; if it asks again before, it gets the same answer. At 103 s it says ``accepted``, and
+from then on the service takes it to fly to that landing point. Without an acceptance by 110 s, it
+is taken to stay.
 """
 
 import math
@@ -53,16 +55,18 @@ LEASE = 30.0
 MOST_STEPS = 3600
 """Steps that are taken at once, or again after a restart; beliefs begin anew after earlier ones."""
 KEPT_REPORTS, KEPT_ANSWERS = 512, 64
-"""Of a UAV: a late report changes what newer ones left open, and may be of a flight that is over."""
+"""Of a UAV: a late report changes what newer ones left open, and may be of a flight that is
+over."""
 REASONS = ("silent", "battery", "held", "returning", "aborted", "airborne", "conflict", "detour")
-"""Why a UAV is not told what the policy chooses: it stands, and its newest report is too old; its battery is
-below the reserve, would be after the flight, or was never reported; a person holds it, or sends it home; it
-has aborted a flight without a report since, or flies without an answer; another UAV is in its way; the
-straight way there leaves the region, or crosses a zone."""
+"""Why a UAV is not told what the policy chooses: it stands, and its newest report is too old; its
+battery is below the reserve, would be after the flight, or was never reported; a person holds it,
+or sends it home; it has aborted a flight without a report since, or flies without an answer;
+another UAV is in its way; the straight way there leaves the region, or crosses a zone."""
 OFFERED, ACCEPTED, TAKEN_OFF, LANDED = "offered", "accepted", "taken off", "landed"
 """How far an answer has come; it never goes back."""
 REFUSED, ABORTED, LAPSED = "refused", "aborted", "lapsed"
-"""How an answer ends that is not flown: by the UAV, in flight, or because nobody accepted it in time."""
+"""How an answer ends that is not flown: by the UAV, in flight, or because nobody accepted it in
+time."""
 AFTER = {
     ACCEPTED: {OFFERED: ACCEPTED},
     REFUSED: {OFFERED: REFUSED},
@@ -70,8 +74,8 @@ AFTER = {
     TAKEN_OFF: dict.fromkeys((OFFERED, LAPSED, ACCEPTED), TAKEN_OFF),
     LANDED: dict.fromkeys((OFFERED, LAPSED, ACCEPTED, TAKEN_OFF), LANDED),
 }
-"""How far an answer has come once a UAV says something of it, by how far it had come before; facts (taken
-off, landed) count whenever they are said, and nothing undoes an end."""
+"""How far an answer has come once a UAV says something of it, by how far it had come before; facts
+(taken off, landed) count whenever they are said, and nothing undoes an end."""
 
 Event = dict[str, Any]
 
@@ -86,7 +90,8 @@ class Held(InputError):
 
 @dataclass
 class Lease:
-    """Which bridge speaks for a UAV, for which vehicle (empty if it does not tell), and when it did last [s];
+    """Which bridge speaks for a UAV, for which vehicle (empty if it does not tell), and when it did
+    last [s];
     None after a restart of the service. ``warning``: who else has tried to since."""
 
     bridge: str
@@ -97,12 +102,13 @@ class Lease:
 
 @dataclass
 class Decision:
-    """What a UAV was told: to fly from a landing point, ``origin``, to ``goal``, or to hold if both are one.
+    """What a UAV was told: to fly from a landing point, ``origin``, to ``goal``, or to hold if both
+    are one.
 
-    ``start`` is where it stood, east and north [m], maybe beside the landing point. Times and durations in
-    seconds. ``action`` is a number, or distance and heading in [0, 1]; None if the policy has not chosen it,
-    but one of ``REASONS``. ``until`` is the end of the time in which it may be accepted. ``since`` is the
-    step up to which reports are older than what is known of it.
+    ``start`` is where it stood, east and north [m], maybe beside the landing point. Times and
+    durations in seconds. ``action`` is a number, or distance and heading in [0, 1]; None if the
+    policy has not chosen it, but one of ``REASONS``. ``until`` is the end of the time in which it
+    may be accepted. ``since`` is the step up to which reports are older than what is known of it.
     """
 
     step: int
@@ -151,8 +157,9 @@ class Decision:
 
 @dataclass
 class Uav:
-    """A UAV of a fleet: its flight level [m], the landing point of its first report, the command of a person
-    (``hold``, ``return``, or none), its latest answers, oldest first, and how its reports came in."""
+    """A UAV of a fleet: its flight level [m], the landing point of its first report, the command of
+    a person (``hold``, ``return``, or none), its latest answers, oldest first, and how its reports
+    came in."""
 
     id: str
     level: float
@@ -233,16 +240,21 @@ class Fleet:
         """UAVs of these IDs, or all, in the order of the fleet."""
         wanted = {*self.uavs} if uavs is None else {*uavs}
         for uav in wanted - {*self.uavs}:
-            raise InputError(f"{key}: {show(uav)} is not a UAV of this fleet: {listed([*self.uavs])}")
+            raise InputError(
+                f"{key}: {show(uav)} is not a UAV of this fleet: {listed([*self.uavs])}"
+            )
         return [each for name, each in self.uavs.items() if name in wanted]
 
     # Time.
 
     def advance(self, now: float) -> None:
-        """Take all steps up to an instant [s], or skip them if they are too many or of before a restart."""
+        """Take all steps up to an instant [s], or skip them if they are too many or of before a
+        restart."""
         self.clock, tracker = max(self.clock, now), self.tracker
         last = tracker.step_of(self.clock) if tracker.has_begun else tracker.step
-        if last > tracker.step and (self.clock < self.computed_from or last > tracker.step + MOST_STEPS):
+        if last > tracker.step and (
+            self.clock < self.computed_from or last > tracker.step + MOST_STEPS
+        ):
             tracker.begin_anew(last)
         while tracker.step < last:
             tracker.next_step()
@@ -250,7 +262,9 @@ class Fleet:
     def _at(self, now: float) -> float:
         """The time of an event: that of the fleet never goes back."""
         if self.tracker.has_begun and now - self.tracker.start > SECONDS:
-            raise InputError(f"time: the fleet began {SECONDS:g} s ago: end it, and begin a new one")
+            raise InputError(
+                f"time: the fleet began {SECONDS:g} s ago: end it, and begin a new one"
+            )
         return max(now, self.clock)
 
     # Requests as events.
@@ -307,8 +321,8 @@ class Fleet:
     def advised(self, said: Asking, now: float) -> Event | None:
         """What UAVs are told that ask; None if that is what they have been told already.
 
-        A UAV that is in danger is told to hold or to return instead; one that has an answer which still
-        holds, or follows one, does not choose.
+        A UAV that is in danger is told to hold or to return instead; one that has an answer which
+        still holds, or follows one, does not choose.
         """
         asked, at = self.members(said.uavs, "uavs"), self._at(now)
         self.advance(at)
@@ -333,7 +347,10 @@ class Fleet:
 
     def _chosen(self, choosing: Sequence[str]) -> dict[str, Decision]:
         """What the policy chooses."""
-        action, mask = self.tracker.ask(choosing), torch.tensor([[uav in choosing for uav in self.uavs]])
+        action, mask = (
+            self.tracker.ask(choosing),
+            torch.tensor([[uav in choosing for uav in self.uavs]]),
+        )
         goal = self.node.simulation.decide(self.tracker.state(choosing), action, mask).goal
         rows = zip(self.uavs.values(), action[0].tolist(), goal[0].tolist(), strict=True)
         return {uav.id: self._decision(uav, *row) for uav, *row in rows if uav.id in choosing}
@@ -341,7 +358,8 @@ class Fleet:
     # Who speaks for a UAV.
 
     def require_lease(self, uav: str, bridge: str, now: float, vehicle: str = "") -> None:
-        """Refuse a bridge while another one speaks for the UAV, or for its vehicle by another name."""
+        """Refuse a bridge while another one speaks for the UAV, or for its vehicle by another
+        name."""
         for fleet in self.others():
             for name, lease in fleet.leases.items():
                 is_same = fleet is self and name == uav
@@ -350,10 +368,16 @@ class Fleet:
                     lease.seen = now
                 elif (is_same or (vehicle and vehicle == lease.vehicle)) and fleet.holds(name, now):
                     one, other = (each[:6] or "without a name" for each in (lease.bridge, bridge))
-                    what = f"UAV {name}" if is_same else f"the vehicle of UAV {name}, here called {uav}"
+                    what = (
+                        f"UAV {name}"
+                        if is_same
+                        else f"the vehicle of UAV {name}, here called {uav}"
+                    )
                     lease.warning = f"bridge {other} has tried to speak for {what}: end it"
                     remedy = "end that one, or wait until it has not been heard"
-                    raise Held(f"bridge: {one} speaks for {what}, not {other}: {remedy} for {LEASE:g} s")
+                    raise Held(
+                        f"bridge: {one} speaks for {what}, not {other}: {remedy} for {LEASE:g} s"
+                    )
 
     def holds(self, uav: str, now: float) -> bool:
         """Whether the bridge that spoke for a UAV last still has it."""
@@ -373,7 +397,8 @@ class Fleet:
     # Events.
 
     def apply(self, event: Event) -> list[str]:
-        """Take an event into account; returns what became of its rows, or to which UAVs it applies."""
+        """Take an event into account; returns what became of its rows, or to which UAVs it
+        applies."""
         self.advance(event["received"])
         if "reports" in event:
             for uav, speaker in event.get("speakers", {}).items():
@@ -381,7 +406,9 @@ class Fleet:
                 if (before := self.leases.get(uav)) and before.bridge == lease.bridge:
                     lease.warning = before.warning
                 self.leases[uav] = lease
-            return [self._report(validated(Report, row), event["received"]) for row in event["reports"]]
+            return [
+                self._report(validated(Report, row), event["received"]) for row in event["reports"]
+            ]
         if "acknowledged" in event:
             return [self._acknowledge(**row) for row in event["acknowledged"]]
         if "told" in event:
@@ -410,10 +437,16 @@ class Fleet:
         late = log.newest is not None and report.time < log.newest.report.time
         sent = None
         if report.flies:
-            told = (each for each in reversed(uav.answers) if each.is_followed and each.time < report.time)
+            told = (
+                each
+                for each in reversed(uav.answers)
+                if each.is_followed and each.time < report.time
+            )
             sent = next(told, None)
         if sent and report.place("target_") is None:
-            for column, value in zip(self.ground.columns, self.ground.place(sent.goal), strict=True):
+            for column, value in zip(
+                self.ground.columns, self.ground.place(sent.goal), strict=True
+            ):
                 setattr(report, f"target_{column}", value)
         filled = self.tracker.add(report, sent and sent.origin)
         if filled is None:
@@ -437,7 +470,9 @@ class Fleet:
 
     def _tell(self, decisions: Sequence[Decision]) -> None:
         if self.tracker.hidden is not None and self.clock >= self.computed_from:
-            self.tracker.ask([each.advice["ID"] for each in decisions])  # they change as when it was asked
+            self.tracker.ask(
+                [each.advice["ID"] for each in decisions]
+            )  # they change as when it was asked
         for decision in decisions:
             uav = self.uavs[decision.advice["ID"]]
             uav.lapse()
@@ -465,8 +500,8 @@ class Fleet:
     def _regroup(self, uavs: list[str], first: Report | None = None) -> None:
         """Go on with other UAVs; ``first`` is the report with which the last one joins.
 
-        The belief, the message history and the past actions begin anew; what is known of the other UAVs, and
-        what they were told, stays.
+        The belief, the message history and the past actions begin anew; what is known of the other
+        UAVs, and what they were told, stays.
         """
         old = self.tracker
         self._take_in(uavs)
@@ -500,29 +535,40 @@ class Fleet:
         return self.tracker.logs[uav.id].reports[-1]
 
     def danger(self, uav: Uav) -> str | None:
-        """Why a UAV must not do what the policy chooses, one of ``REASONS``, or None; the fleet has begun."""
+        """Why a UAV must not do what the policy chooses, one of ``REASONS``, or None; the fleet has
+        begun."""
         order, newest = uav.open_order, self._newest(uav)
         if order is None and self.clock - newest.report.time > self.config.oldest_report:
             return "silent"  # in flight it may be: its goal is safer than a landing where it is
-        if self.config.reserve > 0 and not (newest.battery_known and newest.battery >= self.config.reserve):
+        if self.config.reserve > 0 and not (
+            newest.battery_known and newest.battery >= self.config.reserve
+        ):
             return "battery"
         if self._is_nowhere(uav):
             return "aborted"
-        if newest.report.flies and order is None and newest.step > (uav.order.since if uav.order else -1):
+        if (
+            newest.report.flies
+            and order is None
+            and newest.step > (uav.order.since if uav.order else -1)
+        ):
             return "airborne"
         return {"hold": "held", "return": "returning", "": None}[uav.command]
 
     def _is_nowhere(self, uav: Uav) -> bool:
         """Whether a UAV has aborted a flight, and has not reported since where it is."""
         order = uav.order
-        return order is not None and order.status == ABORTED and self._newest(uav).step <= order.since
+        return (
+            order is not None and order.status == ABORTED and self._newest(uav).step <= order.since
+        )
 
     def _is_busy(self, uav: Uav) -> bool:
         """Whether a UAV has nothing to choose now."""
         offer, number = uav.offer, self.tracker.uavs.index(uav.id)
         if self.tracker.chosen[0, number] or uav.open_order:
             return True
-        if offer is None or (offer.action is None and offer.reason not in ("conflict", "battery", "detour")):
+        if offer is None or (
+            offer.action is None and offer.reason not in ("conflict", "battery", "detour")
+        ):
             return False
         return offer.is_live(self.clock) or offer.step == self.tracker.step
 
@@ -534,7 +580,9 @@ class Fleet:
                 return offer.status not in (REFUSED, ABORTED) and (may_fly or not offer.moves)
             if offer.reason in ("conflict", "detour") and offer.step == self.tracker.step:
                 return True
-        is_bound_home = order is not None and (order.kind == "return" or order.goal == self._home(uav))
+        is_bound_home = order is not None and (
+            order.kind == "return" or order.goal == self._home(uav)
+        )
         return is_bound_home and may_fly and reason in ("battery", "returning")
 
     def _is_outdated(self, uav: Uav, decision: Decision) -> bool:
@@ -545,11 +593,14 @@ class Fleet:
         if newest.time > decision.time and not newest.flies:
             now = replace(decision, start=self.ground.local(newest.place() or (0.0, 0.0)))
         return (
-            self.danger(uav) not in (None, decision.reason) or self._meets(uav, now, {}) or self._bends(now)
+            self.danger(uav) not in (None, decision.reason)
+            or self._meets(uav, now, {})
+            or self._bends(now)
         )
 
     def _start(self, uav: Uav, point: int) -> tuple[float, float]:
-        """Position of a UAV [m]: by its newest report, if it stands at this landing point; or the point."""
+        """Position of a UAV [m]: by its newest report, if it stands at this landing point; or the
+        point."""
         newest = self._newest(uav)
         if newest.point != point or newest.report.flies:
             return tuple(self.ground.points[point].tolist())
@@ -570,13 +621,16 @@ class Fleet:
         return min(free, key=lambda point: self.ground.way(uav.home or 0, point)[0])
 
     def _instead(self, uav: Uav, reason: str) -> Decision:
-        """What a UAV in danger is told: to return if it is sent home or can still get there, else to hold."""
+        """What a UAV in danger is told: to return if it is sent home or can still get there, else
+        to hold."""
         here = goal = self._standing(uav.id, True)
         if reason == "returning":
             goal = self._leads_to(uav, self._home(uav))
         elif reason == "battery" and self.node.scenario.battery.enabled:
             home = self._home(uav)
-            reaches = self._flight(uav, self._start(uav, here), home)[1] <= self._newest(uav).battery
+            reaches = (
+                self._flight(uav, self._start(uav, here), home)[1] <= self._newest(uav).battery
+            )
             stands = not uav.open_order  # in flight nobody knows how far it is
             goal = home if reaches and stands and uav.command != "hold" else here
         return self._decision(uav, None, goal, reason)
@@ -586,13 +640,16 @@ class Fleet:
         origin, step = self._standing(uav.id, True), self.tracker.step
         start, until = self._start(uav, origin), self.clock + self.config.answer_time
         duration = self._flight(uav, start, goal)[0] if goal != origin else 0.0
-        return Decision(step, self.clock, action, origin, goal, start, duration, until, reason, step)
+        return Decision(
+            step, self.clock, action, origin, goal, start, duration, until, reason, step
+        )
 
     def _others(self, uav: Uav) -> list[Uav]:
         return [other for other in self.uavs.values() if other is not uav]
 
     def _flights(self, uav: Uav, found: dict[str, Decision]) -> list[Decision]:
-        """Flights on which a UAV may be, or for which it may set out; ``found`` have not been told yet."""
+        """Flights on which a UAV may be, or for which it may set out; ``found`` have not been told
+        yet."""
         told = filter(None, (uav.open_order, uav.offer, found.get(uav.id)))
         return [each for each in told if each.is_open or (each.moves and each.is_live(self.clock))]
 
@@ -604,10 +661,11 @@ class Fleet:
         return booked | {self._standing(uav.id, False)}
 
     def _meets(self, uav: Uav, decision: Decision, found: dict[str, Decision]) -> bool:
-        """Whether a flight leads to where another UAV may be, or comes near its way at the same level.
+        """Whether a flight leads to where another UAV may be, or comes near its way at the same
+        level.
 
-        A UAV may have to land anywhere on its way: so nobody is sent under the way of another one, nor over
-        where another one may stand or land, whatever their levels are.
+        A UAV may have to land anywhere on its way: so nobody is sent under the way of another one,
+        nor over where another one may stand or land, whatever their levels are.
         """
         way, points = self._path(decision), self.ground.points
         for other in self._others(uav):
@@ -623,7 +681,8 @@ class Fleet:
         return shapely.LineString([decision.start, self.ground.points[decision.goal]])
 
     def _is_clear(self, ways: Any) -> Any:
-        """Whether straight ways stay in the region, and away from its edge, that of its zones included.
+        """Whether straight ways stay in the region, and away from its edge, that of its zones
+        included.
 
         The margin is less where a way begins or ends nearer to the edge.
         """
@@ -635,7 +694,8 @@ class Fleet:
         return shapely.covers(polygon, ways) & (shapely.distance(ways, edge) >= least)
 
     def _bends(self, decision: Decision) -> bool:
-        """Whether the straight way from where a UAV stands is not clear; from outside it may come in."""
+        """Whether the straight way from where a UAV stands is not clear; from outside it may come
+        in."""
         polygon, way = self.ground.region.polygon, self._path(decision)
         if not polygon.covers(shapely.Point(decision.start)):
             within = way.intersection(polygon)
@@ -646,10 +706,13 @@ class Fleet:
 
     @cached_property
     def _hops(self) -> csr_array:
-        """Distances between landing points, not too far apart, whose straight ways are clear [m]."""
+        """Distances between landing points, not too far apart, whose straight ways are clear
+        [m]."""
         points = self.ground.points
         one, other = (
-            KDTree(points).query_pairs(6 * self.node.scenario.region.lattice_step, output_type="ndarray").T
+            KDTree(points)
+            .query_pairs(6 * self.node.scenario.region.lattice_step, output_type="ndarray")
+            .T
         )
         clear = self._is_clear(shapely.linestrings(np.stack([points[one], points[other]], 1)))
         one, other = one[clear], other[clear]
@@ -657,7 +720,8 @@ class Fleet:
         return csr_array((far, (one, other)), shape=(len(points),) * 2)
 
     def _leads_to(self, uav: Uav, goal: int) -> int:
-        """The landing point to which a UAV flies next on the way to a goal, around what is in between."""
+        """The landing point to which a UAV flies next on the way to a goal, around what is in
+        between."""
         here = self._standing(uav.id, True)
         if here == goal or not self._bends(self._decision(uav, None, goal)):
             return goal
@@ -671,7 +735,8 @@ class Fleet:
         return goal
 
     def _cleared(self, found: Sequence[tuple[Uav, Decision]]) -> list[dict[str, Any]]:
-        """Decisions to store, where UAVs hold that would meet others, or whose batteries end too low."""
+        """Decisions to store, where UAVs hold that would meet others, or whose batteries end too
+        low."""
         cleared: dict[str, Decision] = {}
         for number, (uav, decision) in enumerate(found, self.n_answers + 1):
             reason, here = None, decision.origin
@@ -680,7 +745,9 @@ class Fleet:
             elif decision.moves and self._bends(decision):
                 reason = "detour"
             elif decision.kind == "fly" and self.node.scenario.battery.enabled:
-                left = self._newest(uav).battery - self._flight(uav, decision.start, decision.goal)[1]
+                left = (
+                    self._newest(uav).battery - self._flight(uav, decision.start, decision.goal)[1]
+                )
                 reason = "battery" if left < self.config.reserve else None
             told = self._decision(uav, None, here, reason) if reason else decision
             told.advice = self._told(uav, told, f"{self.mark}-{number}".lstrip("-"))
@@ -718,7 +785,10 @@ class Fleet:
             told["altitude"] = uav.level
         if not uav.open_order:  # else nobody knows where it is
             way = self._path(decision)
-            distance, arrival = way.length * decision.moves, written(decision.time + decision.duration)
+            distance, arrival = (
+                way.length * decision.moves,
+                written(decision.time + decision.duration),
+            )
             told |= {
                 "distance": round(distance, 2),
                 "duration": round(decision.duration, 2),

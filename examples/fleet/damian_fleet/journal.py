@@ -43,7 +43,8 @@ class Line(BaseModel):
 
 
 def read_journal(path: Path) -> tuple[Head, list[tuple[str, Line]]]:
-    """The first line of a journal, and the others with their places, but for an unfinished last one."""
+    """The first line of a journal, and the others with their places, but for an unfinished last
+    one."""
     with named(path):
         first, *others = read_text(path).rpartition("\n")[0].split("\n")
         head = validated(Head, parsed_json(first), "line 1")

@@ -1,4 +1,5 @@
-"""What the server node knows of a UAV: its reports in the order in which they were generated, as messages.
+"""What the server node knows of a UAV: its reports in the order in which they were generated, as
+messages.
 
 Places in reports count as the landing points nearest to them.
 """
@@ -25,14 +26,18 @@ from damian_fleet.reports import DEGREES, METRES, Place, Report
 
 
 class Ground:
-    """Landing points of a region, as answers and reports, up to ``reach`` [m] beside them, name places."""
+    """Landing points of a region, as answers and reports, up to ``reach`` [m] beside them, name
+    places."""
 
     def __init__(self, airspace: Airspace, reach: float) -> None:
         self.region, self.reach = airspace.regions[0], reach
         self.columns = METRES if self.region.origin is None else DEGREES
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
-        self.landing_point = lru_cache(10_000)(self._landing_point)  # each place is looked up several times
-        """Number of the landing point nearest to a place; ``InputError`` if it is farther than ``reach``."""
+        self.landing_point = lru_cache(10_000)(
+            self._landing_point
+        )  # each place is looked up several times
+        """Number of the landing point nearest to a place; ``InputError`` if it is farther than
+        ``reach``."""
 
     def local(self, place: Place) -> tuple[float, float]:
         """A place, east and north of the origin of the region [m]."""
@@ -45,7 +50,10 @@ class Ground:
     def _landing_point(self, place: Place) -> int:
         away = np.hypot(*(self.points - self.local(place)).T)
         if away.min() > self.reach:
-            where = f"{', '.join(self.columns)}: {place[0]:.10g}, {place[1]:.10g} is {away.min():.0f} m away"
+            where = (
+                f"{', '.join(self.columns)}: {place[0]:.10g}, {place[1]:.10g} is {away.min():.0f} "
+                "m away"
+            )
             raise InputError(f"{where} from the landing points of {self.region.name}")
         return int(away.argmin())
 
@@ -58,7 +66,8 @@ class Ground:
         return round(float(latitude), 8), round(float(longitude), 8)
 
     def way(self, origin: int, goal: int) -> tuple[float, float]:
-        """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
+        """Distance between two landing points [m] and heading, clockwise from north [deg]; two
+        decimals."""
         east, north = (self.points[goal] - self.points[origin]).tolist()
         heading = math.degrees(math.atan2(east, north)) % 360
         return round(math.hypot(east, north), 2), round(heading, 2)
@@ -92,13 +101,15 @@ class FilledReport:
     motions: int = 0
     """Decisions since its latest detection before."""
     stops: tuple[tuple[int, int], ...] = ()
-    """Its latest landing points, newest first, each with the step of the landing, or -1 if it is unknown."""
+    """Its latest landing points, newest first, each with the step of the landing, or -1 if it is
+    unknown."""
     readings: tuple[float, ...] = ()
     """Readings of sensors of your own."""
 
     @property
     def order(self) -> tuple[float, int]:
-        """When it was generated; of reports of one instant, their numbers tell, and else which came first."""
+        """When it was generated; of reports of one instant, their numbers tell, and else which came
+        first."""
         return self.report.time, self.report.sequence or 0
 
 
@@ -117,11 +128,14 @@ class UavLog:
         return self.reports[-1] if self.reports else None
 
     def check(self, report: Report) -> None:
-        """Require complete places near landing points, the readings of all sensors, and no clock set back."""
+        """Require complete places near landing points, the readings of all sensors, and no clock
+        set back."""
         report.check_places()
         if report.columns != self.ground.columns:
             own = ", ".join(self.ground.columns)
-            raise InputError(f"places in {self.ground.region.name} are {own}: give those of {report.id} so")
+            raise InputError(
+                f"places in {self.ground.region.name} are {own}: give those of {report.id} so"
+            )
         own_places = (report.place(prefix) for prefix in ("", "source_", "target_"))
         for place in (*own_places, *(report.previous or ())):
             if place is not None:
@@ -132,23 +146,32 @@ class UavLog:
         self._check_clock(report)
 
     def _check_clock(self, report: Report) -> None:
-        """Refuse the time of a new report that was generated earlier than the one numbered before it."""
+        """Refuse the time of a new report that was generated earlier than the one numbered before
+        it."""
         own = report.sequence
         if own is None or self.has(report):
             return
         numbered = [(each.report.sequence, each.report.time) for each in self.reports]
-        below = [(number, -time) for number, time in numbered if number is not None and number < own]
+        below = [
+            (number, -time) for number, time in numbered if number is not None and number < own
+        ]
         number, time = max(below, default=(0, math.inf))
         if report.time < -time - AGREE:
-            back = f"{report.time:.13g} s is {-time - report.time:.1f} s before that of number {number}"
+            back = (
+                f"{report.time:.13g} s is {-time - report.time:.1f} s before that of number "
+                f"{number}"
+            )
             raise InputError(f"time: {back}: the clock of {report.id} was set back")
 
     def has(self, report: Report) -> bool:
         """Has this report come in before."""
         return report.identity in self.identities
 
-    def add(self, report: Report, step: int, detected: int | None, origin: int | None = None) -> FilledReport:
-        """Add a report, in its place by the time when it was generated; arguments as of ``FilledReport``."""
+    def add(
+        self, report: Report, step: int, detected: int | None, origin: int | None = None
+    ) -> FilledReport:
+        """Add a report, in its place by the time when it was generated; arguments as of
+        ``FilledReport``."""
         filled = FilledReport(report, step, origin, detected=detected)
         self.identities.add(report.identity)
         at = bisect.bisect_right(self.reports, filled.order, key=lambda each: each.order)
@@ -163,7 +186,9 @@ class UavLog:
         here, target = report.place(), report.place("target_")
         assert here is not None  # every report has it
         took_off = before.point if before and filled.origin is None else filled.origin
-        filled.point = filled.target = took_off if report.flies and took_off is not None else near(here)
+        filled.point = filled.target = (
+            took_off if report.flies and took_off is not None else near(here)
+        )
         if target is not None:
             filled.target = near(target)
         known = before or FilledReport(report, filled.step, readings=(0.0,) * self.n_readings)
@@ -187,7 +212,9 @@ class UavLog:
             filled.motions = report.motions
         filled.stops = self._stops(filled, before)
 
-    def _stops(self, filled: FilledReport, before: FilledReport | None) -> tuple[tuple[int, int], ...]:
+    def _stops(
+        self, filled: FilledReport, before: FilledReport | None
+    ) -> tuple[tuple[int, int], ...]:
         """The latest stops of a UAV, as far as a report and the one before it tell."""
         report, stops = filled.report, list(before.stops) if before else []
         if not stops or stops[0][0] != filled.point:
@@ -200,12 +227,17 @@ class UavLog:
         if report.landed is not None:
             ago = (round((report.time - time) / self.dt) for time in report.landed[: len(stops)])
             landed = [filled.step - n_steps for n_steps in ago]
-            stops[: len(landed)] = [(point, step) for (point, _), step in zip(stops, landed, strict=False)]
+            stops[: len(landed)] = [
+                (point, step) for (point, _), step in zip(stops, landed, strict=False)
+            ]
         return tuple([*stops, *[(stops[-1][0], -1)] * self.n_stops][: self.n_stops])
 
 
-def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float) -> Messages:
-    """Messages [n] as the simulation would send them; landing points are [L, 2] and steps ``dt`` long [s]."""
+def messages_of(
+    reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float
+) -> Messages:
+    """Messages [n] as the simulation would send them; landing points are [L, 2] and steps ``dt``
+    long [s]."""
     steps = torch.tensor([each.step for each in reports])
     detected = torch.tensor([-1 if each.detected is None else each.detected for each in reports])
     battery = torch.tensor([each.battery for each in reports])

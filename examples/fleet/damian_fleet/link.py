@@ -4,8 +4,9 @@ For now, it is for simulation and supervised trials only.
 
     damian-mavlink --fleet north --vehicle A=udpin:127.0.0.1:14551 --vehicle B=udpin:127.0.0.1:14552
 
-A thread for each vehicle hands what comes in to its ``Bridge`` and sends what that returns; another one makes
-its requests, so that a slow service stops nothing. What must outlive a restart lies in ``--memory``.
+A thread for each vehicle hands what comes in to its ``Bridge`` and sends what that returns; another
+one makes its requests, so that a slow service stops nothing. What must outlive a restart lies in
+``--memory``.
 """
 
 import argparse
@@ -40,10 +41,13 @@ _LOG = logging.getLogger("damian_mavlink")
 
 
 def ask(url: str, token: str, request: Request) -> Answer:
-    """The answer of a service; without status if there is none, without content if that is no JSON."""
+    """The answer of a service; without status if there is none, without content if that is no
+    JSON."""
     data = None if request.body is None else json.dumps(request.body).encode()
     headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
-    made = urllib.request.Request(url.rstrip("/") + request.path, data, headers, method=request.method)
+    made = urllib.request.Request(
+        url.rstrip("/") + request.path, data, headers, method=request.method
+    )
     status = content = None
     with contextlib.suppress(Exception):  # whatever a proxy or a broken line sends
         try:
@@ -56,7 +60,9 @@ def ask(url: str, token: str, request: Request) -> Answer:
     return Answer(status, content, request.number)
 
 
-def requester(url: str, token: str, asked: "queue.Queue[Request]", answers: "queue.Queue[Answer]") -> None:
+def requester(
+    url: str, token: str, asked: "queue.Queue[Request]", answers: "queue.Queue[Answer]"
+) -> None:
     """Make the requests of a bridge, the newest if several wait: the others have been given up."""
     while True:
         request = asked.get()
@@ -66,7 +72,8 @@ def requester(url: str, token: str, asked: "queue.Queue[Request]", answers: "que
 
 
 def serve(bridge: Bridge, address: str, url: str, token: str, memory: Path) -> None:
-    """Let a bridge work until it has left its fleet; an error of ours is logged, and ends no flight."""
+    """Let a bridge work until it has left its fleet; an error of ours is logged, and ends no
+    flight."""
     link = mavutil.mavlink_connection(address, *STATION, autoreconnect=True)
     asked: queue.Queue[Request] = queue.Queue()
     answers: queue.Queue[Answer] = queue.Queue()
@@ -124,7 +131,9 @@ def memory_of(path: Path) -> tuple[Memory | None, Any]:
         lock.close()
         raise ValueError(f"{path}: another bridge works with this memory: end that one") from None
     try:
-        return Memory.model_validate_json(path.read_text(encoding="utf-8")) if path.exists() else None, lock
+        return Memory.model_validate_json(
+            path.read_text(encoding="utf-8")
+        ) if path.exists() else None, lock
     except ValueError as error:
         lock.close()
         problem = "it is not the memory of a bridge; remove it to begin anew"
@@ -132,14 +141,19 @@ def memory_of(path: Path) -> tuple[Memory | None, Any]:
 
 
 def main() -> None:
-    """Bridge each vehicle until all have left; Ctrl-C lets them land and leave, a second one ends at once."""
+    """Bridge each vehicle until all have left; Ctrl-C lets them land and leave, a second one ends
+    at once."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--service", default="http://127.0.0.1:8000")
-    parser.add_argument("--token", default=os.environ.get("DAMIAN_TOKEN", ""), help="or DAMIAN_TOKEN")
+    parser.add_argument(
+        "--token", default=os.environ.get("DAMIAN_TOKEN", ""), help="or DAMIAN_TOKEN"
+    )
     parser.add_argument("--fleet", required=True)
     each = "ID=CONNECTION or ID=CONNECTION#SYSTEM, for each UAV"
     parser.add_argument("--vehicle", action="append", required=True, help=each)
-    parser.add_argument("--listen", type=float, default=0.0, help="before it reports, after landing [s]")
+    parser.add_argument(
+        "--listen", type=float, default=0.0, help="before it reports, after landing [s]"
+    )
     parser.add_argument(
         "--memory", type=Path, default=Path("mavlink"), help="what outlives a restart: a folder"
     )

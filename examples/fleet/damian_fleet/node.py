@@ -1,7 +1,8 @@
-"""The server node of a fleet whose messages are reported from outside, instead of sent by a simulation.
+"""The server node of a fleet whose messages are reported from outside, instead of sent by a
+simulation.
 
-It takes steps as an environment does. So a policy observes the same, bit for bit, as in the simulation, if
-the same messages arrive at the same steps.
+It takes steps as an environment does. So a policy observes the same, bit for bit, as in the
+simulation, if the same messages arrive at the same steps.
 """
 
 from dataclasses import replace
@@ -28,7 +29,8 @@ from damian.world.state import PackedState, State
 from damian_fleet.known import Ground
 
 REMEMBERED_STEPS = 32
-"""Steps that the belief looks back at least: real messages may be later than those of the training."""
+"""Steps that the belief looks back at least: real messages may be later than those of the
+training."""
 
 Memories = list[dict[str, Tensor]]
 """The memory of each transform, in order."""
@@ -49,7 +51,8 @@ class Reported(NamedTuple):
     """What the server node of N UAVs learns in a step."""
 
     state: State
-    """The world as far as it is known, [1, N]; its ``sent`` are the messages that the server holds."""
+    """The world as far as it is known, [1, N]; its ``sent`` are the messages that the server
+    holds."""
     age: Tensor
     """Age of these messages [steps], [N]."""
     on_time: Tensor
@@ -62,10 +65,15 @@ class ReportedEnv(UavEnv):
     """A single world that is known only by its messages; ``Node`` takes its steps."""
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
-        told = {"source.count": scenario.source.count == 1, "requests.rate": not scenario.requests.slots}
+        told = {
+            "source.count": scenario.source.count == 1,
+            "requests.rate": not scenario.requests.slots,
+        }
         for key, is_told in told.items():
             if not is_told:
-                raise InputError(f"{key}: it is not told by reports, which know one source and no requests")
+                raise InputError(
+                    f"{key}: it is not told by reports, which know one source and no requests"
+                )
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
         super().__init__(scenario, 1, seed, extras=extras, messages_only=True)
 
@@ -75,18 +83,23 @@ class ReportedEnv(UavEnv):
         age = torch.zeros_like(message[..., :1])
         return outputs | {keys.RECEIVED: message.clone(), keys.AGE: age, keys.DELAY: age.long()}
 
-    def step_fn(self, worlds: Any, action: Tensor, valid: Tensor | None = None) -> tuple[Any, Outputs]:
-        """The outputs after a step, of what is ``Reported`` instead of the worlds of a simulation."""
+    def step_fn(
+        self, worlds: Any, action: Tensor, valid: Tensor | None = None
+    ) -> tuple[Any, Outputs]:
+        """The outputs after a step, of what is ``Reported`` instead of the worlds of a
+        simulation."""
         return worlds, self.outputs_of(worlds)
 
     def reset_fn(self, worlds: Any, mask: Tensor) -> tuple[Any, Outputs]:
-        """The outputs of the step that begins an episode; of worlds, before there are any reports."""
+        """The outputs of the step that begins an episode; of worlds, before there are any
+        reports."""
         if isinstance(worlds, PackedState):
             return super().reset_fn(worlds, mask)
         return worlds, self.outputs_of(worlds, first=True)
 
     def outputs_of(self, reported: Reported, first: bool = False) -> Outputs:
-        """The outputs of a step, before any transform; ``first``: of the step that begins an episode."""
+        """The outputs of a step, before any transform; ``first``: of the step that begins an
+        episode."""
         state, on_time = reported.state, reported.on_time.unsqueeze(0)
         held = state.sent.pack()
         if first:
@@ -104,7 +117,8 @@ class ReportedEnv(UavEnv):
 
 
 class Node:
-    """The server node of a fleet; several may share it, because memories are arguments and results."""
+    """The server node of a fleet; several may share it, because memories are arguments and
+    results."""
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         scenario = scenario_of_reports(scenario)
@@ -129,9 +143,12 @@ class Node:
 
     @torch.no_grad()
     def begin(self, reported: Reported) -> tuple[Memories, TensorDictBase]:
-        """Memories and outputs of the first step, of any number, when every UAV has sent a message."""
+        """Memories and outputs of the first step, of any number, when every UAV has sent a
+        message."""
         everywhere = torch.ones(1, dtype=torch.bool)
-        _, memories, outputs = self.env.reset_fn(cast(Any, reported), _copies(self._unused), everywhere)
+        _, memories, outputs = self.env.reset_fn(
+            cast(Any, reported), _copies(self._unused), everywhere
+        )
         for transform, memory in zip(self.transforms, memories, strict=True):
             if isinstance(transform, ServerNode):
                 memory["elapsed"] = reported.state.steps.clone()
@@ -141,7 +158,8 @@ class Node:
     def step(
         self, memories: Memories, reported: Reported, action: Tensor, chosen: Tensor
     ) -> tuple[Memories, TensorDictBase]:
-        """Memories and outputs after actions [1, N, ...] that the ``chosen`` UAVs took in the step before."""
+        """Memories and outputs after actions [1, N, ...] that the ``chosen`` UAVs took in the step
+        before."""
         memories = _copies(memories)
         for i, transform in enumerate(self.transforms):
             for late in reported.late:
@@ -168,8 +186,13 @@ def note_late(
     if isinstance(transform, Belief) and lag <= transform.longest:
         messages = transform.server.messages(message.view(1, 1, -1))
         slot = (memory["slot"] + 1 - lag) % len(memory["report"])
-        source, level = torch.arange(len(slot), device=slot.device), transform.server.level(messages)
-        memory["report"][slot, agent, source] = report_rows(transform.grid, messages, level).view(-1)
+        source, level = (
+            torch.arange(len(slot), device=slot.device),
+            transform.server.level(messages),
+        )
+        memory["report"][slot, agent, source] = report_rows(transform.grid, messages, level).view(
+            -1
+        )
         memory["delay"][slot, agent] = lag
     return memory
 
@@ -177,7 +200,9 @@ def note_late(
 def scenario_of_reports(scenario: ScenarioConfig) -> ScenarioConfig:
     """The scenario as reports tell it: own messages are known as late as others."""
     if scenario.links.kind != "server":
-        problem = "is not server: reports are what the server node knows, not what links bring to a UAV"
+        problem = (
+            "is not server: reports are what the server node knows, not what links bring to a UAV"
+        )
         raise InputError(f"links: {scenario.links.kind} {problem}")
     return replace(scenario, observation=replace(scenario.observation, own=False))
 

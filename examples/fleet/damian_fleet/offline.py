@@ -1,10 +1,11 @@
-"""Two programs without a service: one answer to a table of reports, and the flight that a journal tells.
+"""Two programs without a service: one answer to a table of reports, and the flight that a journal
+tells.
 
 damian-advise checkpoint=runs/FOLDER table=reports.csv instant=true
 damian-playback region=llanbedr journal=north.jsonl "formats=[html,geojson]" folder=north
 
-Words that are no settings of the program are those of damian train, which choose the scenario (such as
-region=llanbedr), or change that of the checkpoint.
+Words that are no settings of the program are those of damian train, which choose the scenario
+(such as region=llanbedr), or change that of the checkpoint.
 """
 
 import sys
@@ -37,11 +38,17 @@ class OfflineConfig(Settings):
     """Where the scenario and the policy come from."""
 
     checkpoint: str | None = setting(
-        None, "Run folder, its best.pt, or damian:NAME: the policy and its scenario; the script if not given."
+        None,
+        "Run folder, its best.pt, or damian:NAME: the policy and its scenario; the script if not "
+        "given.",
     )
-    instant: bool = setting(False, "Whether a policy may advise whose UAVs were at their targets at once.")
+    instant: bool = setting(
+        False, "Whether a policy may advise whose UAVs were at their targets at once."
+    )
     seed: int = setting(0, "Seed of random regions, and of sampled actions.", low=0)
-    trust: bool = setting(False, "Import the components package.module:Name that the checkpoint's run names.")
+    trust: bool = setting(
+        False, "Import the components package.module:Name that the checkpoint's run names."
+    )
 
 
 @dataclass
@@ -49,7 +56,9 @@ class AdviceConfig(OfflineConfig):
     """The settings of damian-advise."""
 
     table: str = setting("", "Table of reports, CSV or JSON: where should each UAV land next?")
-    sampled: bool = setting(False, "Draw the actions of the policy, instead of taking the likeliest ones.")
+    sampled: bool = setting(
+        False, "Draw the actions of the policy, instead of taking the likeliest ones."
+    )
     answer: str = setting("advice.csv", "File for the answer, which is printed too.")
 
 
@@ -62,8 +71,12 @@ class PlaybackConfig(OfflineConfig):
     formats: list[str] = setting(
         ["html"], "What to make of each.", choices=("gif", "mp4", "png", "html", "geojson")
     )
-    views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
-    shown: list[str] = setting([], "IDs of UAVs that films tell apart; if none, all of up to 6, 3 of more.")
+    views: list[str] = setting(
+        ["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d")
+    )
+    shown: list[str] = setting(
+        [], "IDs of UAVs that films tell apart; if none, all of up to 6, 3 of more."
+    )
 
 
 def answer_table(config: AdviceConfig, words: Sequence[str]) -> None:
@@ -110,8 +123,11 @@ def playback() -> None:
     _run(play_back, PlaybackConfig, "journal")
 
 
-def _run(work: Callable[[Any, Sequence[str]], None], kind: type[OfflineConfig], needed: str) -> None:
-    """Do the work of a program with the settings of the command line; wrong ones end it with one line."""
+def _run(
+    work: Callable[[Any, Sequence[str]], None], kind: type[OfflineConfig], needed: str
+) -> None:
+    """Do the work of a program with the settings of the command line; wrong ones end it with one
+    line."""
     given, known, own, words = sys.argv[1:], rules(kind), dict[str, Any](), list[str]()
     if {"-h", "--help"} & {*given}:
         settings = (f"  {name}: {rule.meaning}" for name, rule in known.items())

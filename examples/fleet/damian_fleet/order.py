@@ -1,8 +1,9 @@
 """How late the messages of a vehicle are, by its own clock and count, whatever way they took.
 
-Some messages tell the time since the boot of the vehicle; the others are placed between those by the number
-that each message has, which begins again after 255. A late message is no restart: that is told by the answer
-to a request of the time (TIMESYNC), which is behind what was heard before the request was made.
+Some messages tell the time since the boot of the vehicle; the others are placed between those by
+the number that each message has, which begins again after 255. A late message is no restart: that
+is told by the answer to a request of the time (TIMESYNC), which is behind what was heard before the
+request was made.
 """
 
 import bisect
@@ -29,15 +30,21 @@ class Order:
     def _begin(self) -> None:
         self._times: list[float] = []  # of messages with a time, ascending ...
         self._numbers: list[int] = []  # ... and their numbers, counted on beyond 255
-        self._newest: dict[Any, tuple[float, float]] = {}  # by kind: time or number of it, when it came
+        self._newest: dict[
+            Any, tuple[float, float]
+        ] = {}  # by kind: time or number of it, when it came
         self._number = 0  # of the newest message
         self._rate = math.nan  # messages in a second
-        self._upper, self._lower = math.inf, -math.inf  # of how far our clock is ahead of the vehicle's
+        self._upper, self._lower = (
+            math.inf,
+            -math.inf,
+        )  # of how far our clock is ahead of the vehicle's
         self._bounded_at = self._mixed_until = -math.inf
 
     @property
     def _ahead(self) -> float:
-        """How far our clock is ahead of that of the vehicle at least, so that nothing seems too new."""
+        """How far our clock is ahead of that of the vehicle at least, so that nothing seems too
+        new."""
         return self._upper if self._lower == -math.inf else min(self._lower, self._upper)
 
     def ask_time(self, now: float) -> int:
@@ -59,7 +66,8 @@ class Order:
         self._lower = max(self._lower, asked - vehicle)
 
     def lateness(self, kind: Any, message: Any, now: float) -> float | None:
-        """How long a message was on its way; None if it, or a newer one of its kind, has come before."""
+        """How long a message was on its way; None if it, or a newer one of its kind, has come
+        before."""
         drift = _DRIFT * max(now - self._bounded_at, 0.0) if self._bounded_at > -math.inf else 0.0
         self._upper, self._lower, self._bounded_at = self._upper + drift, self._lower - drift, now
         boot, number = getattr(message, "time_boot_ms", None), message.get_seq()
@@ -77,7 +85,9 @@ class Order:
         self._newest[kind] = place, now
         late = max(now - self._ahead - sent, 0.0) if self._times else 0.0
         if boot is not None and late > 256 / self._rate - 1.0:
-            self._mixed_until = now + LATEST  # messages come so late that their count has begun again
+            self._mixed_until = (
+                now + LATEST
+            )  # messages come so late that their count has begun again
         return late
 
     def _clock(self, boot: float, number: int, now: float) -> bool:
@@ -105,9 +115,12 @@ class Order:
         return True
 
     def _place(self, number: int, now: float) -> tuple[float, float]:
-        """The number of a message without a time, counted on, and when it was sent by the vehicle's clock."""
+        """The number of a message without a time, counted on, and when it was sent by the vehicle's
+        clock."""
         vehicle = now - self._ahead
-        if math.isnan(self._rate) or vehicle > self._times[-1] + LATEST:  # nothing tells but the count
+        if (
+            math.isnan(self._rate) or vehicle > self._times[-1] + LATEST
+        ):  # nothing tells but the count
             place = self._number + (number - self._number + 128) % 256 - 128
             self._number = max(self._number, place)
             return place, vehicle
@@ -122,5 +135,8 @@ class Order:
             return place, self._times[-1] + (place - self._numbers[-1]) / self._rate
         if after == 0:
             return place, self._times[0] + (place - self._numbers[0]) / self._rate
-        (one, other), (t, u) = self._numbers[after - 1 : after + 1], self._times[after - 1 : after + 1]
+        (one, other), (t, u) = (
+            self._numbers[after - 1 : after + 1],
+            self._times[after - 1 : after + 1],
+        )
         return place, t + (u - t) * (place - one) / max(other - one, 1)

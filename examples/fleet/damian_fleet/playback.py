@@ -1,7 +1,8 @@
 """The flight that a journal tells, as episodes, from which films, pages and GeoJSON are made.
 
 The server node takes the steps of the journal again. Positions are those that the UAVs reported, in
-hindsight, and between two reports on the straight way to the later one. Nobody knows where the source was.
+hindsight, and between two reports on the straight way to the later one. Nobody knows where the
+source was.
 """
 
 import math
@@ -29,12 +30,14 @@ from damian_fleet.reports import Place, Report, Rows, written
 from damian_fleet.tracker import Tracker
 
 
-def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, Any]) -> list[Episode]:
-    """The flight of a journal as episodes; ``source`` and ``emits`` are None if the task has one or a UAV
-    has spotted one.
+def episodes_of(
+    path: Path, node_of: Callable[[int], Node], about: Mapping[str, Any]
+) -> list[Episode]:
+    """The flight of a journal as episodes; ``source`` and ``emits`` are None if the task has one or
+    a UAV has spotted one.
 
-    An episode begins when all UAVs of the fleet have reported; when UAVs join or leave, another one does.
-    ``node_of`` gives a node for a number of UAVs, which writes the terms of the reward.
+    An episode begins when all UAVs of the fleet have reported; when UAVs join or leave, another one
+    does. ``node_of`` gives a node for a number of UAVs, which writes the terms of the reward.
     """
     head, lines = read_journal(path)
     rows = [(where, report) for where, line in lines for report in line.reports]
@@ -53,7 +56,9 @@ def episodes_of(path: Path, node_of: Callable[[int], Node], about: Mapping[str, 
             continue  # not every UAV has reported
         tracker = Tracker(node_of(len(uavs)), uavs, rows)
         steps = range(tracker.first_step, tracker.step_of(part[-1][1].time) + 1)
-        episodes.append(_episode(tracker, rows, fitted, steps, {**told, **about, "fleet": head.fleet}))
+        episodes.append(
+            _episode(tracker, rows, fitted, steps, {**told, **about, "fleet": head.fleet})
+        )
     if not episodes:
         raise InputError(problem)
     return episodes
@@ -73,7 +78,11 @@ def _parts(
 
 
 def _episode(
-    tracker: Tracker, rows: Rows, fitted: pd.DataFrame, steps: Sequence[int], about: Mapping[str, Any]
+    tracker: Tracker,
+    rows: Rows,
+    fitted: pd.DataFrame,
+    steps: Sequence[int],
+    about: Mapping[str, Any],
 ) -> Episode:
     """The flight of these steps; ``fitted`` has its messages, as of ``fit``."""
     node, numbers, known = tracker.node, np.array(steps), list[Any]()
@@ -101,7 +110,8 @@ def _episode(
 def _hindsight(
     tracker: Tracker, reports: Sequence[Report], steps: NDArray[np.int64]
 ) -> dict[str, NDArray[Any]]:
-    """Columns of a UAV that follow from its reports by the time when they were generated, [S, ...]."""
+    """Columns of a UAV that follow from its reports by the time when they were generated,
+    [S, ...]."""
     ground, rows = tracker.node.ground, []
     for report in reports:
         target = report.place("target_")
@@ -120,7 +130,9 @@ def _hindsight(
         )
     place, goal = ["east", "north", "up"], ["to_east", "to_north"]
     names = ["step", "time", *place, *goal, "battery", "track", "spotted", "flies"]
-    table = pd.DataFrame(rows, columns=names).sort_values("time").drop_duplicates("step", keep="last")
+    table = (
+        pd.DataFrame(rows, columns=names).sort_values("time").drop_duplicates("step", keep="last")
+    )
     table = table.set_index("step")
     position = np.stack([np.interp(steps, table.index, table[axis]) for axis in place], -1)
     stands = table[place[:2]].set_axis(goal, axis=1)
@@ -140,7 +152,8 @@ def _hindsight(
 def _messages(
     tracker: Tracker, fitted: pd.DataFrame, steps: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N] each."""
+    """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N]
+    each."""
     sent, number = (
         np.zeros((len(steps), len(tracker.uavs)), bool),
         {uav: i for i, uav in enumerate(tracker.uavs)},
@@ -151,7 +164,9 @@ def _messages(
     for uav, time, received in found[["uav", "time", "received"]].itertuples(index=False):
         step = tracker.step_of(time) - steps[0]
         if 0 < step < len(steps):
-            lag = -1 if math.isnan(received) else max(tracker.step_of(received) - steps[0] - step, 0)
+            lag = (
+                -1 if math.isnan(received) else max(tracker.step_of(received) - steps[0] - step, 0)
+            )
             at = step, number[uav]
             sent[at], delay[at] = True, lag
     return sent, delay

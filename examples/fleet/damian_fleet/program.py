@@ -1,7 +1,8 @@
-"""The service for fleets of real UAVs: damian-fleet checkpoint=runs/first port=8000 database=fleets.db
+"""The service for fleets of real UAVs: damian-fleet checkpoint=runs/first port=8000
+database=fleets.db
 
-Words that are no settings of the service are those of damian train, which choose the scenario (such as
-region=llanbedr), or change that of the checkpoint.
+Words that are no settings of the service are those of damian train, which choose the scenario
+(such as region=llanbedr), or change that of the checkpoint.
 """
 
 import gc
@@ -31,7 +32,8 @@ from damian_fleet.store import Fleets
 
 LIMITS = {"backlog": 64, "limit_concurrency": 500 + MOST_STRANGERS}
 LIMITS |= {"timeout_keep_alive": 30, "timeout_graceful_shutdown": 2}
-"""Connections that wait, and those that are served at a time (others are answered 503); times [s]."""
+"""Connections that wait, and those that are served at a time (others are answered 503); times
+[s]."""
 
 
 def config_of(words: Sequence[str]) -> tuple[FleetConfig, list[str]]:
@@ -47,7 +49,9 @@ def config_of(words: Sequence[str]) -> tuple[FleetConfig, list[str]]:
     return FleetConfig(**own), others
 
 
-def make_parts(config: FleetConfig, words: Sequence[str]) -> Callable[[int], tuple[Node, torch.nn.Module]]:
+def make_parts(
+    config: FleetConfig, words: Sequence[str]
+) -> Callable[[int], tuple[Node, torch.nn.Module]]:
     """The node and the policy for a number of UAVs."""
     loaded = None
     if config.checkpoint is None:
@@ -58,17 +62,24 @@ def make_parts(config: FleetConfig, words: Sequence[str]) -> Callable[[int], tup
         trained = damian.load(config.checkpoint, trust=config.trust)
         instant = any(each.env.uav_env.simulation.vehicles.instant for each in (trained, loaded))
         if instant and not config.instant:
-            problem = "the policy's UAVs were at their targets at once: train one with motion=polynomial"
+            problem = (
+                "the policy's UAVs were at their targets at once: train one with motion=polynomial"
+            )
             raise InputError(f"motion: instant: {problem}, or give instant=true to have it served")
         if loaded.env.uav_env.scenario.observation.own:
-            print("note: the policy knew its own messages at once; the service knows them when they arrive")
+            print(
+                "note: the policy knew its own messages at once; the service knows them when they "
+                "arrive"
+            )
 
     @cache
     def parts(n_uavs: int) -> tuple[Node, torch.nn.Module]:
         node = Node(for_uavs(scenario, n_uavs), config.seed)
         if loaded is None:
             return node, script_policy(node.env)
-        widths = [env.observation_spec[keys.OBSERVATION].shape[-1] for env in (node.env, loaded.env)]
+        widths = [
+            env.observation_spec[keys.OBSERVATION].shape[-1] for env in (node.env, loaded.env)
+        ]
         if widths[0] != widths[1]:
             raise InputError(
                 f"uavs: the policy observes the distances of {scenario.agents} UAVs, not {n_uavs}"
@@ -108,11 +119,18 @@ def main() -> None:
         except (OSError, UnicodeError) as error:
             raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
         with listener, closing(make_fleets(config, words)) as fleets:
-            no_delay = socket.IPPROTO_TCP, socket.TCP_NODELAY, 1  # or an answer in two parts takes 40 ms
+            no_delay = (
+                socket.IPPROTO_TCP,
+                socket.TCP_NODELAY,
+                1,
+            )  # or an answer in two parts takes 40 ms
             listener.setsockopt(*no_delay)
             print(*[f"token: {config.token}\n"] * config.is_made, end="")
             print("listening on http://{}:{}".format(*listener.getsockname()[:2]), flush=True)
-            app, quiet = make_app(fleets, str(config.token)), {"log_level": "warning", "access_log": False}
+            app, quiet = (
+                make_app(fleets, str(config.token)),
+                {"log_level": "warning", "access_log": False},
+            )
             gc.collect()
             gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
             served = uvicorn.Config(app, http=door(str(config.token)), ws="none", **quiet, **LIMITS)

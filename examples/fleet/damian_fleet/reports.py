@@ -1,7 +1,7 @@
 """Rows of tables as pydantic models: reports that come in, as CSV and JSON.
 
-Columns of a report may be written in any case, and with ``_`` for a space. ``NA``, an empty cell and null
-mean that the value is not known.
+Columns of a report may be written in any case, and with ``_`` for a space. ``NA``, an empty cell
+and null mean that the value is not known.
 """
 
 import math
@@ -26,7 +26,8 @@ from damian.common.text_files import parse_table, read_text, show
 from damian.delays.logs import LATEST, UNKNOWN, column_of, seconds_of
 
 DEGREES, METRES = ("lat", "lon"), ("x", "y")
-"""Columns of a place: latitude and longitude [deg], or over a region without a place on Earth x and y [m]."""
+"""Columns of a place: latitude and longitude [deg], or over a region without a place on Earth x and
+y [m]."""
 Place = tuple[float, float]
 """A place in the columns that its row has."""
 
@@ -52,7 +53,9 @@ def _below(limit: float, problem: str) -> BeforeValidator:
 
 
 def _text_split_at(separator: str | None) -> BeforeValidator:
-    return BeforeValidator(lambda value: value.split(separator) if isinstance(value, str) else value)
+    return BeforeValidator(
+        lambda value: value.split(separator) if isinstance(value, str) else value
+    )
 
 
 _listed = BeforeValidator(lambda value: [value] if isinstance(value, int | float) else value)
@@ -84,7 +87,8 @@ Time: TypeAlias = Annotated[float, Field(ge=0, le=LATEST), _dated, _of_a_clock]
 """A time [s], as a number or as ISO 8601."""
 Count: TypeAlias = Annotated[int, Field(ge=0, le=2**31)]
 Flag: TypeAlias = Annotated[
-    bool, BeforeValidator(lambda value: value.removesuffix(".0") if isinstance(value, str) else value)
+    bool,
+    BeforeValidator(lambda value: value.removesuffix(".0") if isinstance(value, str) else value),
 ]
 """True or false; a table of numbers in which a cell is empty has 1.0 for 1."""
 _degrees = _below(1e5, "give degrees, not degrees times 10^7, as MAVLink and ulog have them")
@@ -93,7 +97,8 @@ Longitude: TypeAlias = Annotated[Number, Field(ge=-180, le=180), _degrees]
 Coordinate: TypeAlias = Annotated[Number, Field(ge=-2e7, le=2e7)]
 Pair: TypeAlias = Annotated[tuple[Coordinate, Coordinate], _text_split_at(None)]
 UavId: TypeAlias = Annotated[str, Field(pattern=r"^\w[\w .:/-]{0,63}$")]
-"""ID of a UAV; it begins with a letter, digit or ``_``, so that no spreadsheet takes it for a formula."""
+"""ID of a UAV; it begins with a letter, digit or ``_``, so that no spreadsheet takes it for a
+formula."""
 
 
 class Row(BaseModel):
@@ -115,7 +120,9 @@ class Row(BaseModel):
         """A row by its columns, without unknown values."""
         if not isinstance(row, Mapping):
             return row
-        known = {name: cell for name, cell in row.items() if str(cell).strip().lower() not in UNKNOWN}
+        known = {
+            name: cell for name, cell in row.items() if str(cell).strip().lower() not in UNKNOWN
+        }
         return {column_of(str(name)): cell for name, cell in known.items()}
 
 
@@ -160,11 +167,15 @@ class Report(Row):
     target_y: Coordinate | None = None
     previous: Annotated[tuple[Pair, ...], Field(max_length=16), _text_split_at(";")] | None = None
     """Landing points where it was before, newest first: [[53.1, -4.5]], or 53.1 -4.5; 53.2 -4.5."""
-    landed: Annotated[tuple[Time, ...], Field(max_length=17), _text_split_at(";"), _listed] | None = None
+    landed: (
+        Annotated[tuple[Time, ...], Field(max_length=17), _text_split_at(";"), _listed] | None
+    ) = None
     """Times at which it landed, or held, where it is and at the places of ``previous`` [s]."""
     motions: Count | None = None
     """Decisions (holding included) since it last detected the source before."""
-    readings: Annotated[tuple[Number, ...], Field(max_length=1000), _text_split_at(";")] | None = None
+    readings: Annotated[tuple[Number, ...], Field(max_length=1000), _text_split_at(";")] | None = (
+        None
+    )
     """Readings of sensors of your own."""
     sequence: Count | None = Field(None, validation_alias=AliasChoices("sequence", "number"))
     """Number of the report, which grows by one."""
@@ -183,21 +194,26 @@ class Report(Row):
 
     @property
     def identity(self) -> Hashable:
-        """Two reports with equal identities are one: its number and time, or else its whole content."""
+        """Two reports with equal identities are one: its number and time, or else its whole
+        content."""
         if self.sequence is not None:
             return self.sequence, self.time if "time" in self.model_fields_set else None
         return self.model_dump_json(exclude_none=True)
 
     def place(self, prefix: str = "") -> Place | None:
-        """Where the UAV is; ``source_``: where it detected the source; ``target_``: where it flies."""
+        """Where the UAV is; ``source_``: where it detected the source; ``target_``: where it
+        flies."""
         first, second = (getattr(self, prefix + name) for name in self.columns)
         return None if first is None else (first, second)
 
     def stamp(self, now: float, file: bool = False) -> None:
-        """Set the times that the report leaves open; only one from a ``file`` may say when it came in."""
+        """Set the times that the report leaves open; only one from a ``file`` may say when it came
+        in."""
         said = self.model_fields_set
         if "received" in said and not file:
-            raise InputError("receive time: only a table has it; the service looks at its own clock")
+            raise InputError(
+                "receive time: only a table has it; the service looks at its own clock"
+            )
         if "received" not in said:
             self.received = self.time + self.aoi if file and "time" in said else now
         if "time" not in said:
@@ -211,9 +227,13 @@ class Report(Row):
         pairs = [{f"{prefix}{name}" in said for name in self.columns} for prefix in prefixes]
         mixed = any(f"{prefix}{name}" in said for prefix in prefixes for name in others)
         if mixed or pairs[0] != {True} or any(len(pair) > 1 for pair in pairs):
-            raise InputError("places are pairs lat, lon [deg], or all of them x, y [m]; the UAV's is needed")
+            raise InputError(
+                "places are pairs lat, lon [deg], or all of them x, y [m]; the UAV's is needed"
+            )
         if True in pairs[1] and self.source_time is None and not self.source_spotted:
-            raise InputError("source time: it is missing: when the source was detected at this place [s]")
+            raise InputError(
+                "source time: it is missing: when the source was detected at this place [s]"
+            )
 
 
 Found = list[tuple[str, Any]]
@@ -235,7 +255,9 @@ def rows_of_csv(text: str) -> Found:
 def rows_of_json(text: str | bytes) -> Found:
     """Rows of JSON, an object or a list of objects, of any kind."""
     found = parsed_json(text)
-    return [(f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)]
+    return [
+        (f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)
+    ]
 
 
 def reports_of(found: Found) -> Rows:
@@ -277,4 +299,6 @@ def written(time: float) -> float | str:
     """A time: as a date (ISO 8601, UTC), or in seconds if it does not count from 1970."""
     if time < CALENDAR:
         return round(time, 3)
-    return datetime.fromtimestamp(time, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return (
+        datetime.fromtimestamp(time, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    )

@@ -46,11 +46,12 @@ class Place(BaseModel):
 class Advice(Place):
     """What a UAV was told; all but ``state`` and ``age`` stays the same for one ID ``answer``.
 
-    ``state`` is ``fly``, ``hold`` or ``return`` for an answer that waits for acceptance, ``bound`` for one
-    that the UAV follows, and ``none`` if there is none; ``reason`` says why the policy was not followed. The
-    place is the landing point, ``altitude`` the flight level above the takeoff point [m], ``speed`` that of
-    the cruise [m/s], ``heading`` clockwise from north [deg], ``distance`` [m] and ``duration`` [s] those of
-    the flight, ``until`` when it must be accepted by, ``age`` that of the newest report [s].
+    ``state`` is ``fly``, ``hold`` or ``return`` for an answer that waits for acceptance, ``bound``
+    for one that the UAV follows, and ``none`` if there is none; ``reason`` says why the policy was
+    not followed. The place is the landing point, ``altitude`` the flight level above the takeoff
+    point [m], ``speed`` that of the cruise [m/s], ``heading`` clockwise from north [deg],
+    ``distance`` [m] and ``duration`` [s] those of the flight, ``until`` when it must be accepted
+    by, ``age`` that of the newest report [s].
     """
 
     answer: str | None
@@ -69,8 +70,9 @@ class Advice(Place):
 
 
 class UavStatus(Place):
-    """Where a UAV was by its newest report, the age of that [s], its battery [%], how many reports came, and
-    how many twice, what a person has told it, how far its latest answer has come, and what it is told now."""
+    """Where a UAV was by its newest report, the age of that [s], its battery [%], how many reports
+    came, and how many twice, what a person has told it, how far its latest answer has come, and
+    what it is told now."""
 
     ID: str
     age: float | None
@@ -84,7 +86,8 @@ class UavStatus(Place):
 
 
 class FleetStatus(BaseModel):
-    """What is known of a fleet; its steps have a length of ``dt`` [s]; ``start`` is None until it begins."""
+    """What is known of a fleet; its steps have a length of ``dt`` [s]; ``start`` is None until it
+    begins."""
 
     start: float | str | None
     step: int
@@ -125,7 +128,8 @@ class Command(Body):
 
 
 class Change(Body):
-    """UAVs that join with their first reports, and UAVs that leave now; what is so already stays so."""
+    """UAVs that join with their first reports, and UAVs that leave now; what is so already stays
+    so."""
 
     join: list[UavId] = []
     leave: list[UavId] = []

@@ -1,8 +1,8 @@
 """The service over HTTP: reports in, advice out, several fleets at once. ``GET`` changes nothing.
 
-Requests carry ``Authorization: Bearer TOKEN``; whoever has the wrong one learns nothing, not even which
-fleets there are. Only the time, the health and the description of the service, and the page of the map
-without its data, need none.
+Requests carry ``Authorization: Bearer TOKEN``; whoever has the wrong one learns nothing, not even
+which fleets there are. Only the time, the health and the description of the service, and the page
+of the map without its data, need none.
 """
 
 import asyncio
@@ -30,7 +30,15 @@ from damian.common.text_files import one_line, show
 from damian.show.geojson import on_earth
 from damian.show.replay_page import PAGE
 from damian_fleet.fleet import Fleet, Held, Waiting
-from damian_fleet.reports import Found, Report, reports_of, rows_of_csv, rows_of_json, validated, written
+from damian_fleet.reports import (
+    Found,
+    Report,
+    reports_of,
+    rows_of_csv,
+    rows_of_json,
+    validated,
+    written,
+)
 from damian_fleet.rows import (
     MOST_ROWS,
     Acknowledgement,
@@ -44,10 +52,18 @@ from damian_fleet.rows import (
 from damian_fleet.store import Fleets, NoFleet
 
 MAX_BODY, TICK = 1_000_000, 1.0
-"""Largest body of a request [bytes]; time between two updates of all fleets, so that no request waits for
-many steps [s]."""
-STATUS = {NoFleet: 404, Waiting: 409, Held: 409, InputError: 422, RequestValidationError: 422, RunError: 507}
-"""What a request is answered that ends with an error; 507: it could not be stored, and changed nothing."""
+"""Largest body of a request [bytes]; time between two updates of all fleets, so that no request
+waits for many steps [s]."""
+STATUS = {
+    NoFleet: 404,
+    Waiting: 409,
+    Held: 409,
+    InputError: 422,
+    RequestValidationError: 422,
+    RunError: 507,
+}
+"""What a request is answered that ends with an error; 507: it could not be stored, and changed
+nothing."""
 _LOG = logging.getLogger("damian_fleet")
 
 
@@ -57,7 +73,9 @@ class Clock:
     It starts at ``least`` [s] at least, such as the latest time that is stored.
     """
 
-    def __init__(self, least: float = 0.0, system: Any = time.time, monotonic: Any = time.monotonic) -> None:
+    def __init__(
+        self, least: float = 0.0, system: Any = time.time, monotonic: Any = time.monotonic
+    ) -> None:
         self._system, self._monotonic = system, monotonic
         self._base = max(system(), least) - monotonic()
 
@@ -84,11 +102,15 @@ def refused(_: Request, error: Any) -> Response:
 
 async def check_size(request: Request) -> None:
     """Refuse a large body before it is read."""
-    length = request.headers.get("content-length", "0" if request.method in ("GET", "DELETE") else "")
+    length = request.headers.get(
+        "content-length", "0" if request.method in ("GET", "DELETE") else ""
+    )
     if not length.isdecimal():
         raise HTTPException(411, "say how long the body is: Content-Length")
     if int(length) > MAX_BODY:
-        raise HTTPException(413, f"the body is larger than {MAX_BODY} bytes", {"Connection": "close"})
+        raise HTTPException(
+            413, f"the body is larger than {MAX_BODY} bytes", {"Connection": "close"}
+        )
 
 
 async def rows_of(request: Request) -> Found:
@@ -96,12 +118,16 @@ async def rows_of(request: Request) -> Found:
     body = await request.body()
     is_table = request.headers.get("content-type", "").startswith("text/csv")
     if is_table and body.count(b"\n") > MOST_ROWS + 1:
-        raise HTTPException(413, f"there are more than {MOST_ROWS} rows: send them in several requests")
+        raise HTTPException(
+            413, f"there are more than {MOST_ROWS} rows: send them in several requests"
+        )
     found = rows_of_csv(body.decode("utf-8-sig", "replace")) if is_table else rows_of_json(body)
     if not found:
         raise InputError("there are no rows")
     if len(found) > MOST_ROWS:
-        raise HTTPException(413, f"there are more than {MOST_ROWS} rows: send them in several requests")
+        raise HTTPException(
+            413, f"there are more than {MOST_ROWS} rows: send them in several requests"
+        )
     return found
 
 
@@ -140,11 +166,16 @@ def make_app(fleets: Fleets, token: str, clock: Clock | None = None) -> FastAPI:
     @app.get("/time")
     async def service_time() -> dict[str, Any]:
         """The time of the service, and how far the clock of its system is ahead [s]."""
-        return {"time": now(), "written": written(now()), "system_ahead": round(now.system_ahead, 3)}
+        return {
+            "time": now(),
+            "written": written(now()),
+            "system_ahead": round(now.system_ahead, 3),
+        }
 
     @app.get("/fleets/{name}/map", response_class=HTMLResponse)
     async def show_map(name: str) -> str:
-        """The fleet as it flies; the page asks for what it shows with the token that one types in."""
+        """The fleet as it flies; the page asks for what it shows with the token that one types
+        in."""
         page = Path(__file__).with_name("map.html").read_text(encoding="utf-8")
         return page.replace("$colours", json.dumps(UAV_COLOURS))
 
@@ -164,9 +195,13 @@ def _fleets(fleets: Fleets, token: str, now: Clock) -> APIRouter:
     """The requests about fleets."""
     bearer = HTTPBearer(auto_error=False)
 
-    async def check_token(given: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]) -> None:
+    async def check_token(
+        given: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)],
+    ) -> None:
         if not hmac.compare_digest((given.credentials if given else "").encode(), token.encode()):
-            raise HTTPException(401, "the token is missing or wrong", {"WWW-Authenticate": "Bearer"})
+            raise HTTPException(
+                401, "the token is missing or wrong", {"WWW-Authenticate": "Bearer"}
+            )
 
     router = APIRouter(prefix="/fleets", dependencies=[Depends(check_token), Depends(check_size)])
 
@@ -197,7 +232,11 @@ def _fleets(fleets: Fleets, token: str, now: Clock) -> APIRouter:
         reports = reports_of(rows)
         ignored = {column for _, report in reports for column in report.model_extra or ()}
         found = fleets.take(name, Fleet.reported, reports, now())
-        told = {"accepted": len(found), "found": found, "ignored": sorted(ignored - {"bridge", "vehicle"})}
+        told = {
+            "accepted": len(found),
+            "found": found,
+            "ignored": sorted(ignored - {"bridge", "vehicle"}),
+        }
         warning = fleets[name].warnings({report.id for _, report in reports})
         return {**told, "warning": warning} if warning else told
 

@@ -1,7 +1,8 @@
-"""Fleets in a database: each request is one transaction, which stores its event before it is answered.
+"""Fleets in a database: each request is one transaction, which stores its event before it is
+answered.
 
-A process that is killed at any instant leaves a database in which a request is there as a whole, or not at
-all. A fleet is restored by applying its stored events again.
+A process that is killed at any instant leaves a database in which a request is there as a whole, or
+not at all. A fleet is restored by applying its stored events again.
 """
 
 import json
@@ -42,13 +43,17 @@ class Fleets:
     """The fleets of a service.
 
     Args:
-        make: makes a fleet of UAVs, whose answers begin with a mark, as of the time of its latest event.
+        make: makes a fleet of UAVs, whose answers begin with a mark, as of the time of its latest
+            event.
         path: the database; ``:memory:`` to keep nothing.
         about: by which policy and settings fleets are advised; others may not go on with them.
     """
 
     def __init__(
-        self, make: Callable[[list[str], str, float], Fleet], path: str | Path, about: Mapping[str, Any]
+        self,
+        make: Callable[[list[str], str, float], Fleet],
+        path: str | Path,
+        about: Mapping[str, Any],
     ) -> None:
         self.make, self.about = make, dict(about)
         self.problem: str | None = None
@@ -59,7 +64,9 @@ class Fleets:
             options: Any = {"timeout": 1, "isolation_level": None, "check_same_thread": False}
             self._base = sqlite3.connect(path, **options)
             self._base.executescript(TABLES)
-            rows = self._base.execute("SELECT name, id, head FROM fleets WHERE ended IS NULL").fetchall()
+            rows = self._base.execute(
+                "SELECT name, id, head FROM fleets WHERE ended IS NULL"
+            ).fetchall()
         except sqlite3.Error as error:
             raise InputError(f"database: {path} cannot be used: {error}") from None
         self._ids = {name: key for name, key, _ in rows}
@@ -94,7 +101,9 @@ class Fleets:
             head = json.loads(text)
             fleet = self.make(head["uavs"], head["mark"], latest or 0.0)
             if head["ground"] != _mark(fleet):
-                raise RunError(f"database: fleet {name} is of other landing points: give its region")
+                raise RunError(
+                    f"database: fleet {name} is of other landing points: give its region"
+                )
             for event in self._events(key):
                 fleet.apply(json.loads(event))
             for lease in fleet.leases.values():
@@ -118,7 +127,8 @@ class Fleets:
     def take(
         self, name: str, request: Callable[[Fleet, Any, float], Event | None], said: Any, now: float
     ) -> list[str]:
-        """Store the event that a request of a fleet is, such as ``Fleet.reported``, and then apply it.
+        """Store the event that a request of a fleet is, such as ``Fleet.reported``, and then apply
+        it.
 
         Returns:
             What became of it, as of ``Fleet.apply``; nothing if the request changes nothing.
@@ -127,21 +137,33 @@ class Fleets:
         if (event := request(fleet, said, now)) is None:
             return []
         text = json.dumps(event, allow_nan=False)
-        line = "INSERT INTO events SELECT ?, coalesce(max(n), 0) + 1, ?, ? FROM events WHERE fleet = ?"
+        line = (
+            "INSERT INTO events SELECT ?, coalesce(max(n), 0) + 1, ?, ? FROM events WHERE fleet = ?"
+        )
         self._store(line, key := self._id(name), event["received"], text, key)
         return fleet.apply(json.loads(text))
 
     def create(self, name: str, uavs: Sequence[str]) -> bool:
         """Create a fleet of UAVs with these IDs; returns whether it is new."""
         if not NAME.fullmatch(name):
-            raise InputError(f"fleet: {show(name)} is not a name of up to 64 letters, digits, _ and -")
+            raise InputError(
+                f"fleet: {show(name)} is not a name of up to 64 letters, digits, _ and -"
+            )
         if name in self._ids:
             if [*self[name].uavs] != [*uavs]:
-                raise InputError(f"fleet: {name} has other UAVs; end it first, or take another name")
+                raise InputError(
+                    f"fleet: {name} has other UAVs; end it first, or take another name"
+                )
             return False
         mark = secrets.token_hex(3)  # tells its answers from those of an earlier fleet of this name
         made = self.make([*uavs], mark, 0.0)
-        head = {"journal": "damian-advice", "version": 3, "fleet": name, "uavs": [*uavs], "mark": mark}
+        head = {
+            "journal": "damian-advice",
+            "version": 3,
+            "fleet": name,
+            "uavs": [*uavs],
+            "mark": mark,
+        }
         head |= {"about": self.about, "ground": _mark(made)}
         self._store("INSERT INTO fleets(name, head) VALUES (?, ?)", name, json.dumps(head))
         (self._ids[name],) = self._base.execute("SELECT last_insert_rowid()").fetchone()
@@ -159,7 +181,7 @@ class Fleets:
         self.loaded.pop(name, None)
 
     def journal(self, name: str) -> Iterator[str]:
-        """What happened to a fleet, also to one that has ended, for ``damian-playback`` and ``damian fit``."""
+        """What happened to a fleet, also to one that has ended, as a journal."""
         line = "SELECT id, head FROM fleets WHERE name = ? ORDER BY id DESC"
         found = self._base.execute(line, (name,)).fetchone() or (self._id(name), "")
         yield found[1]

@@ -1,7 +1,7 @@
 """Follows UAVs by their reports: takes the steps of the server node with what had come in by then.
 
-Step k lasts from ``start + k dt`` on; the oldest first report was generated at the start. A message belongs
-to the step in which it was generated, and counts from the step in which it came in.
+Step k lasts from ``start + k dt`` on; the oldest first report was generated at the start. A message
+belongs to the step in which it was generated, and counts from the step in which it came in.
 """
 
 import math
@@ -30,15 +30,17 @@ _ROUNDING = 1e-3
 
 
 class Tracker:
-    """The server node of a fleet, which begins with the newest report of each UAV, once each has sent one.
+    """The server node of a fleet, which begins with the newest report of each UAV, once each has
+    sent one.
 
     Args:
         node: the server node for so many UAVs.
         uavs: their IDs.
-        rows: reports that ``steps`` takes in the order in which they came in, whatever theirs is; others are
-            given to ``add``, in the order in which they come in.
-        standing: called with the ID of a UAV and whether it asks for advice, returns the index of the landing
-            point where it stands or to which it flies; if not given, its newest message tells.
+        rows: reports that ``steps`` takes in the order in which they came in, whatever theirs is;
+            others are given to ``add``, in the order in which they come in.
+        standing: called with the ID of a UAV and whether it asks for advice, returns the index of
+            the landing point where it stands or to which it flies; if not given, its newest message
+            tells.
     """
 
     def __init__(
@@ -54,7 +56,8 @@ class Tracker:
         self.held: dict[str, FilledReport] = {}
         """The message of each UAV that the server holds."""
         self.pending: list[tuple[int, str, FilledReport]] = []
-        """Reports that have come in and count later: the step from which they do, the UAV, the report."""
+        """Reports that have come in and count later: the step from which they do, the UAV, the
+        report."""
         self.has_begun, self.start = False, 0.0
         """Whether every UAV has sent a report, and when step 0 began then [s]."""
         self.step = self.first_step = 0
@@ -68,12 +71,16 @@ class Tracker:
         for where, report in rows or []:
             with named(where):
                 self.check(report)
-        self._coming = deque(sorted((report for _, report in rows or []), key=lambda each: each.received))
+        self._coming = deque(
+            sorted((report for _, report in rows or []), key=lambda each: each.received)
+        )
         """Reports of ``rows`` that have not come in yet."""
         while self._coming and not self.has_begun:
             self.add(self._coming.popleft())
         if self._coming and self._coming[-1].received - self.start > SECONDS:
-            raise InputError(f"time: the first reports are more than {SECONDS:g} s older: leave them out")
+            raise InputError(
+                f"time: the first reports are more than {SECONDS:g} s older: leave them out"
+            )
 
     def new_log(self) -> UavLog:
         """The log of a UAV that has not reported yet."""
@@ -81,15 +88,20 @@ class Tracker:
         return UavLog(self.node.ground, stops, widths.readings, self.node.dt)
 
     def check(self, report: Report, log: UavLog | None = None) -> None:
-        """Refuse a report that no UAV of the fleet can send; give ``log`` for one that is joining it."""
+        """Refuse a report that no UAV of the fleet can send; give ``log`` for one that is joining
+        it."""
         if log is None and report.id not in self.logs:
-            raise InputError(f"ID: {show(report.id)} is not a UAV of this fleet: {listed(self.uavs)}")
+            raise InputError(
+                f"ID: {show(report.id)} is not a UAV of this fleet: {listed(self.uavs)}"
+            )
         for name, time in (("time", report.time), ("source time", report.source_time)):
             if time is not None and time > report.received + AGREE:
                 late = f"{time:.13g} s is {time - report.received:.1f} s after it came in"
                 raise InputError(f"{name}: {late}: set the clock of the UAV")
         if report.received - report.time > UNSET:
-            early = f"{report.time:.13g} s is {report.received - report.time:.3g} s before it came in"
+            early = (
+                f"{report.time:.13g} s is {report.received - report.time:.3g} s before it came in"
+            )
             raise InputError(f"time: {early}: the clock of {report.id} is not set")
         (log or self.logs[report.id]).check(report)
 
@@ -130,7 +142,9 @@ class Tracker:
     def put(self, report: Report, origin: int | None = None) -> FilledReport:
         """Put a report into the log of its UAV, whatever counts; as of ``add``."""
         detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
-        return self.logs[report.id].add(report, min(self.step_of(report.time), self.step), detected, origin)
+        return self.logs[report.id].add(
+            report, min(self.step_of(report.time), self.step), detected, origin
+        )
 
     # Steps.
 
@@ -150,13 +164,20 @@ class Tracker:
             if self.before is None:
                 self._after, self._outputs = self.node.begin(self._reported())
             else:
-                self._after, self._outputs = self.node.step(self.before, self._reported(), *self._previous)
+                self._after, self._outputs = self.node.step(
+                    self.before, self._reported(), *self._previous
+                )
         return self._outputs
 
     def next_step(self) -> None:
-        """End this step; in the next one it counts who has ``chosen`` which ``action`` in this one."""
+        """End this step; in the next one it counts who has ``chosen`` which ``action`` in this
+        one."""
         self.observe()
-        self.before, self.step, self._previous = self._after, self.step + 1, (self.action, self.chosen)
+        self.before, self.step, self._previous = (
+            self._after,
+            self.step + 1,
+            (self.action, self.chosen),
+        )
         self._begin_step()
 
     def begin_anew(self, step: int) -> None:
@@ -194,13 +215,18 @@ class Tracker:
 
     def _reported(self) -> Reported:
         arrived = {(uav, filled.step): filled for uav, filled in self._arrived}
-        late = {key: filled for key, filled in arrived.items() if self.first_step < key[1] < self.step}
+        late = {
+            key: filled for key, filled in arrived.items() if self.first_step < key[1] < self.step
+        }
         rows = self._messages([*late.values()]).pack() if late else ()
         return Reported(
             state=self.state([]),
             age=self.step - torch.tensor([each.step for each in self.held.values()]),
             on_time=torch.tensor(
-                [each.step == self.step and (uav, self.step) in arrived for uav, each in self.held.items()]
+                [
+                    each.step == self.step and (uav, self.step) in arrived
+                    for uav, each in self.held.items()
+                ]
             ),
             late=[
                 LateMessage(row, self.uavs.index(uav), self.step - step)

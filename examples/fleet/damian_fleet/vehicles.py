@@ -1,11 +1,13 @@
-"""A copter in virtual time that refuses what ArduCopter refuses, for tests and trials without hardware.
+"""A copter in virtual time that refuses what ArduCopter refuses, for tests and trials without
+hardware.
 
-Written from ArduPilot's documentation (flight modes, arming, prearm checks, MAV_CMD pages, crash check,
-failsafes of battery, EKF and ground station) with its default parameters. It is a point that flies: no
-attitude, no rotor, no sensor. A place is north + 1j east [m] of the origin; heights are above flat ground.
+Written from ArduPilot's documentation (flight modes, arming, prearm checks, MAV_CMD pages, crash
+check, failsafes of battery, EKF and ground station) with its default parameters. It is a point that
+flies: no attitude, no rotor, no sensor. A place is north + 1j east [m] of the origin; heights are
+above flat ground.
 
-``python -m damian_fleet.vehicles 52.811,-4.1283 127.0.0.1:14550 127.0.0.1:14551`` flies a copter for each
-address of a bridge, over UDP, 60 m apart.
+``python -m damian_fleet.vehicles 52.811,-4.1283 127.0.0.1:14550 127.0.0.1:14551`` flies a copter
+for each address of a bridge, over UDP, 60 m apart.
 """
 
 import itertools
@@ -27,7 +29,9 @@ CUSTOM_MODE, ARMED, CHANGE_MODE = 1, 128, 1  # flags of the base mode and of DO_
 RELATIVE_ALTITUDE, AMSL = (3, 6), (0, 5)  # MAV_FRAME
 GROUND_AMSL = 50.0  # [m], so that the heights of the two frames differ
 STREAMS, GPS_RAW = (0, 1, 24, 33, 65, 87, 147, 148, 245), 24  # messages that can be asked for
-SWITCH = dict(zip((STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND), range(1165, 2000, 150), strict=True))
+SWITCH = dict(
+    zip((STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND), range(1165, 2000, 150), strict=True)
+)
 """Where a pilot's switch stands for a mode [us] of channel 5 (FLTMODE_CH)."""
 BY_PILOT = (STABILIZE, ALT_HOLD, LOITER)  # modes that a pilot's sticks fly
 BOARDS = itertools.count(1)
@@ -35,40 +39,58 @@ BOARDS = itertools.count(1)
 
 METRES_PER_DEGREE = 111_319.49
 CLIMB_SPEED, DESCENT_SPEED, LANDING_SPEED = 2.5, 1.5, 0.5  # [m/s]; the last below LANDING_HEIGHT
-DEFAULT_SPEED, MAX_AIRSPEED, ACCELERATION, GRAVITY = 10.0, 15.0, 2.5, 9.8  # [m/s], [m/s], [m/s^2], [m/s^2]
+DEFAULT_SPEED, MAX_AIRSPEED, ACCELERATION, GRAVITY = (
+    10.0,
+    15.0,
+    2.5,
+    9.8,
+)  # [m/s], [m/s], [m/s^2], [m/s^2]
 LANDING_HEIGHT, RTL_HEIGHT, RTL_WAIT = 10.0, 15.0, 5.0  # [m], [m], [s]
 DISARM_DELAY, LAND_DETECTOR, SPOOL_UP, FIX_AFTER_BOOT = 10.0, 1.0, 2.0, 10.0  # [s]
 BATTERY_LOW, EKF_FAILSAFE, STATION_FAILSAFE = 15.0, 1.0, 5.0  # [%], [s], [s]
 
 
 class Copter:
-    """One ArduCopter: `step(now, messages)` obeys messages that arrived and returns those that it sends.
+    """One ArduCopter: `step(now, messages)` obeys messages that arrived and returns those that it
+    sends.
 
-    Public state is the truth: `mode`, `armed`, `landed`, `place`, `height`, `velocity`, `crashed`. A pilot
-    calls `change_mode`, which moves his `switch` (None: no receiver), `arm` and `disarm`; faults are
-    `crash()`, `reboot(now)` and the fields `wind` [m/s], `fix`, `glitch` [m, of what it says], `prearm` (a
-    text that refuses arming), `battery` [%] of each.
+    Public state is the truth: `mode`, `armed`, `landed`, `place`, `height`, `velocity`, `crashed`.
+    A pilot calls `change_mode`, which moves his `switch` (None: no receiver), `arm` and `disarm`;
+    faults are `crash()`, `reboot(now)` and the fields `wind` [m/s], `fix`, `glitch`
+    [m, of what it says], `prearm` (a text that refuses arming), `battery` [%] of each.
 
-    ``origin`` is latitude and longitude [deg] of place 0, ``drain`` what a second in the air costs [%]. It
-    returns on a low battery (BATT_FS_LOW_ACT=2), and lands if the MAVLink system ``station`` is silent for
-    5 s (MAV_GCS_SYSID, FS_GCS_ENABLE=5), if one is given, unless a pilot's sticks fly it (FS_OPTIONS=16).
+    ``origin`` is latitude and longitude [deg] of place 0, ``drain`` what a second in the air costs
+    [%]. It returns on a low battery (BATT_FS_LOW_ACT=2), and lands if the MAVLink system
+    ``station`` is silent for 5 s (MAV_GCS_SYSID, FS_GCS_ENABLE=5), if one is given, unless a
+    pilot's sticks fly it (FS_OPTIONS=16).
     """
 
     def __init__(self, origin, place=0j, *, system=1, now=0.0, drain=0.05, station=None):
         self.origin, self.place, self.height, self.landed = origin, complex(place), 0.0, True
         self.system, self.drain, self.station = system, drain, station
         self.wind, self.fix, self.glitch, self.prearm = 0j, True, 0j, None
-        self.battery, self.crashed, self.board, self.switch = [100.0], False, next(BOARDS), SWITCH[STABILIZE]
+        self.battery, self.crashed, self.board, self.switch = (
+            [100.0],
+            False,
+            next(BOARDS),
+            SWITCH[STABILIZE],
+        )
         self.aside = -math.inf  # until then the switch is off its place
         self.mav, self.sent, self.now = mavlink.MAVLink(None, system, 1), [], now
         self.reboot(now - FIX_AFTER_BOOT)  # it has stood there for a while
 
     def reboot(self, now):
-        """Start the autopilot: disarmed, no fix for some seconds, streams off. In the air it falls."""
+        """Start the autopilot: disarmed, no fix for some seconds, streams off. In the air it
+        falls."""
         if not self.landed:
             self.crash()
         self.mode, self.armed, self.failsafe, self.speed = STABILIZE, False, set(), DEFAULT_SPEED
-        self.goal, self.taking_off, self.position_control, self.home = None, False, False, self.place
+        self.goal, self.taking_off, self.position_control, self.home = (
+            None,
+            False,
+            False,
+            self.place,
+        )
         self.velocity, self.climb, self.booted, self.on_ground_since = 0j, 0.0, now, now
         self.heard = self.lost_since = self.home_since = None
         self.has_origin, self.streams = False, {0: [1.0, now]}
@@ -108,7 +130,8 @@ class Copter:
         self.stop()
 
     def change_mode(self, mode):
-        """A pilot chooses a mode; whether it flies in that. A switch that stands there is moved and back."""
+        """A pilot chooses a mode; whether it flies in that. A switch that stands there is moved and
+        back."""
         if mode in SWITCH and self.switch is not None:
             if self.switch == SWITCH[mode]:
                 self.aside = self.now + 1.0
@@ -122,7 +145,12 @@ class Copter:
         if mode not in MODES or (self.armed and mode in NEED_POSITION and not self.has_position):
             self.text(f"Mode change to {mode} failed: requires position")
             return False
-        self.mode, self.home_since, self.speed, self.position_control = mode, None, DEFAULT_SPEED, False
+        self.mode, self.home_since, self.speed, self.position_control = (
+            mode,
+            None,
+            DEFAULT_SPEED,
+            False,
+        )
         self.stop()
         self.send(*self.stream(0))
         return True
@@ -131,7 +159,8 @@ class Copter:
         self.goal, self.taking_off = None, False
 
     def step(self, now, messages=()):
-        """Fly until `now` [s], obey what arrived, and return what was sent: messages of pymavlink, packed."""
+        """Fly until `now` [s], obey what arrived, and return what was sent: messages of pymavlink,
+        packed."""
         dt, self.now = max(now - self.now, 0.0), now
         for message in messages:
             self.receive(message)
@@ -182,14 +211,22 @@ class Copter:
             case mavlink.MAV_CMD_NAV_TAKEOFF:
                 if frame not in RELATIVE_ALTITUDE:
                     return DENIED
-                if not (self.armed and self.landed and self.mode == GUIDED and altitude > self.height):
+                if not (
+                    self.armed and self.landed and self.mode == GUIDED and altitude > self.height
+                ):
                     return FAILED
-                self.goal, self.taking_off, self.position_control = (self.place, altitude), True, False
+                self.goal, self.taking_off, self.position_control = (
+                    (self.place, altitude),
+                    True,
+                    False,
+                )
                 return ACCEPTED
             case mavlink.MAV_CMD_DO_REPOSITION:
                 return self.reposition(command, frame)
             case mavlink.MAV_CMD_DO_CHANGE_SPEED:
-                if self.mode == GUIDED and second > 0 and first in (0, 1):  # no speed of climb or descent
+                if (
+                    self.mode == GUIDED and second > 0 and first in (0, 1)
+                ):  # no speed of climb or descent
                     self.speed = second
                 return DENIED if second <= 0 else ACCEPTED if self.mode == GUIDED else FAILED
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL if int(first) in STREAMS:
@@ -214,7 +251,10 @@ class Copter:
             return FAILED
         if not self.position_control:  # entering it resets the speed: only a later one holds
             self.speed, self.position_control = DEFAULT_SPEED, True
-        self.goal = self.metres(latitude, longitude), command.z - (GROUND_AMSL if frame in AMSL else 0)
+        self.goal = (
+            self.metres(latitude, longitude),
+            command.z - (GROUND_AMSL if frame in AMSL else 0),
+        )
         return ACCEPTED
 
     # Failsafes and motion.
@@ -284,14 +324,19 @@ class Copter:
         return self.home, 0.0 if there else self.height
 
     def fly_to(self, target, dt):
-        """Fly at the ground speed it wants as far as its airspeed allows; without a position it drifts."""
+        """Fly at the ground speed it wants as far as its airspeed allows; without a position it
+        drifts."""
         if target is None or not self.has_position:
             self.velocity = self.wind
         else:
             way = target - self.place
             speed = min(self.speed, math.sqrt(2 * ACCELERATION * abs(way)), abs(way) / dt)
             change = (way / abs(way) * speed if way else 0j) - self.velocity
-            air = self.velocity + change * min(1.0, ACCELERATION * dt / (abs(change) or 1.0)) - self.wind
+            air = (
+                self.velocity
+                + change * min(1.0, ACCELERATION * dt / (abs(change) or 1.0))
+                - self.wind
+            )
             self.velocity = air * min(1.0, MAX_AIRSPEED / (abs(air) or 1.0)) + self.wind
         self.place += self.velocity * dt
 
@@ -315,14 +360,20 @@ class Copter:
             self.sent.append(message)
 
     def text(self, text):
-        self.send(mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, text.encode()[:50]))
+        self.send(
+            mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, text.encode()[:50])
+        )
 
     def stream(self, number):
         """The messages of an id, which must be one of ``STREAMS``."""
         known = self.has_position if number == GPS_RAW else self.has_origin
         latitude, longitude = self.degrees(self.place + self.glitch) if known else (0.0, 0.0)
         amsl, above_home = self.height + GROUND_AMSL if known else 0.0, round(self.height * 1000)
-        place = round(latitude * 1e7), round(longitude * 1e7), round(amsl * 1000)  # zeros while it knows none
+        place = (
+            round(latitude * 1e7),
+            round(longitude * 1e7),
+            round(amsl * 1000),
+        )  # zeros while it knows none
         left = [max(0, round(level)) for level in self.battery]
         match number:
             case 0:  # HEARTBEAT
@@ -332,25 +383,35 @@ class Copter:
                 )
                 yield mavlink.MAVLink_heartbeat_message(2, 3, base, self.mode, state, 3)
             case 1:  # SYS_STATUS
-                yield mavlink.MAVLink_sys_status_message(0, 0, 0, 300, 12000, 1000, left[0], *[0] * 6)
+                yield mavlink.MAVLink_sys_status_message(
+                    0, 0, 0, 300, 12000, 1000, left[0], *[0] * 6
+                )
             case 24:  # GPS_RAW_INT
                 fix, satellites = (3, 12) if known else (1, 3)
                 rest = 100, 100, 65535, 65535, satellites
                 yield mavlink.MAVLink_gps_raw_int_message(int(self.now * 1e6), fix, *place, *rest)
             case 33:  # GLOBAL_POSITION_INT
                 boot = round((self.now - self.booted) * 1000)
-                speed = (round(100 * v) for v in (self.velocity.real, self.velocity.imag, -self.climb))
-                yield mavlink.MAVLink_global_position_int_message(boot, *place, above_home, *speed, 65535)
+                speed = (
+                    round(100 * v) for v in (self.velocity.real, self.velocity.imag, -self.climb)
+                )
+                yield mavlink.MAVLink_global_position_int_message(
+                    boot, *place, above_home, *speed, 65535
+                )
             case 65 if self.switch is not None:  # RC_CHANNELS
                 boot = round((self.now - self.booted) * 1000)
-                aside = (self.now < self.aside) * (150 if self.switch == SWITCH[STABILIZE] else -150)
+                aside = (self.now < self.aside) * (
+                    150 if self.switch == SWITCH[STABILIZE] else -150
+                )
                 channels = [1500, 1500, 1000, 1500, self.switch + aside, *[65535] * 13]
                 yield mavlink.MAVLink_rc_channels_message(boot, 5, *channels, 255)
             case 87 if self.position_control and self.goal and self.mode == GUIDED:
                 boot = round((self.now - self.booted) * 1000)
                 latitude, longitude = (round(each * 1e7) for each in self.degrees(self.goal[0]))
                 aim = latitude, longitude, self.goal[1] + GROUND_AMSL
-                yield mavlink.MAVLink_position_target_global_int_message(boot, 0, 0xFFF8, *aim, *[0] * 8)
+                yield mavlink.MAVLink_position_target_global_int_message(
+                    boot, 0, 0xFFF8, *aim, *[0] * 8
+                )
             case 148:  # AUTOPILOT_VERSION
                 rest = *[0] * 5, *[[0] * 8] * 3, *[0] * 3, [*self.board.to_bytes(18, "little")]
                 yield mavlink.MAVLink_autopilot_version_message(*rest)

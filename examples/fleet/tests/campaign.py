@@ -1,8 +1,9 @@
-"""Seeded faults over a fleet of five in virtual time: service, five bridges and five copters in this process.
+"""Seeded faults over a fleet of five in virtual time: service, five bridges and five copters in
+this process.
 
-``python tests/campaign.py`` plays 1,000 faults and prints the tables of the README (`make fleet-campaign`).
-What counts is what the copters do, whatever the programs believe. A person sees to vehicles that are not the
-bridge's.
+``python tests/campaign.py`` plays 1,000 faults and prints the tables of the README
+(`make fleet-campaign`). What counts is what the copters do, whatever the programs believe. A person
+sees to vehicles that are not the bridge's.
 """
 
 import argparse
@@ -43,8 +44,14 @@ from damian_fleet.vehicles import (
 UAVS, TICK, HOUR = "ABCDE", 0.25, 3600.0
 ORIGIN = (52.8110, -4.1283)
 STARTS = (0j, 170 + 0j, 340 + 0j, 510 + 0j, -170 + 0j)
-SAME_POINT, CLEARANCE = 15.0, 5.0  # [m]; 10 m are set, and a copter stands up to 2 m beside its landing point
-HOVER, LONGEST = 30.0, 600.0  # [s] that a copter may stand in the air in GUIDED, and that it may fly
+SAME_POINT, CLEARANCE = (
+    15.0,
+    5.0,
+)  # [m]; 10 m are set, and a copter stands up to 2 m beside its landing point
+HOVER, LONGEST = (
+    30.0,
+    600.0,
+)  # [s] that a copter may stand in the air in GUIDED, and that it may fly
 HEED, APART = 3.0, 25.0  # [s] after which a bridge watches, and between commands of two bridges
 OLD = 3.5  # how old mode and motors may be when something is commanded [s]
 ASIDE = 30.0  # how far beside STARTS copters begin [m]
@@ -54,11 +61,13 @@ WORDS = ["region=llanbedr", "motion=polynomial", "motion.max_speed=8", "battery.
 WORDS += ["region.lattice_step=170", "actions.distances=[260,390]", "levels=[20,25,30]"]
 ZONE = [[110, -50], [150, -50], [150, -10], [110, -10]]
 WORDS += [f"region.zones=[{ZONE}]".replace(" ", "")]
-"""15 landing points, long flights and three levels for five, so that UAVs meet often; a zone between two."""
+"""15 landing points, long flights and three levels for five, so that UAVs meet often; a zone
+between two."""
 
 
 class Line:
-    """A link that delays, loses and doubles what it carries; ``slowest`` is the longest delay [s]."""
+    """A link that delays, loses and doubles what it carries; ``slowest`` is the longest delay
+    [s]."""
 
     def __init__(self, rng, slowest):
         self.rng, self.items = rng, []
@@ -78,7 +87,8 @@ class Line:
 
 
 class Service:
-    """The service, which can be killed: what is started again has the files that lay on the disk."""
+    """The service, which can be killed: what is started again has the files that lay on the
+    disk."""
 
     def __init__(self, folder):
         self.config, words = config_of([*WORDS, f"database={folder / 'fleets.0'}"])
@@ -93,7 +103,9 @@ class Service:
         clock = Clock(self.fleets.latest, lambda: 1.7e9 + self.now + self.jump, lambda: self.now)
         transport = httpx2.ASGITransport(make_app(self.fleets, TOKEN, clock))
         headers = {"authorization": f"Bearer {TOKEN}"}
-        self.client = httpx2.AsyncClient(transport=transport, base_url="http://fleet", headers=headers)
+        self.client = httpx2.AsyncClient(
+            transport=transport, base_url="http://fleet", headers=headers
+        )
 
     def restart(self):
         before = Path(self.config.database)
@@ -128,18 +140,36 @@ class Link:
 
 
 class Uav(Link):
-    """A copter, its bridge, what a pilot has done with it, and another bridge that somebody starts."""
+    """A copter, its bridge, what a pilot has done with it, and another bridge that somebody
+    starts."""
 
     def __init__(self, name, number, rng):
         aside = ASIDE * np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())
-        super().__init__(name, Copter(ORIGIN, STARTS[number] + aside, system=number + 1, station=255), rng)
+        super().__init__(
+            name, Copter(ORIGIN, STARTS[number] + aside, system=number + 1, station=255), rng
+        )
         self.memory, self.epoch, self.off_until = None, 0.0, 0.0
         self.act, self.seen_at, self.changed, self.shown = None, None, {}, {}
-        self.second, self.second_until, self.ambush, self.others, self.wait = None, 0.0, None, 0, None
-        self.strayed, self.known, self.confirmed, self.accepted, self.way = False, 0.0, 0.0, 0.0, None
+        self.second, self.second_until, self.ambush, self.others, self.wait = (
+            None,
+            0.0,
+            None,
+            0,
+            None,
+        )
+        self.strayed, self.known, self.confirmed, self.accepted, self.way = (
+            False,
+            0.0,
+            0.0,
+            0.0,
+            None,
+        )
         self.last_command = self.hover_since = self.air_since = self.idle_since = None
         self.commander, self.commanded = None, -np.inf
-        self.commanded_at, self.heartbeat_at = -np.inf, -np.inf  # when those that have come were sent
+        self.commanded_at, self.heartbeat_at = (
+            -np.inf,
+            -np.inf,
+        )  # when those that have come were sent
         self.flights = 0
 
     def stop_bridge(self, until):
@@ -157,7 +187,8 @@ class Uav(Link):
         return self.bridge.state if self.bridge else Memory.model_validate_json(self.memory).state
 
     def acted(self, now, why, *changed):
-        """Somebody else has changed mode, motors, switch or aim: once that is heard, the bridge is quiet."""
+        """Somebody else has changed mode, motors, switch or aim: once that is heard, the bridge is
+        quiet."""
         copter = self.copter
         fell = copter.crashed and copter.height > 2
         lands = copter.mode == LAND and (self.last_command == LAND or self.state == "landing")
@@ -187,7 +218,8 @@ class Uav(Link):
 
 
 class Campaign:
-    """One fleet with faults at random times; ``broken`` tells which invariants did not hold, and how."""
+    """One fleet with faults at random times; ``broken`` tells which invariants did not hold, and
+    how."""
 
     def __init__(self, seed, folder):
         self.rng = np.random.default_rng(seed)
@@ -200,7 +232,8 @@ class Campaign:
         self.ground = self.service.fleets["north"].ground
 
     def play(self, faults, every=10.0):
-        """Let it fly, with a fault every so many seconds, then without, until every UAV has flown again."""
+        """Let it fly, with a fault every so many seconds, then without, until every UAV has flown
+        again."""
         self.run(30.0)
         for _ in range(faults):
             kind = FAULTS[self.rng.integers(len(FAULTS))]
@@ -220,7 +253,9 @@ class Campaign:
             self.break_("flies again", f"{uav.name}: {state}, {rows[uav.name]}")
         for name, numbers in self.reported.items():
             if rows[name]["reports"] < len(numbers):
-                self.break_("no report is lost", f"{name}: {rows[name]['reports']} of {len(numbers)}")
+                self.break_(
+                    "no report is lost", f"{name}: {rows[name]['reports']} of {len(numbers)}"
+                )
         return self
 
     def break_(self, invariant, how):
@@ -248,7 +283,8 @@ class Campaign:
             self.after(seconds, lambda line=line: vars(line).update(line.usual))
 
     def command(self, command, uavs, seconds=None):
-        """An operator, who asks again until the service answers, and lets UAVs go on after so long [s]."""
+        """An operator, who asks again until the service answers, and lets UAVs go on after so long
+        [s]."""
         if self.now < self.service.down_until:
             self.after(1.0, lambda: self.command(command, uavs, seconds))
             return
@@ -273,7 +309,9 @@ class Campaign:
             if link is uav:
                 for at, message in heard:
                     uav.hear(at, message, now)
-            messages, requests = link.bridge.step(now + uav.epoch, [message for _, message in heard], answers)
+            messages, requests = link.bridge.step(
+                now + uav.epoch, [message for _, message in heard], answers
+            )
             for message in messages:
                 message.pack(self.station)
             link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
@@ -284,10 +322,14 @@ class Campaign:
         copter.mav.seq = (copter.mav.seq + uav.others) % 256
         for link in links:
             heartbeats = now < link.mute_until
-            link.up.send(now, *((now, m) for m in sent if not heartbeats or m.get_type() != "HEARTBEAT"))
+            link.up.send(
+                now, *((now, m) for m in sent if not heartbeats or m.get_type() != "HEARTBEAT")
+            )
         if copter.failsafe - failsafe:
             after = {"mode": copter.mode, "motors": copter.armed}
-            uav.acted(now, f"failsafe {copter.failsafe}", *(i for i in after if after[i] != before[i]))
+            uav.acted(
+                now, f"failsafe {copter.failsafe}", *(i for i in after if after[i] != before[i])
+            )
         if copter.landed or (copter.position_control and uav.way is None):
             goal, level = copter.goal or (copter.place, 0.0)
             path = shapely.LineString([(end.real, end.imag) for end in (copter.place, goal)])
@@ -351,14 +393,20 @@ class Campaign:
         elif status == 200 and request.path.endswith("/reports"):
             self.reported.setdefault(request.body["ID"], set()).add(request.body["number"])
             at = uav.copter.metres(request.body["lat"], request.body["lon"])
-            if uav.copter.landed and uav.known > self.now and abs(at - uav.copter.place) < SAME_POINT:
+            if (
+                uav.copter.landed
+                and uav.known > self.now
+                and abs(at - uav.copter.place) < SAME_POINT
+            ):
                 uav.known = self.now
         if body.get("status") == ["accepted"]:
             uav.confirmed = self.now
         for row in body.get("advice", []) if status == 200 else []:
             told = {key: value for key, value in row.items() if key not in ("state", "age")}
             if row["answer"] and self.answers.setdefault(row["answer"], told) != told:
-                self.break_("an answer never changes", f"{row}, before {self.answers[row['answer']]}")
+                self.break_(
+                    "an answer never changes", f"{row}, before {self.answers[row['answer']]}"
+                )
         return status, body
 
     def see_to(self, uav):
@@ -383,7 +431,9 @@ class Campaign:
                 copter.reboot(self.now)
             copter.crashed, copter.battery = False, [100.0]
             stands = shapely.Point(self.ground.local(copter.degrees(copter.place)))
-            if not self.ground.region.polygon.contains(stands):  # in the zone, or outside: he carries it
+            if not self.ground.region.polygon.contains(
+                stands
+            ):  # in the zone, or outside: he carries it
                 copter.place = STARTS[ord(uav.name) - ord("A")]
             copter.change_mode(STABILIZE)
         elif self.now >= uav.idle_since + 35:
@@ -395,11 +445,15 @@ class Campaign:
     def check(self):
         for uav in self.uavs:
             copter = uav.copter
-            stands = copter.mode == GUIDED and abs(copter.velocity) < 0.3 and abs(copter.climb) < 0.1
+            stands = (
+                copter.mode == GUIDED and abs(copter.velocity) < 0.3 and abs(copter.climb) < 0.1
+            )
             if copter.landed or not stands:
                 uav.hover_since = self.now
             elif self.now > uav.hover_since + HOVER:
-                self.break_("airborne is commanded", f"{uav.name} stands, {uav.bridge and uav.bridge.state}")
+                self.break_(
+                    "airborne is commanded", f"{uav.name} stands, {uav.bridge and uav.bridge.state}"
+                )
             if not copter.landed and self.now > uav.air_since + LONGEST:
                 self.break_("airborne is commanded", f"{uav.name} flies too long: {copter.mode}")
         for one, other in combinations(self.uavs, 2):
@@ -413,7 +467,10 @@ class Campaign:
                 self.break_("no two paths too near", f"{one.name}, {other.name} on {paths}")
         if self.now % 5:
             return
-        told = [row["advice"] or {} for row in self.service.ask("GET", "/fleets/north")[1].get("uavs", [])]
+        told = [
+            row["advice"] or {}
+            for row in self.service.ask("GET", "/fleets/north")[1].get("uavs", [])
+        ]
         bound = [row for row in told if row.get("state") in ("fly", "return", "bound")]
         for one, other in combinations(bound, 2):
             if (one["lat"], one["lon"]) == (other["lat"], other["lon"]):
@@ -489,7 +546,9 @@ class Faults:
         """For another station, from another vehicle; and one of an answer that nobody gave."""
         for command in (176, 400, 22, 192, 178, 21):
             for system, target in ((uav.copter.system, (255, 190)), (77, (255, 191))):
-                message = mavlink.MAVLink_command_ack_message(command, field.rng.integers(5), 0, 0, *target)
+                message = mavlink.MAVLink_command_ack_message(
+                    command, field.rng.integers(5), 0, 0, *target
+                )
                 message.pack(mavlink.MAVLink(None, system, 1))
                 late = seconds * field.rng.random()
                 field.after(late, lambda m=message: uav.up.send(field.now, (field.now, m)))
@@ -535,7 +594,9 @@ class Faults:
 
     def pilot_stops_the_motors(field, uav, _):
         if uav.copter.armed:
-            uav.copter.disarm(force=field.rng.random() < 0.3) and uav.acted(field.now, "disarm", "motors")
+            uav.copter.disarm(force=field.rng.random() < 0.3) and uav.acted(
+                field.now, "disarm", "motors"
+            )
 
     def position_lost(field, uav, seconds):
         uav.copter.fix = False
@@ -561,7 +622,9 @@ class Faults:
 
 
 ACTS = (Faults.pilot_chooses, Faults.another_station_sends_it_elsewhere)
-FAULTS = [each for name, each in vars(Faults).items() if not name.startswith("_") and each not in ACTS]
+FAULTS = [
+    each for name, each in vars(Faults).items() if not name.startswith("_") and each not in ACTS
+]
 INVARIANTS = (
     "no two bound to one point",
     "no two at one point",
@@ -595,9 +658,18 @@ def main():
         broken.update([*field.broken])
         totals.update(flights=sum(uav.flights for uav in field.uavs), hours=field.now / 3600)
         print(f"seed {seed}: {field.now:.0f} s, {field.broken or 'everything held'}", flush=True)
-    print(f"\n{faults.total()} faults, {totals['flights']} flights in {totals['hours']:.1f} h of flying\n")
+    print(
+        f"\n{faults.total()} faults, {totals['flights']} flights in {totals['hours']:.1f} h of "
+        "flying\n"
+    )
     for title, rows in (("fault", faults), ("broken", {i: broken[i] for i in INVARIANTS})):
-        print(f"| {title} | |", "|:--|--:|", *(f"| {name} | {n} |" for name, n in rows.items()), "", sep="\n")
+        print(
+            f"| {title} | |",
+            "|:--|--:|",
+            *(f"| {name} | {n} |" for name, n in rows.items()),
+            "",
+            sep="\n",
+        )
     sys.exit(bool(broken))
 
 

@@ -19,31 +19,56 @@ from damian_fleet.settings import FleetConfig
 from damian_fleet.store import Fleets
 
 EAST, WEST = 0, 1
-FEATURES = ["source_distance", "source_bearing", "source_time", "source_drift", "agent_distances", "coverage"]
+FEATURES = [
+    "source_distance",
+    "source_bearing",
+    "source_time",
+    "source_drift",
+    "agent_distances",
+    "coverage",
+]
 SEEN = ObservationConfig(global_features=FEATURES, local_features=["spotted", "battery"], age=True)
 FLIGHTS = MotionConfig(kind="polynomial", max_speed=20.0, max_acceleration=10.0)
 WALK = SourceConfig(motion="dynamic", level_db=143.0, emission="per_step", emission_probability=0.6)
 
 
 def scenario_of(**changed: Any) -> ScenarioConfig:
-    endless = {"episode": EpisodeConfig(max_steps=None), "region": LLANBEDR, "source": WALK, "agents": 3}
+    endless = {
+        "episode": EpisodeConfig(max_steps=None),
+        "region": LLANBEDR,
+        "source": WALK,
+        "agents": 3,
+    }
     return ScenarioConfig(**{**endless, "observation": SEEN, **changed})
 
 
-SCENARIO = scenario_of(motion=FLIGHTS, actions=ActionConfig(distances=[60.0], headings=[90.0, -90.0]))
+SCENARIO = scenario_of(
+    motion=FLIGHTS, actions=ActionConfig(distances=[60.0], headings=[90.0, -90.0])
+)
 
 NODES: dict[tuple[str, int], Node] = {}
 """Nodes that tests share, by scenario and number of UAVs; they remember nothing of a fleet."""
 
 
 class Field:
-    """A fleet in a database, whose policy sends UAV ``i`` by ``wishes[i]`` unless ``policy_of`` makes one."""
+    """A fleet in a database, whose policy sends UAV ``i`` by ``wishes[i]`` unless ``policy_of``
+    makes one."""
 
     def __init__(
-        self, path: str | Path = ":memory:", uavs="AB", scenario=SCENARIO, policy_of=None, **rules: Any
+        self,
+        path: str | Path = ":memory:",
+        uavs="AB",
+        scenario=SCENARIO,
+        policy_of=None,
+        **rules: Any,
     ) -> None:
         self.wishes, self.now = [EAST] * 4, START
-        self.scenario, self.policy_of, self.path, self.rules = scenario, policy_of, path, FleetConfig(**rules)
+        self.scenario, self.policy_of, self.path, self.rules = (
+            scenario,
+            policy_of,
+            path,
+            FleetConfig(**rules),
+        )
         self.fleets = self.open()
         self.fleets.create("north", [*uavs])
 
@@ -91,7 +116,9 @@ class Field:
 
     def say(self, uav: str, answer: str | None, status: str, after: float = 0.0) -> str:
         self.now += after
-        return self.take(Fleet.acknowledged, [Acknowledgement(ID=uav, answer=answer or "", status=status)])[0]
+        return self.take(
+            Fleet.acknowledged, [Acknowledgement(ID=uav, answer=answer or "", status=status)]
+        )[0]
 
     def command(self, command: str, uavs: list[str] | None) -> list[str]:
         return self.take(Fleet.commanded, Command(command=command, uavs=uavs))
@@ -107,16 +134,20 @@ class Field:
         return int(self.fleet.node.simulation.candidates.goals()[0, point, EAST])
 
 
-def flights(scenario: ScenarioConfig, policy_of, n_steps: int, fraction: float = 0.0) -> Iterator[tuple]:
+def flights(
+    scenario: ScenarioConfig, policy_of, n_steps: int, fraction: float = 0.0
+) -> Iterator[tuple]:
     """Fly a simulated world by a policy, and let a fleet follow by what the UAVs report.
 
     Yields:
-        What the simulation shows the policy, the field, the policy's action, the IDs of the UAVs that choose,
-        and the step.
+        What the simulation shows the policy, the field, the policy's action, the IDs of the UAVs
+        that choose, and the step.
     """
     env = make_env(scenario, 1, 3, extras=["message"])
     policy, uavs = policy_of(env), names_of(scenario.agents)
-    field = Field(":memory:", uavs, scenario, policy_of, reserve=0.0, oldest_report=1e6, clearance=0.0)
+    field = Field(
+        ":memory:", uavs, scenario, policy_of, reserve=0.0, oldest_report=1e6, clearance=0.0
+    )
     field.fleet._bends = lambda _: False  # UAVs of a simulation fly around
     reporter = Reporter(env, field.fleet.ground, fraction)
     shown = env.reset()

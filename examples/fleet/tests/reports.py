@@ -14,7 +14,8 @@ from damian_fleet.reports import Rows, reports_of, rows_of_json
 START = 1.7e9
 """When the simulated flights begin [s since 1970]."""
 LLANBEDR = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
-"""With a single initial condition, whose table of first observations rounds as that of a single fleet."""
+"""With a single initial condition, whose table of first observations rounds as that of a single
+fleet."""
 
 
 def names_of(n: int) -> list[str]:
@@ -67,7 +68,9 @@ class Reporter:
             "motions": int(messages.motions[uav]),
             "previous": [list(self.ground.place(int(p))) for p in messages.trail[uav, 1:]],
             "sequence": self.n_sent[uav],
-            "landed": [self.time_of(round(t / self.dt)) for t in messages.landed[uav].tolist() if t >= 0],
+            "landed": [
+                self.time_of(round(t / self.dt)) for t in messages.landed[uav].tolist() if t >= 0
+            ],
         }
         seen = float(messages.detected_time[uav, 0])
         if seen >= 0:
@@ -102,7 +105,17 @@ def read_json(rows: Any) -> Rows:
 
 def write_journal(path: Path, *lines: dict[str, Any], uavs: list[str]) -> Path:
     """A journal of lines after the first one."""
-    about = {"policy": "script", "checkpoint": "runs/gone", "overrides": ["region=llanbedr", "port=0"]}
-    head = {"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": uavs, "about": about}
+    about = {
+        "policy": "script",
+        "checkpoint": "runs/gone",
+        "overrides": ["region=llanbedr", "port=0"],
+    }
+    head = {
+        "journal": "damian-advice",
+        "version": 3,
+        "fleet": "north",
+        "uavs": uavs,
+        "about": about,
+    }
     path.write_text("".join(json.dumps(line) + "\n" for line in [head, *lines]), encoding="utf-8")
     return path

@@ -1,4 +1,5 @@
-"""A copter and a service that do and say what a test scripts, and a bridge between them in virtual time."""
+"""A copter and a service that do and say what a test scripts, and a bridge between them in virtual
+time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +13,8 @@ TICK = 0.25
 
 
 class Vehicle(Copter):
-    """Hears and says nothing if it is ``deaf`` or ``silent``, and gives ``results`` instead of obeying."""
+    """Hears and says nothing if it is ``deaf`` or ``silent``, and gives ``results`` instead of
+    obeying."""
 
     def __init__(self, system: int = 1) -> None:
         self.results: dict[int, int] = {}
@@ -47,7 +49,10 @@ class Vehicle(Copter):
                 each.fix_type = self.receiver
             elif each.get_type() == "SYS_STATUS":
                 present, healthy = self.sensors
-                each.onboard_control_sensors_present, each.onboard_control_sensors_health = present, healthy
+                each.onboard_control_sensors_present, each.onboard_control_sensors_health = (
+                    present,
+                    healthy,
+                )
         super().send(*messages)
 
     def switch_motors(self) -> None:
@@ -88,7 +93,9 @@ class Service:
             body = {"status": [said if said != "accepted" else self.status]}
         elif name == "uavs":
             self.members = [*(self.members or []), *request.body.get("join", [])]
-            self.members = [each for each in self.members if each not in request.body.get("leave", [])]
+            self.members = [
+                each for each in self.members if each not in request.body.get("leave", [])
+            ]
         elif request.method == "PUT":
             self.members, status = list(request.body["uavs"]), 201
         elif self.members is None:
@@ -106,7 +113,13 @@ class Service:
             self.offer |= {"reason": self.reason if self.command else None}
             if kind != "hold":
                 lat, lon = (HOME, GOAL)[self.n % 2]
-                self.offer |= {"lat": lat, "lon": lon, "altitude": 5.0, "speed": 5.0, "duration": 30.0}
+                self.offer |= {
+                    "lat": lat,
+                    "lon": lon,
+                    "altitude": 5.0,
+                    "speed": 5.0,
+                    "duration": 30.0,
+                }
         return self.offer | ({"state": "bound"} if self.status in ("accepted", "taken off") else {})
 
 
@@ -135,7 +148,10 @@ class World:
         return bool(until())
 
     def until(self, state: str) -> "World":
-        assert self.run(120, lambda: self.bridge.state == state), (self.bridge.state, self.bridge.why)
+        assert self.run(120, lambda: self.bridge.state == state), (
+            self.bridge.state,
+            self.bridge.why,
+        )
         return self
 
     def until_said(self, answer: str, how: str) -> bool:

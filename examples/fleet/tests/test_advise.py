@@ -53,11 +53,14 @@ def test_a_table_is_answered_with_landing_points(advise, capsys):
 def test_a_trained_policy_answers_as_it_was_trained(advise, capsys):
     rows = TABLE.splitlines()
     Path("three.csv").write_text("\n".join(rows), encoding="utf-8")
-    words = ["checkpoint=damian:crowded-any-delay", "table=three.csv"]
+    words = ["checkpoint=damian:crowded-any-delay", "region=llanbedr", "table=three.csv"]
     with pytest.raises(SystemExit):
         advise(*words)
-    assert capsys.readouterr().err.startswith("error: motion: instant: the policy's UAVs were at their")
-    answer = list(csv.DictReader((advise(*words, "instant=true") / "advice.csv").open(encoding="utf-8")))
+    assert capsys.readouterr().err.startswith(
+        "error: motion: instant: the policy's UAVs were at their"
+    )
+    text = (advise(*words, "instant=true") / "advice.csv").read_text(encoding="utf-8")
+    answer = list(csv.DictReader(text.splitlines()))
     assert [each["ID"] for each in answer] == ["A", "B", "C"]
     assert all(each["state"] in ("fly", "hold") for each in answer)
 
@@ -65,12 +68,17 @@ def test_a_trained_policy_answers_as_it_was_trained(advise, capsys):
 REFUSALS = [
     ([], "table: it is missing: give table=FILE"),
     (["table=nothing.csv"], "nothing.csv: no such file"),
-    (["table=table.csv", "links=updown"], "links: updown is not server: reports are what the server node"),
+    (
+        ["table=table.csv", "links=updown"],
+        "links: updown is not server: reports are what the server node",
+    ),
     (["table=far.csv"], "far.csv: line 2: lat, lon: 48, 11 is "),
 ]
 
 
-@pytest.mark.parametrize(("words", "message"), REFUSALS, ids=[" ".join(words) for words, _ in REFUSALS])
+@pytest.mark.parametrize(
+    ("words", "message"), REFUSALS, ids=[" ".join(words) for words, _ in REFUSALS]
+)
 def test_what_cannot_be_is_refused_in_one_line(advise, capsys, words, message):
     Path("far.csv").write_text("ID,lat,lon\nA,48,11\n", encoding="utf-8")
     with pytest.raises(SystemExit) as ended:
@@ -94,13 +102,23 @@ LINES = [
 
 def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(advise):
     write_journal(Path("north.jsonl"), *LINES, uavs=["A", "B"])
-    words = ["journal=north.jsonl", "region=llanbedr", "delay=paper", "clock.simulation=0.5s", "folder=shown"]
+    words = [
+        "journal=north.jsonl",
+        "region=llanbedr",
+        "delay=paper",
+        "clock.simulation=0.5s",
+        "folder=shown",
+    ]
     folder = advise(*words, "formats=[gif,geojson]", program=offline.playback) / "shown"
     episode = Episode.load(folder / "episode_0.json")
     assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
     assert np.diff(episode.time) == pytest.approx(0.5)
     about = dict(episode.about)
-    assert (about["policy"], about["checkpoint"], about["fleet"]) == ("script", "runs/gone", "north")
+    assert (about["policy"], about["checkpoint"], about["fleet"]) == (
+        "script",
+        "runs/gone",
+        "north",
+    )
     assert about["began"] == "2023-11-14T22:13:21.000Z", "when both had reported"
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == episode.n_steps + 1

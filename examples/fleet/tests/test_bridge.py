@@ -65,7 +65,8 @@ def in_state(state: str) -> World:
 
 
 def watches(world: World) -> bool:
-    """Whether the bridge gives the vehicle to the pilot, and commands nothing before that, nor afterwards."""
+    """Whether the bridge gives the vehicle to the pilot, and commands nothing before that, nor
+    afterwards."""
     before = len(world.vehicle.commands())
     world.until("watch").heal().run(60)
     return len(world.vehicle.commands()) == before and world.bridge.state == "watch"
@@ -89,7 +90,11 @@ ACTS = {
     "failsafe": lambda vehicle: vehicle.failsafe.add("battery"),
 }
 SEEN = [(state, act) for state in ["join", *FLIGHT] for act in ACTS]
-SEEN = [each for each in SEEN if each[1] != "failsafe" or each[0] in ("join", "ground", "accept", "guided")]
+SEEN = [
+    each
+    for each in SEEN
+    if each[1] != "failsafe" or each[0] in ("join", "ground", "accept", "guided")
+]
 
 
 @pytest.mark.parametrize(("state", "act"), [each for each in SEEN if each != ("arm", "motors")])
@@ -111,7 +116,9 @@ def test_another_station_may_send_it_elsewhere(state):
     assert abs(world.vehicle.place - world.vehicle.metres(HOME[0], HOME[1] + 0.001)) < 1
 
 
-@pytest.mark.parametrize("is_lost", [False, True], ids=["before its command", "whose own command got lost"])
+@pytest.mark.parametrize(
+    "is_lost", [False, True], ids=["before its command", "whose own command got lost"]
+)
 def test_a_landing_that_may_be_of_somebody_else_is_the_pilots(is_lost):
     world = in_state("cruise")
     world.vehicle.switch = None  # no receiver: nobody sees a switch
@@ -161,7 +168,9 @@ def test_a_copter_that_nobody_commands_is_landed_by_its_failsafe(cause):
     else:
         world.vehicle.silent = True
     said = []
-    world.others = lambda _: said.extend(m.text for m in world._out if m.get_type() == "STATUSTEXT") or []
+    world.others = lambda _: (
+        said.extend(m.text for m in world._out if m.get_type() == "STATUSTEXT") or []
+    )
     assert world.run(60, lambda: world.vehicle.mode == LAND)
     assert any("nobody commands it" in text for text in said)
     world.run(60)
@@ -237,7 +246,9 @@ def test_without_a_memory_a_flight_is_left_to_the_pilot():
     assert watches(world)
 
 
-@pytest.mark.parametrize(("command", "state"), [(SET_MODE, "guided"), (ARM, "arm"), (TAKEOFF, "climb")])
+@pytest.mark.parametrize(
+    ("command", "state"), [(SET_MODE, "guided"), (ARM, "arm"), (TAKEOFF, "climb")]
+)
 def test_what_is_refused_before_the_flight_gives_the_vehicle_back(command, state):
     world = World()
     world.vehicle.results = {command: REFUSED}
@@ -302,7 +313,9 @@ def test_acknowledgements_for_other_stations_do_not_count():
     assert world.until_said("x-1", "landed")
 
 
-@pytest.mark.parametrize("says", [{"fix": False}, {"receiver": 1}], ids=["zeros", "said by the receiver"])
+@pytest.mark.parametrize(
+    "says", [{"fix": False}, {"receiver": 1}], ids=["zeros", "said by the receiver"]
+)
 def test_a_position_before_the_fix_is_none_and_it_flies_afterwards(says):
     world = World(system=1)
     vars(world.vehicle).update(says)
@@ -425,7 +438,9 @@ def test_started_again_it_goes_on_as_it_was_and_tells_what_it_had_to_tell(state)
         end = "landed" if state in ("climb", "cruise", "landing") else "aborted"
         assert world.until_said("x-1", end)
         assert world.run(200, lambda: world.service.facts[-1][1] == "landed")
-    assert world.service.reports[n_reports]["number"] == world.service.reports[0]["number"] + n_reports
+    assert (
+        world.service.reports[n_reports]["number"] == world.service.reports[0]["number"] + n_reports
+    )
 
 
 def test_an_older_message_on_a_longer_way_does_not_count():
@@ -439,7 +454,13 @@ def test_an_older_message_on_a_longer_way_does_not_count():
 
 @pytest.mark.parametrize(
     ("come", "facts"),
-    [("lapsed", []), ("refused", []), ("unknown", []), ("landed", []), ("taken off", [("x-1", "aborted")])],
+    [
+        ("lapsed", []),
+        ("refused", []),
+        ("unknown", []),
+        ("landed", []),
+        ("taken off", [("x-1", "aborted")]),
+    ],
 )
 def test_what_the_service_does_not_confirm_is_not_flown(come, facts):
     world = World()

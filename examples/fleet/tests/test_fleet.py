@@ -18,7 +18,8 @@ LATE = {"law": "uniform", "low": 0, "high": 4}
 
 
 def recurrent(env):
-    """A policy with random weights and hidden states, the same for every environment of a scenario."""
+    """A policy with random weights and hidden states, the same for every environment of a
+    scenario."""
     torch.manual_seed(7)
     actor = MappoConfig().make_actor(env, MlpConfig(hidden=[16], rnn="gru"))
     add_recurrent_state(env, actor)
@@ -26,7 +27,10 @@ def recurrent(env):
 
 
 TASKS = {
-    "the last to arrive": (script_policy, {"delay": DelayConfig(obs=LATE, loss=0.2, order="arrival")}),
+    "the last to arrive": (
+        script_policy,
+        {"delay": DelayConfig(obs=LATE, loss=0.2, order="arrival")},
+    ),
     "flights": (
         recurrent,
         {

@@ -64,10 +64,14 @@ def test_what_is_no_json_over_http_is_no_answer(said, status, content, served):
 
 
 def test_a_service_that_is_not_there_is_no_answer():
-    assert ask("http://127.0.0.1:9", "token", Request("POST", "/x", {}, number=7)) == Answer(None, None, 7)
+    assert ask("http://127.0.0.1:9", "token", Request("POST", "/x", {}, number=7)) == Answer(
+        None, None, 7
+    )
 
 
-def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(served, tmp_path, monkeypatch):
+def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(
+    served, tmp_path, monkeypatch
+):
     service, vehicle, now = Service(), Vehicle(), [0.0]
     service.command = "hold"
 
@@ -95,7 +99,16 @@ def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(served, t
                 done.append(os.kill(os.getpid(), signal.SIGINT))
 
     done, port = [], own.getsockname()[1]
-    words = ["--service", served(answer), "--fleet", "north", "--memory", str(tmp_path), "--token", "x"]
+    words = [
+        "--service",
+        served(answer),
+        "--fleet",
+        "north",
+        "--memory",
+        str(tmp_path),
+        "--token",
+        "x",
+    ]
     words += ["--vehicle", f"A=udpout:127.0.0.1:{port}#1"]
     monkeypatch.setattr("sys.argv", ["damian-mavlink", *words])
     thread = threading.Thread(target=fly)

@@ -47,13 +47,22 @@ def service():
 
 def report(fleets, uav, number):
     lat, lon = PLACES[uav]
-    row = {"ID": uav, "number": number, "time": time.time(), "lat": lat, "lon": lon, "battery": 80 - number}
+    row = {
+        "ID": uav,
+        "number": number,
+        "time": time.time(),
+        "lat": lat,
+        "lon": lon,
+        "battery": 80 - number,
+    }
     fleets.take("north", Fleet.reported, read_json(row), time.time())
 
 
 def test_the_map_shows_each_uav_its_goal_and_its_row_and_asks_for_the_token(tmp_path):
     with service() as (fleets, address), chromium() as driver:
-        wait = import_module("selenium.webdriver.support.wait").WebDriverWait(driver, 20, 0.05).until
+        wait = (
+            import_module("selenium.webdriver.support.wait").WebDriverWait(driver, 20, 0.05).until
+        )
         text = lambda name: driver.find_element("id", name).text  # noqa: E731
         resize(driver, 1000)
         fleets.create("north", [*PLACES])
@@ -67,11 +76,16 @@ def test_the_map_shows_each_uav_its_goal_and_its_row_and_asks_for_the_token(tmp_
         field.clear()
         field.send_keys(TOKEN + "\n")
         wait(lambda _: len(driver.find_elements("css selector", "#uavs tr")) == len(PLACES))
-        assert [" ".join(line.split()[:2]) for line in text("uavs").splitlines()] == ["A fly", "B none"]
+        assert [" ".join(line.split()[:2]) for line in text("uavs").splitlines()] == [
+            "A fly",
+            "B none",
+        ]
         assert "79 %" in text("uavs")
         seen = driver.execute_script(COLOURS)
         assert {"0,114,178", "213,94,0"} <= {*seen}, seen  # both darts in their colours
-        assert seen["0,114,178"] > seen["213,94,0"]  # that of A, with the ring at its goal and the way there
+        assert (
+            seen["0,114,178"] > seen["213,94,0"]
+        )  # that of A, with the ring at its goal and the way there
         report(fleets, "B", 9)
         wait(lambda _: "71 %" in text("uavs"))
         driver.save_screenshot(str(tmp_path / "map.png"))

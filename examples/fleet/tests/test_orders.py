@@ -38,7 +38,9 @@ def test_an_answer_that_got_lost_moves_nobody_and_is_given_again_while_it_holds(
     assert field.ask("A", 5) == first.model_copy(update={"age": 6.0})
     assert field.booked("A") == 200
     later = field.ask("A", 6)
-    assert (later.answer != first.answer, later.distance) == (True, first.distance), "from where it stands"
+    assert (later.answer != first.answer, later.distance) == (True, first.distance), (
+        "from where it stands"
+    )
     assert field.say("A", first.answer, "accepted") == "lapsed"
     assert field.booked("A") == 200
     assert field.say("A", later.answer, "accepted") == "accepted"
@@ -157,7 +159,9 @@ def test_an_answer_is_not_accepted_if_it_is_not_safe_any_more(field, what):
         field.report("A", 200, battery=19.0)
     elif what == "place":
         field.report("B", field.east_of(200))
-    assert field.say("A", answer.answer, "accepted") == ("accepted" if what == "nothing" else "lapsed")
+    assert field.say("A", answer.answer, "accepted") == (
+        "accepted" if what == "nothing" else "lapsed"
+    )
 
 
 def test_a_flight_begins_where_the_uav_stands_beside_its_landing_point(field):
@@ -175,7 +179,9 @@ def test_a_uav_returns_on_its_reserve_if_it_reaches_home_and_no_flight_ends_belo
     energy = replace(SCENARIO, battery=BatteryConfig(enabled=True, capacity_kwh=0.02))
     field = begun(200, scenario=energy, reserve=40.0)
     there = field.east_of(200)
-    drain = field.fleet._flight(field.fleet.uavs["A"], tuple(field.fleet.ground.points[200]), there)[1]
+    drain = field.fleet._flight(
+        field.fleet.uavs["A"], tuple(field.fleet.ground.points[200]), there
+    )[1]
     assert 5 < drain < 35
     field.report("A", 200, battery=40.0 + drain / 2, time=START + 0.5)
     assert told(field, "A", 1) == ("hold", "battery"), "the flight would end below"
@@ -191,7 +197,9 @@ def test_a_uav_returns_on_its_reserve_if_it_reaches_home_and_no_flight_ends_belo
     field.now += 0.1
     field.report("A", there, battery=drain + 1, FLA=5.0)
     newest = field.fleet.tracker.logs["A"].newest
-    assert (newest.point, newest.target) == (there, 200), "of this flight, though it began in the same step"
+    assert (newest.point, newest.target) == (there, 200), (
+        "of this flight, though it began in the same step"
+    )
     assert field.ask("A", 1).state == "bound", "it has taken off for home, and is not told to hold"
     field.command("hold", ["A"])
     assert field.ask("A", 11).state == "hold", "a person wants it so"
@@ -234,7 +242,11 @@ def test_a_person_sends_uavs_home(field):
     field.say("A", answer.answer, "accepted")
     field.command("return", ["A"])
     recalled, home = field.ask("A", 2), field.fleet.ground.place(200)
-    assert (recalled.state, (recalled.lat, recalled.lon), recalled.heading) == ("return", home, None)
+    assert (recalled.state, (recalled.lat, recalled.lon), recalled.heading) == (
+        "return",
+        home,
+        None,
+    )
     field.fleet.uavs["A"].home = field.east_of(200)
     assert field.ask("A", 11).state == "bound", "it is on its way home already"
     field.fleet.uavs["A"].home = 200
@@ -242,7 +254,9 @@ def test_a_person_sends_uavs_home(field):
     field.report("A", field.east_of(200))
     field.report("B", 200)
     beside = field.ask("A", 1)
-    assert (beside.state, (beside.lat, beside.lon) != home) == ("return", True), "another one stands there"
+    assert (beside.state, (beside.lat, beside.lon) != home) == ("return", True), (
+        "another one stands there"
+    )
     field.say("A", beside.answer, "refused")
     field.now += 11
     field.report("B", 300)
@@ -325,7 +339,9 @@ def test_a_way_is_checked_from_where_the_uav_stands_with_a_margin(aside, bends):
     """Past the upper edge of a zone, whose margin is 10 m."""
     field, x, y = holed()
     points, fleet = field.fleet.ground.points, field.fleet
-    goal = min(range(len(points)), key=lambda i: abs(points[i][0] - x - 90) + abs(points[i][1] - y - 41))
+    goal = min(
+        range(len(points)), key=lambda i: abs(points[i][0] - x - 90) + abs(points[i][1] - y - 41)
+    )
     stand(field, x - 60, y + 41 + aside - (points[goal][1] - y - 41))
     field.ask("A")
     told = fleet._decision(fleet.uavs["A"], None, goal)
@@ -361,7 +377,9 @@ def test_an_offer_is_not_accepted_from_where_its_way_crosses_a_zone():
     told = field.ask("A", 1)
     assert told.state == "fly"
     gx, gy = field.fleet.ground.points[field.fleet.uavs["A"].offer.goal]
-    lat, lon = (float(each) for each in to_latlon(2 * x - gx, 2 * y - gy, field.fleet.ground.region.origin))
+    lat, lon = (
+        float(each) for each in to_latlon(2 * x - gx, 2 * y - gy, field.fleet.ground.region.origin)
+    )
     field.now += 1
     field.report("A", 0, lat=lat, lon=lon)
     assert field.say("A", told.answer, "accepted") == "lapsed"

@@ -23,7 +23,9 @@ N_STEPS = 60
 SCENARIO = ScenarioConfig(
     agents=3,
     region=LLANBEDR,
-    source=SourceConfig(motion="dynamic", level_db=143.0, emission="per_step", emission_probability=0.6),
+    source=SourceConfig(
+        motion="dynamic", level_db=143.0, emission="per_step", emission_probability=0.6
+    ),
     delay=DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, loss=0.2),
     observation=ObservationConfig(local_features=["spotted", "battery"], belief=["belief_moments"]),
     battery=BatteryConfig(enabled=True),
@@ -31,7 +33,9 @@ SCENARIO = ScenarioConfig(
 )
 MOTIONS = {
     "instant": MotionConfig(),
-    "flights": MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0, sensing_time=2.0),
+    "flights": MotionConfig(
+        kind="polynomial", max_speed=40.0, max_acceleration=20.0, sensing_time=2.0
+    ),
 }
 SCENARIOS = {name: replace(SCENARIO, motion=motion) for name, motion in MOTIONS.items()}
 
@@ -51,12 +55,15 @@ def scenario(request) -> ScenarioConfig:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory, scenario) -> tuple:
-    """A simulated flight, the episode that the simulation recorded, and the journal of its reports."""
+    """A simulated flight, the episode that the simulation recorded, and the journal of its
+    reports."""
     env = make_env(scenario, 1, 3, extras=EXTRAS)
     rollout = env.rollout(N_STEPS, script_policy(env), break_when_any_done=False)
     reporter, lines = Reporter(env, Node(scenario, 3).ground), []
     for step in range(N_STEPS + 1):
-        reporter.send(rollout[:, step] if step < N_STEPS else rollout[:, -1]["next"], step, at_once=step == 0)
+        reporter.send(
+            rollout[:, step] if step < N_STEPS else rollout[:, -1]["next"], step, at_once=step == 0
+        )
         now = reporter.time_of(step) + 0.2 * reporter.dt
         lines += [{"received": now, "reports": rows}] if (rows := reporter.arriving(step)) else []
         lines.append({"asked": now + 0.1 * reporter.dt, "told": {}})
@@ -83,14 +90,18 @@ def test_a_journal_tells_what_the_server_knew_bit_for_bit(flown, told):
     assert (told.age > 0).any()
 
 
-def test_a_journal_tells_what_was_sent_and_when_it_arrived_unless_the_flight_ended_before(flown, told):
+def test_a_journal_tells_what_was_sent_and_when_it_arrived_unless_the_flight_ended_before(
+    flown, told
+):
     recorded = flown[0]
     arrived = recorded.sent & (recorded.delay >= 0)
     arrived &= np.arange(N_STEPS + 1)[:, None] + recorded.delay <= N_STEPS
     assert np.array_equal(told.sent & (told.delay >= 0), arrived)
     assert np.array_equal(told.delay[arrived], recorded.delay[arrived])
     missing = recorded.sent & ~arrived
-    for uav in range(3):  # losses are seen by gaps between numbers, up to the last message that came in
+    for uav in range(
+        3
+    ):  # losses are seen by gaps between numbers, up to the last message that came in
         last = np.flatnonzero(arrived[:, uav])[-1]
         assert told.lost[:, uav].sum() == missing[:last, uav].sum()
     if recorded.instant:  # messages of every step: it is also known when they were sent
@@ -119,7 +130,9 @@ def test_where_uavs_were_is_what_they_reported_in_hindsight(flown, told):
 
 def test_a_journal_without_a_flight_is_refused(tmp_path):
     path = write_journal(tmp_path / "x.jsonl", uavs=names_of(1))
-    with pytest.raises(InputError, match=r"x\.jsonl: the fleet never began: not every UAV has reported"):
+    with pytest.raises(
+        InputError, match=r"x\.jsonl: the fleet never began: not every UAV has reported"
+    ):
         played(path, SCENARIO)
 
 
@@ -135,7 +148,9 @@ def test_another_episode_begins_when_uavs_join_and_leave(tmp_path):
     first, *others, last = names_of(4)
     members = {"join": [last], "leave": [first], "received": 1005.0}
     lines = [reports(1000.0, 0, 1, 2), members, reports(1007.0, 1, 3), reports(1009.0, 2)]
-    path = write_journal(tmp_path / "x.jsonl", *lines, {"asked": 1012.0, "told": {}}, uavs=names_of(3))
+    path = write_journal(
+        tmp_path / "x.jsonl", *lines, {"asked": 1012.0, "told": {}}, uavs=names_of(3)
+    )
     before, after = played(path, replace(SCENARIO, observation=ObservationConfig()))
     assert (before.names, after.names) == ([first, *others], [*others, last])
     assert (before.n_steps, after.n_steps) == (0, 3)

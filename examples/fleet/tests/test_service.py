@@ -82,7 +82,11 @@ def test_reports_go_in_and_landing_points_come_out(client):
 
 def test_looking_changes_nothing(client):
     begin(client)
-    paths = [route for route, does in client.get("/openapi.json").json()["paths"].items() if "get" in does]
+    paths = [
+        route
+        for route, does in client.get("/openapi.json").json()["paths"].items()
+        if "get" in does
+    ]
     assert len(paths) >= 6
     before = client.get(f"{NORTH}/journal").text
     for _ in range(2):
@@ -103,7 +107,11 @@ def test_two_reports_of_one_second_count_and_one_that_comes_twice_counts_once(cl
     def found(**changed) -> str:
         return client.post(f"{NORTH}/reports", json=row("A", **changed)).json()["found"][0]
 
-    assert [found(source_spotted=1), found(source_spotted=1), found()] == ["new", "duplicate", "duplicate"]
+    assert [found(source_spotted=1), found(source_spotted=1), found()] == [
+        "new",
+        "duplicate",
+        "duplicate",
+    ]
     assert [found(number=7), found(number=8), found(number=7)] == ["new", "new", "duplicate"]
     one = {"number": 9, "time": None, "AoI": 1}
     client.wait(1)
@@ -133,7 +141,11 @@ def test_the_autopilot_says_what_is_on_the_ground(client, says, flies):
 def test_who_has_the_wrong_token_learns_nothing(client):
     answers = [
         client.request(method, path, headers={"Authorization": token})
-        for method, path in (("GET", NORTH), ("GET", "/fleets/nowhere"), ("POST", f"{NORTH}/advice"))
+        for method, path in (
+            ("GET", NORTH),
+            ("GET", "/fleets/nowhere"),
+            ("POST", f"{NORTH}/advice"),
+        )
         for token in ("Bearer wrong", "", f"Basic {TOKEN}")
     ]
     said = {(each.status_code, each.json()["error"]) for each in answers}
@@ -148,11 +160,20 @@ def test_who_has_the_wrong_token_learns_nothing(client):
         ({"lat": 528110000}, "lat: 528110000: Value error, give degrees, not degrees times 10^7"),
         ({"time": 1.75e12}, "time: 1750000000000.0: Value error, give seconds, not milliseconds"),
         ({"lat": None, "latitude": 52.8}, "latitude: it is not a column here: give lat [deg]"),
-        ({"battery": None, "percentage": 0.8}, "percentage: it is not a column here: give battery [%], 100"),
-        ({"altitude(feet)": 60}, "altitude(feet): it is not a column here: give fla [m], 0.3048 times"),
+        (
+            {"battery": None, "percentage": 0.8},
+            "percentage: it is not a column here: give battery [%], 100",
+        ),
+        (
+            {"altitude(feet)": 60},
+            "altitude(feet): it is not a column here: give fla [m], 0.3048 times",
+        ),
         ({"battery": 101}, "battery: 101: Input should be less than or equal to 100"),
         ({"lat": 53.9}, "lat, lon: 53.9, -4.1264 is 1"),
-        ({"time": NOW + 60}, "time: 1750000060 s is 60.0 s after it came in: set the clock of the UAV"),
+        (
+            {"time": NOW + 60},
+            "time: 1750000060 s is 60.0 s after it came in: set the clock of the UAV",
+        ),
         ({"ID": "C"}, "ID: 'C' is not a UAV of this fleet: A, B"),
     ],
 )
@@ -166,14 +187,23 @@ def test_a_report_is_refused_with_its_column_and_what_would_be_right(client, cha
 @pytest.mark.parametrize("path", ["reports", "acknowledgements", "command", "uavs"])
 def test_any_nonsense_is_refused_and_changes_nothing(client, path):
     answer, draw = begin(client)["answer"], random.Random(3)
-    good = {"ID": "A", "answer": answer, "status": "accepted", "command": "hold", "join": ["C"], "leave": []}
+    good = {
+        "ID": "A",
+        "answer": answer,
+        "status": "accepted",
+        "command": "hold",
+        "join": ["C"],
+        "leave": [],
+    }
     before = client.get(f"{NORTH}/journal").text
     junk = [b"[]", b"null", b"3", b"1e999", b'"\\ud800"', b"[" * 20_000]
     junk += [b'{"command": "hold", "uavs": ["Z"]}']
     for _ in range(40):
         broken = dict(good)
         for key in {*draw.sample([*broken], 3), "status", "command", "join"}:
-            broken[key] = draw.choice(["=1", "x" * 99, 7.5, [[]], {"A": {}}, True, "\u202e", ["A", "A", 1]])
+            broken[key] = draw.choice(
+                ["=1", "x" * 99, 7.5, [[]], {"A": {}}, True, "\u202e", ["A", "A", 1]]
+            )
         junk += [json.dumps([broken]).encode(), draw.randbytes(40)]
     for number, body in enumerate(junk):
         kind = {"Content-Type": "text/csv" if number % 5 == 4 else "application/json"}
@@ -191,7 +221,9 @@ def test_a_jump_of_the_system_clock_is_shown_and_the_service_keeps_its_time(jump
     clock = Clock(NOW - 9, lambda: hands["system"], lambda: hands["monotonic"])
     hands |= {"system": NOW + 2 + jump, "monotonic": 7.0}
     assert (clock(), clock.system_ahead) == (NOW + 2, jump)
-    assert Clock(NOW + 9e6, lambda: hands["system"])() == pytest.approx(NOW + 9e6), "after what is stored"
+    assert Clock(NOW + 9e6, lambda: hands["system"])() == pytest.approx(NOW + 9e6), (
+        "after what is stored"
+    )
 
 
 def test_one_bridge_speaks_for_a_uav_and_for_a_vehicle_until_it_is_gone(client):
@@ -210,7 +242,9 @@ def test_one_bridge_speaks_for_a_uav_and_for_a_vehicle_until_it_is_gone(client):
     assert says(report("A", "second", "board 2")).startswith(
         "bridge: first speaks for UAV A, not second: end"
     )
-    assert "first speaks for the vehicle of UAV A, here called B" in says(report("B", "third", "board 1"))
+    assert "first speaks for the vehicle of UAV A, here called B" in says(
+        report("B", "third", "board 1")
+    )
     assert report("B", "third", "board 3").status_code == 200
     for path, said in (
         ("advice", {"uavs": ["A"], "bridge": "second"}),
@@ -233,14 +267,18 @@ def test_one_bridge_speaks_for_a_uav_and_for_a_vehicle_until_it_is_gone(client):
 def test_a_bridge_keeps_its_uav_for_a_flight(client):
     client.wait(1)
     client.post(f"{NORTH}/reports", json=[row("A", bridge="first"), row("B")])
-    told = client.post(f"{NORTH}/advice", json={"uavs": ["A"], "bridge": "first"}).json()["advice"][0]
+    told = client.post(f"{NORTH}/advice", json={"uavs": ["A"], "bridge": "first"}).json()["advice"][
+        0
+    ]
     said = {"ID": "A", "answer": told["answer"], "status": "accepted", "bridge": "first"}
     assert client.post(f"{NORTH}/acknowledgements", json=said).json() == {"status": ["accepted"]}
     client.wait(2 * told["duration"])
     answer = client.post(f"{NORTH}/reports", json=row("A", number=3, bridge="second"))
     assert answer.status_code == 409
     client.wait(120)
-    assert client.post(f"{NORTH}/reports", json=row("A", number=3, bridge="second")).status_code == 200
+    assert (
+        client.post(f"{NORTH}/reports", json=row("A", number=3, bridge="second")).status_code == 200
+    )
 
 
 @pytest.mark.parametrize("kind", ["application/json", "text/csv"])
@@ -256,7 +294,9 @@ def test_strangers_are_few_and_do_not_stay(monkeypatch):
     monkeypatch.setattr(door, "MOST_STRANGERS", 3)
     monkeypatch.setattr(door, "PATIENCE", 0.3)
     app = make_app(Fleets(made(), ":memory:", {}), TOKEN)
-    config = uvicorn.Config(app, port=0, log_level="error", http=door.door(TOKEN), limit_concurrency=8)
+    config = uvicorn.Config(
+        app, port=0, log_level="error", http=door.door(TOKEN), limit_concurrency=8
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
@@ -268,7 +308,9 @@ def test_strangers_are_few_and_do_not_stay(monkeypatch):
     with httpx2.Client(base_url="http://{}:{}".format(*address), headers=headers) as known:
         for _ in range(2):
             assert known.get("/fleets").status_code == 200
-            for each in silent:  # all have been closed the second time, but not who has shown the token
+            for (
+                each
+            ) in silent:  # all have been closed the second time, but not who has shown the token
                 each.settimeout(5)
                 with contextlib.suppress(ConnectionResetError):
                     assert each.recv(1) == b""

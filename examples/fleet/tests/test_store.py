@@ -28,12 +28,20 @@ PLACE = {"A": (52.8110, -4.1283), "B": (52.8133, -4.1264)}
 def known(fleet: Fleet) -> dict[str, Any]:
     """All that a fleet knows, to be compared."""
     tracker = fleet.tracker
-    memories = [{name: value.tolist() for name, value in each.items()} for each in tracker.before or []]
+    memories = [
+        {name: value.tolist() for name, value in each.items()} for each in tracker.before or []
+    ]
     seen = tracker.observe()[keys.OBSERVATION].tolist() if tracker.has_begun else None
     return {
         "uavs": fleet.uavs,
         "rest": ({*fleet.joining}, fleet.clock, fleet.n_answers),
-        "tracker": (tracker.step, tracker.start, tracker.held, tracker.pending, tracker.action.tolist()),
+        "tracker": (
+            tracker.step,
+            tracker.start,
+            tracker.held,
+            tracker.pending,
+            tracker.action.tolist(),
+        ),
         "reports": {uav: log.reports for uav, log in tracker.logs.items()},
         "computed": (memories, seen),
     }
@@ -62,12 +70,16 @@ def test_whatever_happens_a_restart_remembers_it_all(tmp_path, seed):
                 assert told.state != "fly" or field.fleet.danger(field.fleet.uavs[told.ID]) is None
                 given |= {told.answer: told.ID} if told.answer else {}
         elif kind < 0.92 and given:
-            word = draw.choice(["accepted", "accepted", "taken off", "landed", "refused", "aborted"])
+            word = draw.choice(
+                ["accepted", "accepted", "taken off", "landed", "refused", "aborted"]
+            )
             answer = draw.choice([*given][-6:])
             if given[answer] in uavs:
                 field.say(given[answer], answer, word)
         elif kind < 0.97:
-            field.command(draw.choice(["hold", "resume", "resume", "return"]), draw.choice([None, [uav]]))
+            field.command(
+                draw.choice(["hold", "resume", "resume", "return"]), draw.choice([None, [uav]])
+            )
         elif "D" in uavs:
             field.change([], ["D"])
         elif "D" not in field.fleet.joining:
@@ -135,7 +147,9 @@ def test_a_request_that_cannot_be_stored_changes_nothing(tmp_path):
 
 def test_a_database_is_of_one_service_and_of_one_policy(tmp_path):
     field = Field(tmp_path / "fleets.db")
-    with pytest.raises(InputError, match=r"database: .*fleets.db cannot be used: database is locked"):
+    with pytest.raises(
+        InputError, match=r"database: .*fleets.db cannot be used: database is locked"
+    ):
         field.open()
     field.scenario = replace(SCENARIO, region=replace(SCENARIO.region, lattice_step=60.0))
     field.restart()
@@ -146,7 +160,9 @@ def test_a_database_is_of_one_service_and_of_one_policy(tmp_path):
         Fleets(field.make, field.path, {"policy": "sampled", "region": "llanbedr"})
     message = "policy: script then, sampled now; region: None then, llanbedr now"
     assert str(error.value) == f"database: fleet north is of other settings: {message}"
-    (tmp_path / "text.db").write_text("this is not a database, however long it may be", encoding="utf-8")
+    (tmp_path / "text.db").write_text(
+        "this is not a database, however long it may be", encoding="utf-8"
+    )
     with pytest.raises(InputError, match="file is not a database"):
         Fleets(field.make, tmp_path / "text.db", {})
 
@@ -156,11 +172,17 @@ def test_nothing_that_was_acknowledged_is_lost_by_kill(tmp_path):
     told, counted = {}, 0
     words = ["region=llanbedr", "motion=polynomial", f"token={TOKEN}", "port=0"]
     code = [sys.executable, "-W", "ignore", "-c", "from damian_fleet.program import main; main()"]
-    rows = [{"ID": uav, "lat": place[0], "lon": place[1], "battery": 80} for uav, place in PLACE.items()]
+    rows = [
+        {"ID": uav, "lat": place[0], "lon": place[1], "battery": 80} for uav, place in PLACE.items()
+    ]
     for _ in range(2):
-        with subprocess.Popen([*code, *words], cwd=tmp_path, stdout=subprocess.PIPE, text=True) as program:
+        with subprocess.Popen(
+            [*code, *words], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+        ) as program:
             line = next(line for line in program.stdout if line.startswith("listening"))
-            client = httpx2.Client(base_url=line.split()[-1], headers={"Authorization": f"Bearer {TOKEN}"})
+            client = httpx2.Client(
+                base_url=line.split()[-1], headers={"Authorization": f"Bearer {TOKEN}"}
+            )
             if not told:
                 client.put("/fleets/f", json={"uavs": [*PLACE]})
                 client.post("/fleets/f/reports", json=rows)
@@ -168,7 +190,9 @@ def test_nothing_that_was_acknowledged_is_lost_by_kill(tmp_path):
             assert not told or again == told | {"state": "bound", "age": again["age"]}
             told = told or again
             said = {"ID": "A", "answer": told["answer"], "status": "accepted"}
-            assert client.post("/fleets/f/acknowledgements", json=said).json() == {"status": ["accepted"]}
+            assert client.post("/fleets/f/acknowledgements", json=said).json() == {
+                "status": ["accepted"]
+            }
             assert client.get("/fleets/f").json()["uavs"][1]["reports"] >= counted
             threading.Timer(0.4, program.kill).start()
             with contextlib.suppress(httpx2.TransportError):

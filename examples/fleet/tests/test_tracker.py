@@ -1,4 +1,5 @@
-"""The server node that follows UAVs by their reports knows what the simulation's one does, and no more."""
+"""The server node that follows UAVs by their reports knows what the simulation's one does, and no
+more."""
 
 from dataclasses import replace
 from typing import Any
@@ -26,13 +27,23 @@ from damian_fleet.tracker import Tracker
 
 LATE = {"law": "uniform", "low": 0, "high": 4}
 WALK = SourceConfig(motion="dynamic", level_db=143.0, emission="per_step", emission_probability=0.6)
-FEATURES = ["source_distance", "source_bearing", "source_time", "source_drift", "agent_distances", "coverage"]
+FEATURES = [
+    "source_distance",
+    "source_bearing",
+    "source_time",
+    "source_drift",
+    "agent_distances",
+    "coverage",
+]
 SEEN = ObservationConfig(global_features=FEATURES, local_features=["spotted", "battery"], age=True)
 BELIEF = replace(SEEN, belief=["belief_gain", "belief_moments"])
 TASKS: dict[str, dict[str, Any]] = {
     "on time": {"observation": SEEN},
     "late": {"delay": DelayConfig(obs=LATE, loss=0.2), "observation": SEEN},
-    "the last to arrive": {"delay": DelayConfig(obs=LATE, loss=0.2, order="arrival"), "observation": SEEN},
+    "the last to arrive": {
+        "delay": DelayConfig(obs=LATE, loss=0.2, order="arrival"),
+        "observation": SEEN,
+    },
     "held back": {"delay": DelayConfig(obs=LATE, hold="max"), "observation": SEEN},
     "messages": {"delay": DelayConfig(obs=LATE, loss=0.2, messages=5), "observation": SEEN},
     "belief": {"delay": DelayConfig(obs=LATE, loss=0.2), "observation": BELIEF},
@@ -44,7 +55,9 @@ TASKS: dict[str, dict[str, Any]] = {
     "flights": {  # no loss: a report in flight counts where the UAV reported last on the ground
         "delay": DelayConfig(obs=2),
         "observation": BELIEF,
-        "motion": MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0, sensing_time=2.0),
+        "motion": MotionConfig(
+            kind="polynomial", max_speed=40.0, max_acceleration=20.0, sensing_time=2.0
+        ),
     },
     "timeline": {
         "delay": DelayConfig(obs=LATE),
@@ -65,7 +78,8 @@ def scenario_of(**changed) -> ScenarioConfig:
 
 
 def recurrent(env):
-    """A policy with random weights and hidden states, the same for every environment of a scenario."""
+    """A policy with random weights and hidden states, the same for every environment of a
+    scenario."""
     torch.manual_seed(7)
     actor = MappoConfig().make_actor(env, MlpConfig(hidden=[16], rnn="gru"))
     add_recurrent_state(env, actor)
@@ -117,12 +131,16 @@ def test_a_table_is_answered_as_the_policy_acts_in_the_simulation(policy_of):
     reporter, shown = Reporter(env, node.ground), env.reset()
     reporter.send(shown, 0, at_once=True)
     for step in range(12):
-        rows += [{**row, "receive time": row["time"] + 0.2} for row in reporter.arriving(step)[::-1]]
+        rows += [
+            {**row, "receive time": row["time"] + 0.2} for row in reporter.arriving(step)[::-1]
+        ]
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             shown = policy(shown)
         answers = next_landings(read_json(rows), node, policy_of(node.env), START)
         goals = env.uav_env.simulation.decide(env.uav_env.state, shown[keys.ACTION], None).goal[0]
-        assert [*zip(answers.lat, answers.lon, strict=True)] == [*map(node.ground.place, goals.tolist())]
+        assert [*zip(answers.lat, answers.lon, strict=True)] == [
+            *map(node.ground.place, goals.tolist())
+        ]
         n_moved += (answers.state == "fly").sum()
         shown = env.step(shown)["next"]
         reporter.send(shown, step + 1)
@@ -140,7 +158,9 @@ def test_who_is_in_flight_is_not_advised():
     assert {*answers.age} == {1.0}
 
 
-def told(uav: str, time: float, point: int, received: float | None = None, **more) -> dict[str, Any]:
+def told(
+    uav: str, time: float, point: int, received: float | None = None, **more
+) -> dict[str, Any]:
     """A report of a UAV at a landing point, which comes in a tenth of a second later."""
     came = time + 0.1 if received is None else received
     return {"uav": uav, "time": time, "point": point, "receive_time": came, **more}
@@ -150,7 +170,8 @@ FIRST = [told(uav, START, 200 + i) for i, uav in enumerate("abc")]
 
 
 def followed(*reports: dict[str, Any], until: float, **changed) -> Tracker:
-    """What the server node knows at an instant [s] from the first reports of three UAVs and these."""
+    """What the server node knows at an instant [s] from the first reports of three UAVs and
+    these."""
     node, rows = Node(scenario_of(**changed), 3), []
     for said in [*FIRST, *reports]:
         lat, lon = node.ground.place(said["point"])
@@ -194,7 +215,10 @@ def test_two_reports_of_one_instant_count_and_tell_of_the_landing_before():
         ({"time": 5.0}, "time: 5 s is 1.7e+09 s before it came in: the clock of a is not set"),
         ({"source_lat": 52.8}, "places are pairs lat, lon [deg], or all of them x, y [m]"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
-        ({"time": START + 2e6, "receive_time": START + 2e6}, "time: the first reports are more than 1e+06 s"),
+        (
+            {"time": START + 2e6, "receive_time": START + 2e6},
+            "time: the first reports are more than 1e+06 s",
+        ),
     ],
 )
 def test_what_no_uav_can_say_is_refused(changed, message):

@@ -42,7 +42,10 @@ class Field:
         return self.long(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height)
 
     def reposition(self, place, flags=0, frame=6):
-        at, number = [round(each * 1e7) for each in self.copter.degrees(place)], mavlink.MAV_CMD_DO_REPOSITION
+        at, number = (
+            [round(each * 1e7) for each in self.copter.degrees(place)],
+            mavlink.MAV_CMD_DO_REPOSITION,
+        )
         params = frame, number, 0, 0, -1, flags, 0, 0, *at, 20
         return self.ask(mavlink.MAVLink_command_int_message(1, 1, *params))
 
@@ -56,7 +59,11 @@ def test_it_takes_off_armed_and_guided_flies_there_lands_and_disarms_itself():
     field, goal = Field(), 100 + 50j
     copter = field.copter
     assert field.takeoff() == FAILED
-    assert [field.mode(GUIDED), field.arm(), copter.change_mode(LOITER)] == [ACCEPTED, ACCEPTED, True]
+    assert [field.mode(GUIDED), field.arm(), copter.change_mode(LOITER)] == [
+        ACCEPTED,
+        ACCEPTED,
+        True,
+    ]
     assert field.takeoff() == FAILED
     assert field.flying().takeoff(40) == FAILED, "it flies already"
     for speed in (10, 4):  # a speed holds only after the reposition that enters position control
@@ -65,7 +72,11 @@ def test_it_takes_off_armed_and_guided_flies_there_lands_and_disarms_itself():
     assert field.run(60, lambda: abs(copter.place - goal) < 0.1)
     assert [field.mode(LAND), field.run(60, lambda: not copter.armed)] == [ACCEPTED, True]
     assert (copter.landed, abs(copter.place - goal) < 1) == (True, True)
-    assert [field.mode(GUIDED), field.arm(), field.run(9.5, lambda: not copter.armed)] == [0, 0, False]
+    assert [field.mode(GUIDED), field.arm(), field.run(9.5, lambda: not copter.armed)] == [
+        0,
+        0,
+        False,
+    ]
     assert field.run(1, lambda: not copter.armed), "after ten seconds on the ground"
 
 
@@ -124,7 +135,9 @@ def test_failsafes_land_it_and_forced_disarming_lets_it_fall():
 
 def test_streams_are_off_after_a_restart_and_zeros_stand_for_the_place_before_the_first_fix():
     field = Field()
-    assert [field.long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 5e5) for number in (33, 147)] == [0, 0]
+    assert [
+        field.long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 5e5) for number in (33, 147)
+    ] == [0, 0]
     field.copter.battery = [80.0, 60.0]
     field.run(2)
     assert {m.id for m in field.received if m.get_type() == "BATTERY_STATUS"} == {0, 1}
@@ -133,7 +146,9 @@ def test_streams_are_off_after_a_restart_and_zeros_stand_for_the_place_before_th
     field.run(3)
     assert {m.get_type() for m in field.received} == {"HEARTBEAT"}
     field.long(mavlink.MAV_CMD_REQUEST_MESSAGE, 33)
-    assert [(m.lat, m.lon) for m in field.received if m.get_type() == "GLOBAL_POSITION_INT"] == [(0, 0)]
+    assert [(m.lat, m.lon) for m in field.received if m.get_type() == "GLOBAL_POSITION_INT"] == [
+        (0, 0)
+    ]
 
 
 @pytest.mark.parametrize(("wind", "carried"), [(12, False), (20, True)])
