@@ -39,7 +39,8 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         f"{task}{HELD_OUT_MARK}{name}" for task in experiment.tasks for name in experiment.held_out
     ]
     for task in rows["task"].unique():
-        should = f'is not of the leaderboard: train in one that is, by experiment=delaybench "tasks=[{places[0]}]"'
+        remedy = f'train in one that is, by experiment=delaybench "tasks=[{places[0]}]"'
+        should = f"is not of the leaderboard: {remedy}"
         checks.require(task in places, f"{path}: task", task, should)
     for name, known in (("delay", experiment.delays), ("regime", (LATE_DATA, SIMULATOR))):
         for value in rows[name].unique():
