@@ -20,7 +20,10 @@ from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEn
 
 from damian import BackupdateStorage, ObservationDelay, Uniform
 
-WORLDS, BATCH_STEPS, BATCHES, MAX_STEPS = 16, 20, 30, 60
+WORLDS = 16
+BATCH_STEPS = 20
+BATCHES = 30
+MAX_STEPS = 60
 
 
 class Tanks(EnvBase):
@@ -98,7 +101,8 @@ def main() -> tuple[TensorDictBase, Tensor]:
         hindsight_key="hindsight",
     )
     buffer = ReplayBuffer(storage=storage, batch_size=256)
-    frames, collected = BATCH_STEPS * WORLDS, []
+    frames = BATCH_STEPS * WORLDS
+    collected = []
     for batch in Collector(env, frames_per_batch=frames, total_frames=BATCHES * frames):
         collected.append(batch["next", "reward"].transpose(0, 1).clone())
         buffer.extend(batch)  # stores the steps, and corrects those that late messages concern

@@ -20,9 +20,14 @@ from torchrl.objectives.value import GAE
 
 from damian import ActionHistory, ObservationDelay, set_seed
 
-AGENTS, WORLDS, STEPS, EPOCHS = 3, 64, 100, 10
-OBSERVATION, ACTION = ("agents", "observation"), ("agents", "action")
-REWARD, RETURN = ("agents", "reward"), ("agents", "episode_reward")
+AGENTS = 3
+WORLDS = 64
+STEPS = 100
+EPOCHS = 10
+OBSERVATION = ("agents", "observation")
+ACTION = ("agents", "action")
+REWARD = ("agents", "reward")
+RETURN = ("agents", "episode_reward")
 ENDS = ("done", "terminated")
 
 
@@ -39,7 +44,8 @@ def make_env(delay: int, history: bool) -> TransformedEnv:
 
 def make_networks(env: TransformedEnv) -> tuple[ProbabilisticActor, TensorDictModule]:
     """An actor and a critic, each shared by the agents; the critic reads what all observe."""
-    n_inputs, spec = env.observation_spec[OBSERVATION].shape[-1], env.full_action_spec[ACTION]
+    n_inputs = env.observation_spec[OBSERVATION].shape[-1]
+    spec = env.full_action_spec[ACTION]
 
     def network(outputs: int, centralized: bool) -> MultiAgentMLP:
         return MultiAgentMLP(
@@ -77,7 +83,8 @@ def train(delay: int = 3, history: bool = True, batches: int = 40, seed: int = 0
     loss.set_keys(done=("agents", "done"), terminated=("agents", "terminated"))
     loss.make_value_estimator(gamma=0.95, lmbda=0.9)
     advantage: GAE = loss.value_estimator
-    optimizer, frames = torch.optim.Adam(loss.parameters(), 5e-4), WORLDS * STEPS
+    optimizer = torch.optim.Adam(loss.parameters(), 5e-4)
+    frames = WORLDS * STEPS
     sampler = SamplerWithoutReplacement()
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(frames), sampler=sampler, batch_size=frames // 8

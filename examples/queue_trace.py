@@ -29,7 +29,8 @@ RATE, QUEUE = "512kbit", 480_000
 MESSAGE, PICTURE, PAUSE = 100, (200_000, 1_500_000), 20.0
 """Sizes of a message and of the smallest and largest picture [bytes]; mean time between two uploads
 [s]."""
-SERVER, PORT = "10.62.2.2", 6262
+SERVER = "10.62.2.2"
+PORT = 6262
 ROOMS = uav, modem, server = [f"{name}{os.getpid()}" for name in ("uav", "modem", "server")]
 ENDS = {
     "wire0": (uav, "10.62.1.1"),
@@ -53,7 +54,8 @@ NETWORK = [
 def send(seconds: int) -> None:
     """Be the UAV: send a numbered message every second, and upload pictures meanwhile."""
     threading.Thread(target=upload_pictures, daemon=True).start()
-    sender, began = socket.socket(type=socket.SOCK_DGRAM), time.monotonic()
+    sender = socket.socket(type=socket.SOCK_DGRAM)
+    began = time.monotonic()
     for number in range(seconds):
         time.sleep(max(began + number - time.monotonic(), 0))
         sender.sendto(struct.pack("Id", number, time.monotonic()).ljust(MESSAGE), (SERVER, PORT))
@@ -77,7 +79,8 @@ def upload(size: int) -> None:
 def receive(seconds: int) -> None:
     """Be the server: print the number and the delay [s] of each message that arrives."""
     threading.Thread(target=take_pictures, daemon=True).start()
-    receiver, ends = socket.socket(type=socket.SOCK_DGRAM), time.monotonic() + seconds + 20
+    receiver = socket.socket(type=socket.SOCK_DGRAM)
+    ends = time.monotonic() + seconds + 20
     receiver.bind((SERVER, PORT))
     while (left := ends - time.monotonic()) > 0:
         receiver.settimeout(left)

@@ -31,7 +31,8 @@ def save_recording(episode: Episode, path: Path) -> None:
     ``reward/NAME``.
     """
     rr: Any = import_module("rerun")
-    recording, time = rr.RecordingStream("damian"), rr.TimeColumn("time", duration=episode.time)
+    recording = rr.RecordingStream("damian")
+    time = rr.TimeColumn("time", duration=episode.time)
     recording.save(path)
     size = float(np.ptp(np.reshape(episode.region.bounds, (2, 2)), axis=0).max()) / 100
     rings = [on_ground(shapely.get_coordinates(ring)) for ring in shapely.get_rings(episode.region)]
@@ -43,8 +44,10 @@ def save_recording(episode: Episode, path: Path) -> None:
         columns = {"positions": on_ground(episode.source[:, 0]), "radii": size * (1 + emits[:, 0])}
         recording.send_columns("source", [time], rr.Points3D.columns(**columns))
     for uav, name in enumerate(episode.names):
-        colour, spotted = COLOURS[uav % len(COLOURS)], episode.spotted[:, uav]
-        colour, position = [int(colour[i : i + 2], 16) for i in (1, 3, 5)], episode.position[:, uav]
+        colour = COLOURS[uav % len(COLOURS)]
+        spotted = episode.spotted[:, uav]
+        colour = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        position = episode.position[:, uav]
         path_of = rr.LineStrips3D([position], colors=[colour], radii=size / 10)
         recording.log(["paths", name], path_of, static=True)
         places = {

@@ -62,7 +62,8 @@ def make_storage(n_steps: int, delay: int) -> BackupdateStorage:
 def draw(storage: BackupdateStorage, delay: int, n: int) -> TensorDictBase:
     """Transitions [n] from all stored steps [T, B] whose observations must have arrived."""
     arrived = storage.latest()[:-delay]
-    step, world = torch.randint(len(arrived), (n,)), torch.randint(storage.steps.shape[1], (n,))
+    step = torch.randint(len(arrived), (n,))
+    world = torch.randint(storage.steps.shape[1], (n,))
     return storage.steps[arrived[step], world]
 
 
@@ -70,7 +71,8 @@ def make_actor_and_loss(
     env: TransformedEnv, critics_read: str
 ) -> tuple[ProbabilisticActor, SACLoss]:
     """TorchRL's soft actor-critic: the actor reads ``known``."""
-    bounds, n_actions = env.action_spec.space, env.action_spec.shape[-1]
+    bounds = env.action_spec.space
+    n_actions = env.action_spec.shape[-1]
     network = nn.Sequential(
         MLP(out_features=2 * n_actions, num_cells=[128, 128]), NormalParamExtractor()
     )
@@ -94,12 +96,15 @@ def train(
 ) -> tuple[BackupdateStorage, list[float]]:
     """Train with one update in each step; returns the storage and the returns of the episodes."""
     torch.manual_seed(seed)
-    env, storage = make_env(delay), make_storage(frames, delay)
+    env = make_env(delay)
+    storage = make_storage(frames, delay)
     set_seed(env, seed)
     buffer = ReplayBuffer(storage=storage)
     actor, loss = make_actor_and_loss(env, "known" if late_critics else "state")
-    optimizer, targets = torch.optim.Adam(loss.parameters(), 1e-3), SoftUpdate(loss, tau=0.005)
-    now, returns = env.reset(), []
+    optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
+    targets = SoftUpdate(loss, tau=0.005)
+    now = env.reset()
+    returns = []
     for n_steps in range(frames):
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             step, now = env.step_and_maybe_reset(

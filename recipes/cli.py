@@ -123,9 +123,11 @@ def plain(given: DictConfig, words: Sequence[str], program: str = "train") -> di
     own = OmegaConf.masked_copy(given, [str(key) for key in given if key != "hydra"])
     values: Any = OmegaConf.to_container(own, resolve=True)
     _check_whole(values, words, (given.get("hydra") or HydraConfig.get()).runtime.choices)
-    known, replaced = known_settings(program), set[str]()
+    known = known_settings(program)
+    replaced = set[str]()
     for word in OverridesParser.create().parse_overrides([*words]):
-        key, value = word.key_or_group, word.value()
+        key = word.key_or_group
+        value = word.value()
         setting = known.get(key)
         replaced |= (
             {key} if setting and not setting.is_section and isinstance(value, Mapping) else set()
@@ -191,13 +193,15 @@ def reason(error: BaseException, program: str = "train") -> str:
     """The deepest cause of an error on one line, with its key in front."""
     while not isinstance(error, InputError) and isinstance(error.__cause__, (*ERRORS, InputError)):
         error = error.__cause__
-    text, key = str(error).partition("\nConfig search path")[0], getattr(error, "full_key", None)
+    text = str(error).partition("\nConfig search path")[0]
+    key = getattr(error, "full_key", None)
     if isinstance(error, OSError) and error.filename and error.strerror:
         text = f"{error.filename}: {error.strerror}"
     elif isinstance(error, OmegaConfBaseException):
         text = text.partition("\n")[0]  # the others name types of OmegaConf
         if key and "not in struct" in text:
-            text, key = no_such_key(str(key), program), None
+            text = no_such_key(str(key), program)
+            key = None
     return one_line(f"{key}: {text}" if key else text)
 
 
@@ -209,7 +213,8 @@ def one_line_errors(program: str = "train") -> Iterator[None]:
     try:
         yield
     except EXPECTED as error:
-        line, cause = reason(error, program), error.__cause__
+        line = reason(error, program)
+        cause = error.__cause__
         if os.environ.get("DAMIAN_TRACEBACK"):
             traceback.print_exception(error)
         elif cause is not None and not isinstance(cause, (*ERRORS, InputError)):

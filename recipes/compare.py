@@ -56,17 +56,17 @@ from .shared.sweeps import (
 )
 from .train import train
 
-TABLE, CURVES, PROFILES = "table.csv", "curves.png", "profiles.png"
+TABLE = "table.csv"
+CURVES = "curves.png"
+PROFILES = "profiles.png"
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
     """Every run with its checked settings: seed after seed, and last what flies others'
     policies."""
-    tasks, delays, runs = (
-        config.chosen("tasks"),
-        {NOT_LATE: [], **config.chosen("delays")},
-        list[Run](),
-    )
+    tasks = config.chosen("tasks")
+    delays = {NOT_LATE: [], **config.chosen("delays")}
+    runs = list[Run]()
     composed = cache(
         cli.settings
     )  # several methods differ only in whose policy they fly: 0.2 s each
@@ -122,7 +122,8 @@ def _seeds(
 ) -> Iterator[Run]:
     """The runs of one task, delay and method, which the folder names."""
     task, delay, name = folder.parts[-3:]
-    method, methods = config.experiment.methods[name], config.experiment.methods
+    method = config.experiment.methods[name]
+    methods = config.experiment.methods
     away = task != trained_in  # a held-out task, where nothing is trained
     flown = method.policy_of or (name if away and not method.untrained else None)
     trains = not (method.untrained or flown)
@@ -140,7 +141,8 @@ def _seeds(
             able = not method.teacher or hasattr(unseeded.learner, "teacher")
             checks.require(able, "learner", unseeded.learner.name, "has no setting teacher")
             check_learning(unseeded)
-    source, policy = flown or method.source, None
+    source = flown or method.source
+    policy = None
     for seed in config.every_seed:
         seeded = replace(unseeded, seed=seed, overrides=[*words, f"seed={seed}"])
         if source:
@@ -156,11 +158,13 @@ def _seeds(
 
 def includes(config: CompareConfig, rows: pd.DataFrame) -> "pd.Series[bool]":
     """Which rows of results are of a task, a delay, a method and a seed that are asked for."""
-    tasks, first = [*config.chosen("tasks")], config.experiment.first_seed
+    tasks = [*config.chosen("tasks")]
+    first = config.experiment.first_seed
     tasks += [
         f"{task}{HELD_OUT_MARK}{name}" for task in tasks for name in config.experiment.held_out
     ]
-    delays, methods = [NOT_LATE, *config.chosen("delays")], [*config.chosen("methods")]
+    delays = [NOT_LATE, *config.chosen("delays")]
+    methods = [*config.chosen("methods")]
     asked = {"task": tasks, "delay": delays, "method": methods}
     last = math.inf if config.seeds is None else config.every_seed[-1]
     return rows[[*asked]].isin(asked).all(axis=1) & rows["seed"].between(first, last)
@@ -179,7 +183,8 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
 def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) -> list[str]:
     """Lines above the tables: the command, the number of seeds and episodes, what the columns
     mean."""
-    seeds, episodes = rows["seed"], sorted(rows["episodes"].astype(int).unique())
+    seeds = rows["seed"]
+    episodes = sorted(rows["episodes"].astype(int).unique())
     few = rows.groupby(RUN[:-1])["seed"].nunique().min() < SEEDS or episodes[0] < EPISODES
     return [
         *[f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes"] * bool(few),
@@ -205,13 +210,15 @@ def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) ->
 def compare(config: CompareConfig, folder: Path) -> None:
     """Carry out the runs of a comparison that are not finished, and report on them."""
     check_no_links(folder)
-    has_rows, failed = (folder / ROWS).exists(), []
+    has_rows = (folder / ROWS).exists()
+    failed = []
     if (
         config.report_only
         and has_rows
         and not any((folder / each).exists() for each in config.experiment.tasks)
     ):
-        kept, runs = stored_results(folder, "hydra.run.dir"), []
+        kept = stored_results(folder, "hydra.run.dir")
+        runs = []
     else:
         if config.report_only and config.seeds is None:  # all up to the last one with a run
             names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))

@@ -116,7 +116,8 @@ def report(
         env.set_seed(config.eval_seed)  # the same episodes for every policy
         return evaluate(env, policy, config.horizon, sample, config.metrics)
 
-    random, rows = fly(random_policy(env)), {}
+    random = fly(random_policy(env))
+    rows = {}
     for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():
         if policy is not None:
             rows = {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)} | rows

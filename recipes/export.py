@@ -46,7 +46,8 @@ def export(run: Path, trust: bool = False) -> Path:
     except ImportError as error:
         raise InputError(f"export needs {error.name}: pip install 'damian[export]'") from None
     actor, env = load(run, worlds=2, deterministic=True, trust=trust)
-    config, shipped = stored_config(run_folder(run), "checkpoint"), str(run).startswith("damian:")
+    config = stored_config(run_folder(run), "checkpoint")
+    shipped = str(run).startswith("damian:")
     named = Path("runs") if shipped else run_folder(run)
     target = named / run_folder(run).name / EXPORT if shipped else named / EXPORT
     any_number = any_number_of_uavs(config)
@@ -67,7 +68,8 @@ def describe(
     run: Path, policy: ExportedPolicy, env: DelayedEnv, any_number: bool
 ) -> dict[str, Any]:
     """What goes in and what comes out, for people and programs without damian."""
-    scenario, inputs = env.uav_env.scenario, {}
+    scenario = env.uav_env.scenario
+    inputs = {}
     for name, key in zip(policy.inputs, policy.in_keys, strict=True):
         spec = env.full_observation_spec[key]
         shape = ["worlds", "uavs", *spec.shape[2:]]

@@ -28,7 +28,8 @@ from .config import FitConfig
 def fit(config: FitConfig, folder: Path) -> None:
     """Write the delays of a log of reports as a trace, and tell and draw which law fits them
     best."""
-    log, dt = Path(config.log), config.clock.dt
+    log = Path(config.log)
+    dt = config.clock.dt
     messages = in_order(read_log(log))
     right = are_right(messages)
     with named(log):
@@ -49,8 +50,11 @@ def fit(config: FitConfig, folder: Path) -> None:
 def summary(messages: pd.DataFrame) -> str:
     """The fitted delays and losses as text, with a line about those that came in before their
     time."""
-    delays, n, time = messages.delay.dropna(), len(messages), messages.time
-    n_lost, early = n - len(delays), (time - messages.received)[messages.received < time]
+    delays = messages.delay.dropna()
+    n = len(messages)
+    time = messages.time
+    n_lost = n - len(delays)
+    early = (time - messages.received)[messages.received < time]
     median, most, nearly_all = np.quantile(delays, [0.5, 0.9, 0.99])
     problem = (
         "came in before their time, because clocks differ, and count as 0 s late; the earliest by"
@@ -69,11 +73,10 @@ def summary(messages: pd.DataFrame) -> str:
 def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
     """The law that ``fit_laws`` finds as settings, and what of the delays it does not repeat, as
     text."""
-    other, gain = (
-        np.abs(best.chances - own.chances).sum() / 2,
-        (own.likelihood - best.likelihood) / best.n,
-    )
-    law, loss = str(best.written).replace("'", ""), f" delay.loss={best.loss}" * (best.loss > 0)
+    other = np.abs(best.chances - own.chances).sum() / 2
+    gain = (own.likelihood - best.likelihood) / best.n
+    law = str(best.written).replace("'", "")
+    loss = f" delay.loss={best.loss}" * (best.loss > 0)
     text = f'best law: "delay.obs={law}"{loss} clock.simulation={dt:g}s\n'
     text += f"it gives {other:.1%} of the messages another delay; "
     text += f"{own.written} are likelier by {gain:.3f} nats a message"
@@ -89,7 +92,8 @@ def plot_fit(messages: pd.DataFrame, law: LawFit, dt: float, path: Path) -> None
     """
     delays = np.sort(messages.delay.dropna())
     recorded = 1 - np.arange(len(delays) + 1) / len(messages)
-    later, lost = 1 - law.chances[:-1].cumsum(), law.chances[-1]
+    later = 1 - law.chances[:-1].cumsum()
+    lost = law.chances[-1]
     shown = later > max(lost, 0.1 / len(messages))  # rounding leaves a rest where nothing is later
 
     def panel(axis: Any, _: str) -> None:

@@ -86,7 +86,9 @@ def described(kind: type, path: str = "") -> dict[str, Setting]:
     """Every setting of a dataclass by its dotted key, sections included."""
     found: dict[str, Setting] = {}
     for each in fields(kind):
-        rule, default, declared = rules(kind)[each.name], default_of(each), each.type
+        rule = rules(kind)[each.name]
+        default = default_of(each)
+        declared = each.type
         section: Any = next((x for x in (type(default), declared) if is_dataclass(x)), None)
         if not rule.fixed:
             named = (
@@ -149,7 +151,8 @@ def check_words(program: str, words: Iterable[str]) -> None:
 def is_known(key: str, program: str) -> bool:
     """Is a key that of a setting, or below one that holds anything, or of a learner or model of the
     user's own?"""
-    known, parts = known_settings(program), key.partition("@")[0].split(".")
+    known = known_settings(program)
+    parts = key.partition("@")[0].split(".")
     above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
     is_open = any(each and each.kind.startswith(("Any", "list", "dict")) for each in above)
     return key in known or is_open or parts[0] in ("learner", "model")
@@ -182,10 +185,8 @@ def help_text(name: str, keys: Sequence[str] = ()) -> str:
             "\n".join(f or [no_such_key(k, name)]) for k, f in zip(keys, found, strict=True)
         )
     lines = [f"damian {name} [GROUP=OPTION] [KEY=VALUE] ...", "", about(name)]
-    known, common = (
-        known_settings(name),
-        {} if name in ("train", "compare") else known_settings("train"),
-    )
+    known = known_settings(name)
+    common = {} if name in ("train", "compare") else known_settings("train")
     own = [
         key for key in known if key not in common and not known[key].is_section and "." not in key
     ]
@@ -207,7 +208,8 @@ def _options(program: str, group: str) -> list[str]:
     nothing."""
     if group not in default_options(program):
         return []
-    default, lines = default_options(program)[group], [f"choose one with {group}=OPTION:"]
+    default = default_options(program)[group]
+    lines = [f"choose one with {group}=OPTION:"]
     for option in groups()[group]:
         text = read_text(CONF / group / f"{option}.yaml")
         comments = takewhile(lambda line: line.startswith("#"), text.splitlines())

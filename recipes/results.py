@@ -33,7 +33,8 @@ def results(folder: str | Path) -> pd.DataFrame:
 
 def table(folders: list[Path], score: str) -> str:
     """The table of a folder, or of two folders."""
-    folder, is_comparison = folders[0], (folders[0] / POINTS).is_file()
+    folder = folders[0]
+    is_comparison = (folders[0] / POINTS).is_file()
     if len(folders) == 2:
         return compared(folders, score)
     if is_comparison and (folder / MARKDOWN).exists():

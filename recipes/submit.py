@@ -51,13 +51,12 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
     rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
     words = words_of_tasks(experiment)
     composed = cache(cli.settings)  # the same for all runs of a task
-    facts, trained = list[dict[str, object]](), dict[tuple[str, str], Path]()
+    facts = list[dict[str, object]]()
+    trained = dict[tuple[str, str], Path]()
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
         run = folder / task / delay / method / f"seed_{seed}"
-        record, should = (
-            read_record(run),
-            "is not the folder of a finished run: keep those of all runs",
-        )
+        record = read_record(run)
+        should = "is not the folder of a finished run: keep those of all runs"
         checks.require((run / RESULTS).exists() and bool(record), "folder", run, should)
         found = read_results(run / RESULTS).set_index("policy")[
             "return"
@@ -78,7 +77,8 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
 
 def words_of_tasks(experiment: Experiment) -> dict[tuple[str, str], list[str]]:
     """The settings of each task under each delay."""
-    tasks, delays = experiment.tasks, experiment.delays
+    tasks = experiment.tasks
+    delays = experiment.delays
     return {(task, delay): [*tasks[task], *delays[delay]] for task in tasks for delay in delays}
 
 

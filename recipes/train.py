@@ -64,7 +64,8 @@ FIGURE = "learning_curve.png"
 def train(config: TrainConfig, folder: Path) -> None:
     """Train, evaluate, and fill the run folder."""
     check_learning(config)
-    env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
+    env = learning_env(config)
+    clock = SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
     require_memory(config, env, buffer)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
@@ -131,7 +132,8 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
     settings."""
     if config.resume:
         state.load()
-        made, updates = state.progress.frames, max(state.progress.updates, 1)
+        made = state.progress.frames
+        updates = max(state.progress.updates, 1)
         problem = f"is fewer than the {made} that the run has made"
         checks.require(made - made / updates < config.frames, "frames", config.frames, problem)
     elif config.checkpoint:
@@ -156,7 +158,8 @@ def update(
     batch: TensorDictBase,
 ) -> None:
     """Make one update from a batch [B, T], and log its numbers."""
-    progress, episodes = state.progress, state.episodes
+    progress = state.progress
+    episodes = state.episodes
     episodes.add(batch)
     progress.frames += batch.numel()
     progress.updates += 1
@@ -220,7 +223,8 @@ def save_or_stop(
     config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt
 ) -> bool:
     """Write a checkpoint after an update if one is due; returns whether the training ends here."""
-    finished, asked = enough(config, state), interrupt.asked is not None
+    finished = enough(config, state)
+    asked = interrupt.asked is not None
     due = state.progress.updates % config.checkpoint_every == 0
     if due or finished or asked:
         log.sync()

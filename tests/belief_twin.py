@@ -28,9 +28,11 @@ def belief(
     ``place`` is the index of the tables of the source for its region.
     ``viewer`` is the UAV that knows its own messages at once; None is the server.
     """
-    prior, moves = grid.prior[place].tolist(), moves_of(grid, place)
+    prior = grid.prior[place].tolist()
+    moves = moves_of(grid, place)
     cells = range(len(prior))
-    probable, before = _weighed(grid, place, prior, first), first
+    probable = _weighed(grid, place, prior, first)
+    before = first
     for sent_at, (rows, delays) in enumerate(steps, 1):
         moved = [0.0] * len(prior)
         for a in cells:
@@ -45,7 +47,8 @@ def belief(
             row + grid.no_report // 2 if row == earlier != grid.no_report else row
             for row, earlier in zip(known, before, strict=True)
         ]
-        probable, before = _weighed(grid, place, moved, again), known
+        probable = _weighed(grid, place, moved, again)
+        before = known
     return probable
 
 
@@ -62,9 +65,12 @@ def emission_of(grid: SourceGrid, place: int) -> float:
 
 
 def _weighed(grid: SourceGrid, place: int, probable: list[float], rows: list[int]) -> list[float]:
-    weighed, emits, alarm = [], emission_of(grid, place), float(grid.false_alarm[place])
+    weighed = []
+    emits = emission_of(grid, place)
+    alarm = float(grid.false_alarm[place])
     for cell, chance in enumerate(probable):
-        heard, silent = 1.0, 1.0
+        heard = 1.0
+        silent = 1.0
         for row in rows:
             heard *= math.exp(float(grid.log_reports[row, cell]))
             silent *= alarm if row % 2 == 1 else 1.0 if row == grid.no_report else 1 - alarm
@@ -79,8 +85,11 @@ def detection_table(grid: SourceGrid) -> Tensor:
 
 def chance_at(grid: SourceGrid, place: int, probable: Tensor, point: int) -> float:
     """Probability of detecting the source in the next step from a landing point, by its flat id."""
-    prior, total, detects = grid.prior[place].tolist(), 0.0, detection_table(grid)[point]
-    moves, emits = moves_of(grid, place), emission_of(grid, place)
+    prior = grid.prior[place].tolist()
+    total = 0.0
+    detects = detection_table(grid)[point]
+    moves = moves_of(grid, place)
+    emits = emission_of(grid, place)
     for a, chance in enumerate(probable.tolist()):
         inside = {b: float(moves[a, b]) for b in range(len(prior)) if prior[b] > 0}
         if chance:

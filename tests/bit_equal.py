@@ -136,10 +136,8 @@ def record(path: Path, word: str = "") -> None:
 
 def compare(before: Path, after: Path) -> int:
     """Print what differs between two records; returns the number of differences."""
-    old, new = (
-        json.loads(before.read_text(encoding="utf-8")),
-        json.loads(after.read_text(encoding="utf-8")),
-    )
+    old = json.loads(before.read_text(encoding="utf-8"))
+    new = json.loads(after.read_text(encoding="utf-8"))
     differences = 0
     for name, entries in ((name, old[name]) for name in old if name in new):
         for key in [key for key in entries if key in new.get(name, {})]:

@@ -70,7 +70,8 @@ def twin_delay(
 def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
     """Delays of the messages that senders with these random streams [M] send in steps 1 to T,
     [T, M]."""
-    memory, delays = sampler.initial_state(streams), []
+    memory = sampler.initial_state(streams)
+    delays = []
     for clock in range(1, n_steps + 1):
         delay, memory = sampler(streams, torch.tensor(clock), memory)
         delays.append(delay)
@@ -95,7 +96,9 @@ class Receiver:
     def begin(self, now: int, content: Any) -> None:
         """Begin an episode: the first message is received without delay, and no other is in
         transit."""
-        self.began, self.holds, self.in_transit = now, Message(now, now, content), []
+        self.began = now
+        self.holds = Message(now, now, content)
+        self.in_transit = []
 
     def step(self, now: int, content: Any, delay: int | None) -> bool:
         """Send a message, unless the delay is None, and receive others; is a new message held?"""
@@ -153,8 +156,12 @@ class Counting(EnvBase):
         self, worlds: Sequence[int], n_agents: int = 2, continuous: bool = False, ends: float = 0.15
     ) -> None:
         super().__init__(batch_size=[len(worlds)])
-        self.names, self.n_agents, self.ends, self.total = torch.tensor(worlds), n_agents, ends, 0
-        worlds_shape, agents = self.batch_size, torch.Size((len(worlds), n_agents))
+        self.names = torch.tensor(worlds)
+        self.n_agents = n_agents
+        self.ends = ends
+        self.total = 0
+        worlds_shape = self.batch_size
+        agents = torch.Size((len(worlds), n_agents))
 
         def group(**specs: Any) -> Composite:
             return Composite(agents=Composite(**specs, shape=agents), shape=worlds_shape)
@@ -176,7 +183,8 @@ class Counting(EnvBase):
         shape = (*self.batch_size, self.n_agents)
         x = (7 * self.names.unsqueeze(-1) + torch.arange(self.n_agents)) % 101
         self.x = torch.where(mask.unsqueeze(-1), x, self.x if hasattr(self, "x") else x)
-        self.executed, self.action_valid = torch.zeros(shape), torch.ones(shape)
+        self.executed = torch.zeros(shape)
+        self.action_valid = torch.ones(shape)
 
     def _flag(self, salt: int) -> Tensor:
         """A flag that is true with probability 2/3, [B, N]."""
@@ -188,11 +196,10 @@ class Counting(EnvBase):
 
     def _outputs(self) -> TensorDict:
         shape = (*self.batch_size, self.n_agents)
-        names, agents = (
-            self.names.unsqueeze(-1).expand(shape),
-            torch.arange(self.n_agents).expand(shape),
-        )
-        total, episode = torch.full(shape, self.total), self.episode.unsqueeze(-1).expand(shape)
+        names = self.names.unsqueeze(-1).expand(shape)
+        agents = torch.arange(self.n_agents).expand(shape)
+        total = torch.full(shape, self.total)
+        episode = self.episode.unsqueeze(-1).expand(shape)
         observation = torch.stack(
             [names, agents, total, episode, self.x, self.executed, self.action_valid], -1
         ).double()
@@ -224,8 +231,12 @@ class Counting(EnvBase):
         """The random numbers depend only on the worlds' names and the step."""
 
 
-ACTION, REWARD, OBSERVATION = ("agents", "action"), ("agents", "reward"), ("agents", "observation")
-WORLDS, N_AGENTS, STEPS = [3, 5, 8, 13], 2, 40
+ACTION = ("agents", "action")
+REWARD = ("agents", "reward")
+OBSERVATION = ("agents", "observation")
+WORLDS = [3, 5, 8, 13]
+N_AGENTS = 2
+STEPS = 40
 ROWS = [(world, agent) for world in range(len(WORLDS)) for agent in range(N_AGENTS)]
 
 PAPER = Uniform("3s", "7s", 0.15)
@@ -259,7 +270,8 @@ def delayed(
 
 def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor]:
     """Actions for each step, [B, N]; those of a world do not depend on the other worlds."""
-    names, agents = torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)
+    names = torch.tensor(worlds).unsqueeze(-1)
+    agents = torch.arange(N_AGENTS)
     return [
         counter_rng.bits(names, agents, torch.tensor([t])) % Counting.N_ACTIONS
         for t in range(n_steps)

@@ -112,7 +112,9 @@ KINDS = {
 
 
 LATE = Uniform(1, 3)
-ACTION, OBSERVATION, REWARD = ("agents", "action"), ("agents", "observation"), ("agents", "reward")
+ACTION = ("agents", "action")
+OBSERVATION = ("agents", "observation")
+REWARD = ("agents", "reward")
 
 
 class Drift(EnvBase):
@@ -136,14 +138,16 @@ class Drift(EnvBase):
             reset = tensordict["_reset"].view(3)
         first = torch.arange(6.0).view(3, 2)
         if reset.all():
-            self.place, self.time = first, torch.zeros(3, dtype=torch.long)
+            self.place = first
+            self.time = torch.zeros(3, dtype=torch.long)
         self.place = torch.where(reset.unsqueeze(-1), first, self.place)
         self.time = self.time.masked_fill(reset, 0)
         return TensorDict({"observation": self.place}, [3])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         place = 0.9 * self.place + tensordict["action"]
-        self.place, self.time = place.detach(), self.time + 1
+        self.place = place.detach()
+        self.time = self.time + 1
         done = (self.time >= self._longest).unsqueeze(-1)
         flags = {"done": done, "terminated": done}
         return TensorDict(
@@ -154,7 +158,8 @@ class Drift(EnvBase):
         """The environment has no randomness."""
 
 
-cartpole, uavs = KINDS["CartPole"].make, KINDS["UAVs"].make
+cartpole = KINDS["CartPole"].make
+uavs = KINDS["UAVs"].make
 
 
 def unserved() -> EnvBase:

@@ -11,8 +11,10 @@ SQUARE = shapely.box(-200.0, -200.0, 200.0, 200.0)
 def flight(n_steps: int = 3, **changes) -> Episode:
     """An episode of two UAVs that stand still, of which the server knows the places; the source is
     silent."""
-    t, position = n_steps + 1, np.array([[-100.0, 100.0, 0.0], [100.0, 100.0, 0.0]])
-    uavs, flags = np.zeros((t, 2)), np.zeros((t, 2), bool)
+    t = n_steps + 1
+    position = np.array([[-100.0, 100.0, 0.0], [100.0, 100.0, 0.0]])
+    uavs = np.zeros((t, 2))
+    flags = np.zeros((t, 2), bool)
     columns = {
         "time": np.arange(t) * 2.0,
         "position": np.tile(position, (t, 1, 1)),
@@ -40,9 +42,7 @@ UNKNOWN_SOURCE = {"source": None, "emits": None}
 
 def crowd(n_steps: int = 3, **changes) -> Episode:
     """An episode of 20 UAVs, ten at each of two places."""
-    few, names = (
-        flight(n_steps),
-        "position target battery believed track age reward spotted sent delay",
-    )
+    few = flight(n_steps)
+    names = "position target battery believed track age reward spotted sent delay"
     columns = {name: np.repeat(getattr(few, name), 10, axis=1) for name in names.split()}
     return flight(n_steps, **columns | changes)

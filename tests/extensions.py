@@ -50,7 +50,8 @@ class RowsConfig(MappoConfig):
 class Rows(nn.Module):
     def __init__(self, n_columns, n_out, hidden):
         super().__init__()
-        self.last, self.hidden = nn.Linear(n_columns, n_out), hidden
+        self.last = nn.Linear(n_columns, n_out)
+        self.hidden = hidden
         self.attention = nn.MultiheadAttention(n_columns, 1, batch_first=True)
         nn.init.zeros_(self.last.weight)  # at first nobody hears anything
 

@@ -56,7 +56,8 @@ class Transition(NamedTuple):
 
 def recorded(case: int, *kinds: str) -> list[Transition]:
     """The recorded transitions of the given kinds of runs."""
-    golden, transitions = GOLDEN[case], []
+    golden = GOLDEN[case]
+    transitions = []
     start = golden["scenario"]["uav_start_positions"]
     no_detection = {"server": {"last_time": None, "est_pos": None}}
     first = no_detection | {"positions": start, "motions_counter_after": [0] * len(start)}

@@ -251,7 +251,9 @@ def random_worlds(
                 uav.heard_at = float(rng.uniform(0, now))
                 uav.heard_from = tuple(rng.uniform(-150, 150, 2).tolist())
             if uav.heard_at is not None and rng.random() < spots:
-                uav.spots, uav.heard_at, uav.heard_from = True, now, place
+                uav.spots = True
+                uav.heard_at = now
+                uav.heard_from = place
             uavs.append(uav)
         worlds.append((now, uavs))
     return worlds

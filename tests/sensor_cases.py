@@ -15,7 +15,8 @@ from damian.world.simulation import Simulation
 from damian.world.state import State
 
 SENSORS = [{"sensor": "sensor_cases:gust", "strength": 2.0}, "sensor_cases:gap"]
-LOCAL, GLOBAL = ["sensor_cases:gust_felt"], ["sensor_cases:widest_gap", "sensor_cases:gaps"]
+LOCAL = ["sensor_cases:gust_felt"]
+GLOBAL = ["sensor_cases:widest_gap", "sensor_cases:gaps"]
 
 
 @sensor(width=2)
@@ -24,7 +25,8 @@ def gust(state: State, world: Simulation, *, strength: float = 1.0) -> Tensor:
     seed, episode, step = (
         number.view(-1, 1, 1) for number in (state.seed, state.episode, state.steps)
     )
-    uav, value = torch.arange(state.goal.shape[1]).unsqueeze(-1), torch.arange(2)
+    uav = torch.arange(state.goal.shape[1]).unsqueeze(-1)
+    value = torch.arange(2)
     return strength * counter_rng.uniform(seed, episode, step, uav, value) + step * world.dt
 
 
@@ -63,7 +65,8 @@ def calm(features: dict[str, Tensor], counters: Counters) -> Tensor:
 def readings_of(env: UavEnv, strength: float = 2.0) -> Tensor:
     """What a UAV on the ground reads in the current state, by a loop over worlds and UAVs,
     [B, N, 3]."""
-    state, rows = env.state, []
+    state = env.state
+    rows = []
     for b in range(len(state.seed)):
         rows.append([])
         counters = [state.seed[b], state.episode[b], state.steps[b]]

@@ -59,7 +59,8 @@ def test_a_program_is_imported(path):
 def test_back_updated_rewards_and_ends_are_the_true_ones_wherever_the_message_has_arrived(capsys):
     example = load("backupdating")
     steps, collected = example["main"]()
-    after, n_steps = steps["next"], len(steps)
+    after = steps["next"]
+    n_steps = len(steps)
     arrived = torch.arange(n_steps).view(-1, 1, 1) + after["delay"] < n_steps
     assert n_steps - 7 < arrived.sum() / steps.shape[1] < n_steps
     truth = example["judge"](after["message"])
@@ -183,7 +184,8 @@ def test_soft_actor_critic_with_back_updating_swings_the_pendulum_up():
 
 
 def test_a_recording_for_rerun_has_the_places_and_the_detections_of_every_uav(tmp_path):
-    reader, rows = pytest.importorskip("rerun.chunk").RrdReader, {}
+    reader = pytest.importorskip("rerun.chunk").RrdReader
+    rows = {}
     spotted = np.array([[False, False], [True, False], [True, False], [False, False]])
     flown = flight(spotted=spotted, about={"uavs": ["A/1", "B"]})
     load("rerun_episode")["save_recording"](flown, tmp_path / "flown.rrd")

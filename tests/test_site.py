@@ -19,7 +19,8 @@ EXCLUDED = (".py", ".csv")  # as mkdocs.yml says
 
 
 def test_every_link_and_anchor_of_the_site_leads_somewhere():
-    nowhere, pictures = [], {*generator()["made"]()}
+    nowhere = []
+    pictures = {*generator()["made"]()}
     for name, text in pages().items():
         for link in links(text):
             path, _, anchor = link.partition("#")

@@ -93,7 +93,8 @@ def test_every_link_inside_the_site_leads_somewhere(site, seen):
             if not link.startswith(address):
                 continue
             parts = urlsplit(link)
-            path, part = unquote(parts.path).removeprefix("/"), unquote(parts.fragment)
+            path = unquote(parts.path).removeprefix("/")
+            part = unquote(parts.fragment)
             target = seen.get((path, 1440))
             there = (
                 part in {"", "__codelineno", *target["ids"]}

@@ -248,14 +248,16 @@ class World:
         if point != uav.point:
             east, north = (b - a for a, b in zip(uav.place, place, strict=True))
             uav.track = math.atan2(east, north) % (2 * math.pi)
-        uav.point, uav.place = point, place
+        uav.point = point
+        uav.place = place
         uav.moved += 1
 
     def _listen(self, uav: Uav) -> None:
         uav.motions = uav.moved
         uav.spots = math.dist(uav.place, self.source) <= self.radius
         if uav.spots:
-            uav.heard_at, uav.heard_from = self.steps * self.dt, uav.place
+            uav.heard_at = self.steps * self.dt
+            uav.heard_from = uav.place
             uav.moved = 0
 
 

@@ -35,7 +35,9 @@ def docstrings(source: str) -> set[tuple[int, int]]:
 
 def weight(path: Path) -> tuple[int, int]:
     """Number of tokens of a file, and of the lines that hold one."""
-    left_out, tokens, lines = docstrings(path.read_text(encoding="utf-8")), 0, set()
+    left_out = docstrings(path.read_text(encoding="utf-8"))
+    tokens = 0
+    lines = set()
     with path.open("rb") as file:
         for token in tokenize.tokenize(file.readline):
             if token.type not in LAYOUT and token.start not in left_out:
@@ -47,7 +49,8 @@ def weight(path: Path) -> tuple[int, int]:
 def main() -> None:
     listed = subprocess.run(["git", "ls-files", "*.py"], check=True, capture_output=True, text=True)
     for group, folders in GROUPS.items():
-        tokens, lines = Counter[str](), Counter[str]()
+        tokens = Counter[str]()
+        lines = Counter[str]()
         for name in listed.stdout.split():
             if name.startswith(folders):
                 for key in (group, str(Path(name).parent)):

@@ -48,10 +48,8 @@ region."""
 def script_policy(env: DelayedEnv) -> TensorDictModule:
     """Build the stateless scripted policy, for an environment with ``message`` among its extras."""
     n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
-    shown, should = (
-        f"{n_points} landing points",
-        "are too many for the scripted policy: take a larger step",
-    )
+    shown = f"{n_points} landing points"
+    should = "are too many for the scripted policy: take a larger step"
     checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
     scenario = env.uav_env.scenario
@@ -79,18 +77,22 @@ class Seeker:
     environment."""
 
     def __init__(self, worlds: UavEnv) -> None:
-        scenario, simulation, server = worlds.scenario, worlds.simulation, worlds.server
+        scenario = worlds.scenario
+        simulation = worlds.simulation
+        server = worlds.server
         source = scenario.source
-        self.unpack, self.region_of, self.counted = (
-            server.messages,
-            server.region_of,
-            server.counted,
-        )
-        self.grid, self.level = server.grid, server.level
-        self.radius, self.dt = simulation.radius, scenario.clock.dt
-        self.candidates, self.actions = simulation.candidates, scenario.actions
+        self.unpack = server.messages
+        self.region_of = server.region_of
+        self.counted = server.counted
+        self.grid = server.grid
+        self.level = server.level
+        self.radius = simulation.radius
+        self.dt = scenario.clock.dt
+        self.candidates = simulation.candidates
+        self.actions = scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
-        self.emits, self.hears_all = source.emits, scenario.requests.range is None
+        self.emits = source.emits
+        self.hears_all = scenario.requests.range is None
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
         near = distances(self.points, self.points) <= self.radius
@@ -220,7 +222,8 @@ class Searcher(Seeker):
         """
         known = self.unpack(message)
         own = known if own_message is None else self.unpack(own_message)
-        region, level = self.region_of(known), self.level(known)
+        region = self.region_of(known)
+        level = self.level(known)
         belief = belief.unsqueeze(1) if own_belief is None else own_belief
         assert self.grid is not None
         place = places(self.grid, region, level).unsqueeze(1).expand(belief.shape[:3])
@@ -271,7 +274,8 @@ class Coverer(Seeker):
         Where each UAV knows its own messages, ``own_message`` [B, N, M] are these.
         """
         held = own = self.unpack(message)
-        region, actions = self.region_of(held), []
+        region = self.region_of(held)
+        actions = []
         near = self.footprints(region)
         claimed = torch.zeros(len(region), near.shape[-1], device=message.device)
         for uav in range(message.shape[1]):  # what a UAV chooses depends on those before it
@@ -355,13 +359,12 @@ def _assigned(uavs: Tensor, places: Tensor, wanted: Tensor, uav: int) -> tuple[T
     assigned first.
     """
     cost = distances(uavs, places).masked_fill(~wanted.unsqueeze(1), torch.inf)
-    goal, assigned = (
-        places[:, 0].clone(),
-        torch.zeros(len(uavs), dtype=torch.bool, device=uavs.device),
-    )
+    goal = places[:, 0].clone()
+    assigned = torch.zeros(len(uavs), dtype=torch.bool, device=uavs.device)
     for _ in range(min(cost.shape[1:])):
         least, pair = cost.flatten(1).min(-1)
-        one, place = pair // cost.shape[2], pair % cost.shape[2]
+        one = pair // cost.shape[2]
+        place = pair % cost.shape[2]
         own = (one == uav) & least.isfinite()
         goal = torch.where(
             own.unsqueeze(-1), _places_at(places, place.unsqueeze(1)).squeeze(1), goal

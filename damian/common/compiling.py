@@ -25,7 +25,8 @@ class CompiledMethods:
     """
 
     def __init__(self, options: dict[str, Any], cuda_graph: bool = False) -> None:
-        self._options, self._cuda_graph = options, cuda_graph
+        self._options = options
+        self._cuda_graph = cuda_graph
         self._graphs: dict[tuple[Hashable, ...], Callable[..., Any]] = {}
 
     def get(self, method: Callable[..., Any], *variant: Hashable) -> Callable[..., Any]:
@@ -49,7 +50,9 @@ class CudaGraph:
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._function, self._graph, self._calls = function, torch.cuda.CUDAGraph(), 0
+        self._function = function
+        self._graph = torch.cuda.CUDAGraph()
+        self._calls = 0
         self._inputs: list[Tensor] = []
 
     def __call__(self, *args: Any) -> Any:

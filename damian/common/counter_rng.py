@@ -14,7 +14,8 @@ from torch import Tensor
 
 _MASK = 0xFFFFFFFF
 _WEYL = -0x61C8864680B583EB  # 2^64 / golden ratio, as a signed number
-_FIRST, _SECOND = -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15
+_FIRST = -0x40A7B892E31B1A47
+_SECOND = -0x6B2FB644ECCEEE15
 
 
 def bits64(key: Tensor, *counters: Tensor) -> Tensor:

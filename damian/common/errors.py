@@ -37,7 +37,8 @@ def described(error: BaseException) -> str:
     """An error on one line: its type, its message, and the deepest line of the user's own code."""
     text = " ".join(str(error).split())
     # Frames that belong neither to this package, nor to an installed one, nor to Python.
-    package, library = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
+    package = str(Path(__file__).parents[1])
+    library = sysconfig.get_path("stdlib")
     others = ("site-packages", "dist-packages", "<frozen", package, library)
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not any(other in frame.filename for other in others)]

@@ -193,7 +193,9 @@ def set_at(values: dict[str, Any], key: str, value: Any) -> None:
 def filled(kind: type[S], values: Mapping[str, Any], path: str = "") -> S:
     """Settings of a class from plain values, whose sections are mappings; no text in them is
     resolved."""
-    known, hints, given = rules(kind), _hints(kind), {}
+    known = rules(kind)
+    hints = _hints(kind)
+    given = {}
     for name, value in values.items():
         if name not in known or known[name].fixed:
             close = difflib.get_close_matches(
@@ -238,10 +240,12 @@ _KINDS = {
 
 def _converted(key: str, value: Any, hint: Any) -> Any:
     """A value of the declared type; arrays and numbers of NumPy and torch become plain ones."""
-    value, kind = plain(value), _base(hint)
+    value = plain(value)
+    kind = _base(hint)
     if kind is Any or (value is None and type(None) in get_args(hint)):
         return value
-    origin, inner = get_origin(kind) or kind, get_args(kind)
+    origin = get_origin(kind) or kind
+    inner = get_args(kind)
     if origin is float and checks.is_number(value):
         return float(value)
     if origin is str and checks.is_number(value):
@@ -270,7 +274,8 @@ def _check_value(key: str, value: Any, rule: Rule, kind: Any) -> None:
         return
     if rule.above is not None:
         checks.above(key, value, rule.above, rule.unit)
-    low, high = rule.low, rule.high
+    low = rule.low
+    high = rule.high
     if low is None and high is None:
         high = checks.LARGEST.get(rule.unit, checks.HUGE)
         low = -high
@@ -289,7 +294,8 @@ def check_place(key: str, place: Any) -> None:
     if not isinstance(place, Mapping):
         checks.place(key, place)
         return
-    good, example = set(place) == {"lat", "lon"}, "{lat: 53.1, lon: -4.5}"
+    good = set(place) == {"lat", "lon"}
+    example = "{lat: 53.1, lon: -4.5}"
     checks.require(good, key, place, f"is not {{lat: ..., lon: ...}} in degrees, such as {example}")
     checks.in_range(f"{key}.lat", place["lat"], -90.0, 90.0, "deg")
     checks.in_range(f"{key}.lon", place["lon"], -360.0, 360.0, "deg")

@@ -63,7 +63,9 @@ class Registry(Generic[T]):
     """
 
     def __init__(self, kind: str, fits: type | Callable[[Any], bool], problem: str) -> None:
-        self.kind, self._fits, self._problem = kind, fits, problem
+        self.kind = kind
+        self._fits = fits
+        self._problem = problem
         self._components: dict[
             str, T
         ] = {}  # registered ones, and those that ``get`` has imported last

@@ -29,7 +29,8 @@ def data_file(path: str, key: str) -> str:
     shipped = path.removeprefix("damian:")
     if shipped == path:
         return path
-    folder, name = Path(str(files("damian") / "data")), shipped.partition("/")[0]
+    folder = Path(str(files("damian") / "data"))
+    name = shipped.partition("/")[0]
     alike = [each.name for each in sorted(folder.iterdir()) if each.suffix == Path(name).suffix]
     checks.one_of(key, f"damian:{name}", [f"damian:{each}" for each in alike])
     return str(folder / shipped)

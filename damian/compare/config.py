@@ -114,7 +114,8 @@ class Experiment(Settings):
         never = not self.delays and len(self.methods) > len(undelayed)
         self.refuse(never, "delays", "is empty, but there are delayed methods")
         for name, method in self.methods.items():
-            key, good = f"experiment.methods.{name}", method.delayed and method.policy_of is None
+            key = f"experiment.methods.{name}"
+            good = method.delayed and method.policy_of is None
             should = "goes with neither policy_of nor delayed=false"
             checks.require(good or not method.untrained, key, "untrained", should)
             source = self.methods.get(method.source or "", method)
@@ -171,7 +172,8 @@ class CompareConfig(Settings):
 
     def chosen(self, kind: str) -> dict[str, Any]:
         """The experiment's tasks, delays or methods (``kind``) that are asked for, by name."""
-        every, only = getattr(self.experiment, kind), getattr(self, kind)
+        every = getattr(self.experiment, kind)
+        only = getattr(self, kind)
         return {name: every[name] for name in every if only is None or name in only}
 
     @property

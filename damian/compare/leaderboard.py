@@ -58,7 +58,8 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
     finite = np.isfinite(rows[[*NUMBERS, "parameters"]].to_numpy(float)).all()
     checks.require(bool(finite), path, "a number", "is not finite")
     for place, runs in rows.groupby(RUN[:-1], sort=False):
-        where, seeds = f"{path}: {'/'.join(map(str, place))}", runs["seed"]
+        where = f"{path}: {'/'.join(map(str, place))}"
+        seeds = runs["seed"]
         checks.require(
             not seeds.duplicated().any(), f"{where}: seed", [*seeds], "are not all different"
         )
@@ -94,11 +95,10 @@ def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
     for method in means.sort_values(present, ascending=False).index:
         runs = rows[rows["method"] == method]
         cells = [_mean(runs[runs["delay"] == delay]) for delay in present]
-        one, steps = runs.iloc[0], f"{runs['frames'].max() / 1e6:.2g}"
-        size, version = (
-            f"{int(one['parameters']):,}",
-            f"{one['damian']} ({str(one['commit'])[:7]})".removesuffix(" (several)"),
-        )
+        one = runs.iloc[0]
+        steps = f"{runs['frames'].max() / 1e6:.2g}"
+        size = f"{int(one['parameters']):,}"
+        version = f"{one['damian']} ({str(one['commit'])[:7]})".removesuffix(" (several)")
         lines.append((method, *cells, one["authors"], steps, size, version))
     return markdown_table(
         ["method", *present, "authors", "million steps", "parameters", "damian"], lines

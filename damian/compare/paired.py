@@ -26,7 +26,8 @@ DIFFERENCE = (
 def means(rows: pd.DataFrame, groups: Sequence[str], score: str = "return") -> pd.DataFrame:
     """A line for each policy of each group: means over seeds, and differences to the first
     value."""
-    succeeds, lines = (rows["success_rate"] > 0).any(), []
+    succeeds = (rows["success_rate"] > 0).any()
+    lines = []
     known = {name: declared(name) for name in measured_in(rows, score)}
     measures = [name for name, each in known.items() if name == score or "sweep" in each.tables]
     measures = [
@@ -50,7 +51,8 @@ def difference(runs: pd.DataFrame, others: pd.DataFrame, score: str) -> dict[str
     pairs = runs[["seed", score]].merge(others[["seed", score]], on="seed")
     if pairs.empty:
         return {}
-    new, old = pairs[f"{score}_x"], pairs[f"{score}_y"]
+    new = pairs[f"{score}_x"]
+    old = pairs[f"{score}_y"]
     sign = sign_of(score)
     found = means_over_seeds(pd.DataFrame({"difference": new - old}))
     return found | improvement(sign * new.to_numpy(), sign * old.to_numpy())
@@ -61,7 +63,8 @@ def as_table(lines: pd.DataFrame, groups: Sequence[str], score: str = "return") 
     head = [*groups, "policy", "n"]
     known = [name.removesuffix("_low") for name in map(str, lines) if name.endswith("_low")]
     measures = [name for name in known if name not in ("difference", "improvement")]
-    columns, note = {name: name for name in measures}, NOTE
+    columns = {name: name for name in measures}
+    note = NOTE
     if "difference" in lines:
         columns |= {"difference": "difference", "improvement": "P > first"}
         note += DIFFERENCE.format(score=score, first=f"{groups[0]}={lines[groups[0]].iloc[0]}")

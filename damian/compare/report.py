@@ -22,7 +22,8 @@ from damian.compare.figures import curve
 
 def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
     """Return the whole comparison as Markdown, with ``notes`` as lines at the top."""
-    table, runs = comparison.table, comparison.rows.drop_duplicates(RUN)
+    table = comparison.table
+    runs = comparison.rows.drop_duplicates(RUN)
     hours = f"{len(runs)} runs, which took {runs['seconds'].sum() / 3600:.2f} hours"
     parts = ["\n".join(f"- {note}" for note in (*notes, hours))]
     for task in comparison.tasks():

@@ -39,7 +39,9 @@ def recovery(scores: Floats, least: float = LEAST_GAP) -> Floats:
     positive or less than ``least`` of undelayed - random, or where undelayed does not beat random.
     """
     means = scores.mean(-1)
-    undelayed, random, naive = means[..., 0], means[..., 1], means[..., 2:-1].max(-1)
+    undelayed = means[..., 0]
+    random = means[..., 1]
+    naive = means[..., 2:-1].max(-1)
     gap = undelayed - naive
     enough = (gap > 0) & (undelayed > random) & (gap >= least * (undelayed - random))
     return (means[..., -1] - naive) / np.where(enough, gap, np.nan)
@@ -59,7 +61,8 @@ def interval(values: Floats) -> tuple[Floats, Floats]:
     A nan (a ratio without meaning) counts both as the lowest and as the highest value: an end of
     the interval that falls on a nan is infinite.
     """
-    unknown, tail = np.isnan(values), (1 - LEVEL) / 2
+    unknown = np.isnan(values)
+    tail = (1 - LEVEL) / 2
     low = np.quantile(np.where(unknown, -np.inf, values), tail, 0, method="inverted_cdf")
     high = np.quantile(np.where(unknown, np.inf, values), 1 - tail, 0, method="inverted_cdf")
     return low, high
@@ -115,7 +118,8 @@ def bootstrap(
         scores: scores by seed, [methods, seeds].
         draws: number of resamples.
     """
-    value, n_seeds = np.asarray(statistic(scores), dtype=float), scores.shape[-1]
+    value = np.asarray(statistic(scores), dtype=float)
+    n_seeds = scores.shape[-1]
     if n_seeds < FEWEST:
         return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
     factor = math.sqrt(n_seeds / (n_seeds - 1)) * stdtrit(n_seeds - 1, (1 + LEVEL) / 2) / NORMAL

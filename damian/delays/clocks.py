@@ -26,7 +26,8 @@ UNSET = 1e6
 WINDOW = 10
 """Messages before and after a step of a clock that must show it, where numbers do not."""
 
-Floats, Flags = NDArray[np.floating], NDArray[np.bool_]
+Floats = NDArray[np.floating]
+Flags = NDArray[np.bool_]
 
 
 def in_order(log: pd.DataFrame) -> pd.DataFrame:
@@ -51,10 +52,14 @@ def _runs(own: pd.DataFrame) -> list[int]:
     A sender that starts anew counts from 0: a number comes again with another time, or a small one
     has the latest time.
     """
-    runs, times, highest, began = list[int](), [dict[float, float]()], [-1.0], [-math.inf]
+    runs = list[int]()
+    times = [dict[float, float]()]
+    highest = [-1.0]
+    began = [-math.inf]
     latest = -math.inf
     for number, time, received in own[["sequence", "time", "received"]].itertuples(index=False):
-        run, is_possible = len(times) - 1, -AGREE <= received - time <= UNSET
+        run = len(times) - 1
+        is_possible = -AGREE <= received - time <= UNSET
         is_late = run > 0 and is_possible and time < began[run]
         is_late = is_late and highest[run] < number <= highest[run - 1] + WINDOW
         if is_late and times[run - 1].get(number, time) == time:
@@ -99,7 +104,8 @@ def _right(own: pd.DataFrame) -> Flags:
 def _steps(own: pd.DataFrame) -> Flags:
     """Where the clock of a sender seems to have been set: between a message and the one before
     it."""
-    time, received = own.time.to_numpy(), own.received.to_numpy()
+    time = own.time.to_numpy()
+    received = own.received.to_numpy()
     steps = np.zeros(len(own), bool)
     if own.sequence.notna().all():
         is_behind = time < np.maximum.accumulate(time) - AGREE
@@ -118,8 +124,11 @@ def _level_steps(late: Floats, received: Floats, number: Floats) -> Flags:
     usual.
     """
     lates, times = (sliding_window_view(values, WINDOW) for values in (late, received))
-    level, spread, span = np.median(lates, 1), np.ptp(lates, 1), np.ptp(times, 1)
-    before, after = slice(None, -WINDOW), slice(WINDOW, None)
+    level = np.median(lates, 1)
+    spread = np.ptp(lates, 1)
+    span = np.ptp(times, 1)
+    before = slice(None, -WINDOW)
+    after = slice(WINDOW, None)
     step = np.abs(level[after] - level[before])
     is_level = (
         np.maximum(spread[before], spread[after])

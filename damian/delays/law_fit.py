@@ -15,7 +15,8 @@ LOST_STEPS, NO_MESSAGE = -1, -2
 OWN = ("recorded frequencies", "recorded frequencies of pairs")
 """Laws are compared with these: the recorded frequency of each delay, and that given the delay
 before it."""
-Integers, Floats = NDArray[np.integer], NDArray[np.floating]
+Integers = NDArray[np.integer]
+Floats = NDArray[np.floating]
 
 
 class LawFit(NamedTuple):
@@ -47,7 +48,9 @@ def fit_laws(steps: Integers) -> tuple[LawFit, LawFit]:
     """
     codes = np.where(steps >= 0, steps, steps.max() - steps)  # K + 1 is lost, K + 2 none
     counts = np.bincount(codes.ravel(), minlength=int(steps.max()) + 3)[:-1]
-    n, size, chances = int(counts.sum()), len(counts), counts / counts.sum()
+    n = int(counts.sum())
+    size = len(counts)
+    chances = counts / counts.sum()
     pairs, often = np.unique(
         (codes[:, :-1] * size + codes[:, 1:])[codes[:, 1:] < size], return_counts=True
     )
@@ -68,17 +71,13 @@ def _likelihood(counts: NDArray[Any], chances: Floats) -> float:
 def _memoryless(counts: Integers) -> LawFit:
     """The best law without memory, for counts of the delays 0, 1, ..., K and, last, of losses
     [K + 2]."""
-    n, arrived, delays = (
-        int(counts.sum()),
-        int(counts[:-1].sum()),
-        np.flatnonzero(counts[:-1]).tolist(),
-    )
-    loss, low, high, fits = (
-        1 - arrived / n,
-        min(delays, default=0),
-        max(delays, default=0),
-        list[LawFit](),
-    )
+    n = int(counts.sum())
+    arrived = int(counts[:-1].sum())
+    delays = np.flatnonzero(counts[:-1]).tolist()
+    loss = 1 - arrived / n
+    low = min(delays, default=0)
+    high = max(delays, default=0)
+    fits = list[LawFit]()
     laws: list[tuple[Any, int]] = [(high, min(arrived, 1))]
     if low < high:
         mean = (
@@ -92,7 +91,8 @@ def _memoryless(counts: Integers) -> LawFit:
         laws = [({"law": "uniform", "low": low, "high": high}, 2), ({"law": "uniform", **late}, 3)]
         laws.append(({"law": "geometric", "mean": round(float(mean), 5), "longest": high}, 2))
     for law, k in laws:
-        sampler, chances = cast(TableSampler, sampler_of(law, loss=loss)), np.zeros(len(counts))
+        sampler = cast(TableSampler, sampler_of(law, loss=loss))
+        chances = np.zeros(len(counts))
         table = sampler.chances[0].numpy()
         chances[: len(table) - 1], chances[-1] = table[:-1], table[-1]
         fits.append(
@@ -113,13 +113,12 @@ def _burst(codes: Integers, counts: Integers) -> LawFit:
     (_, enter), (leave, _) = move = moves / moves.sum(1, keepdims=True)
     share = np.array([leave, enter]) / (enter + leave)
     path = _likelihood(moves, move) + _likelihood(np.bincount(bad[:, 0], minlength=2), share)
-    good, worse = _memoryless(counts * ~late), _memoryless(counts * late)
+    good = _memoryless(counts * ~late)
+    worse = _memoryless(counts * late)
     written = {"law": "burst", "enter": round(float(enter), 5), "leave": round(float(leave), 5)}
     written |= {"good": good.written, "bad": worse.written, "bad_loss": worse.loss}
-    chances, likelihood = (
-        share @ [good.chances, worse.chances],
-        good.likelihood + worse.likelihood + path,
-    )
+    chances = share @ [good.chances, worse.chances]
+    likelihood = good.likelihood + worse.likelihood + path
     return LawFit(
         written, chances, likelihood, 2 + good.n_parameters + worse.n_parameters, worse.n + good.n
     )

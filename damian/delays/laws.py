@@ -167,10 +167,8 @@ class Uniform(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         for name in ("low", "high"):
             in_steps(f"{key}.{name}", getattr(self, name), dt)  # refuses what is not a delay
-        low, high = (
-            _exact_steps(f"{key}.low", self.low, dt),
-            _exact_steps(f"{key}.high", self.high, dt),
-        )
+        low = _exact_steps(f"{key}.low", self.low, dt)
+        high = _exact_steps(f"{key}.high", self.high, dt)
         in_time = isinstance(self.low, str), isinstance(self.high, str)
         should = f"and high={self.high} are not two steps or two times in order"
         checks.require(low <= high and in_time[0] == in_time[1], f"{key}.low", self.low, should)
@@ -285,7 +283,8 @@ class Lag(Law):
     """Each sender has its own time until its second draw, random and at most a period."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        period, draws_again = None, bool(self.hold_probability) or self.stagger
+        period = None
+        draws_again = bool(self.hold_probability) or self.stagger
         if self.update_period == "episode":
             problem = "draws one lag: hold_probability and stagger have no effect"
             checks.require(not draws_again, f"{key}.update_period", "episode", problem)
@@ -332,12 +331,14 @@ class Distance(Law):
         longest = in_steps(f"{key}.longest", self.longest, dt)
         in_steps(f"{key}.base", self.base, dt)  # refuses what is not a delay
         base = _exact_steps(f"{key}.base", self.base, dt)
-        loses, compute = math.isfinite(self.range), partial(self.delays, base)
+        loses = math.isfinite(self.range)
+        compute = partial(self.delays, base)
         return ContextSampler(compute, longest, loss, loses=loses, reads=["position"])
 
     def delays(self, base: float, context: MessageContext) -> Tensor:
         """Delay of each of M messages [steps], [M], -1 if it is lost; ``base`` is in steps, too."""
-        entries, position = context.entries, context.entries["position"]
+        entries = context.entries
+        position = context.entries["position"]
         given = "receiver_position" in entries
         receiver = entries["receiver_position"] if given else position.new_tensor(self.receiver)
         distance = torch.linalg.vector_norm(position - receiver, dim=-1)
@@ -414,9 +415,11 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     samplers: list[Sampler] = []
     index = []
     for i, j in itertools.product(range(n), range(n)):
-        law, name = delay, key
+        law = delay
+        name = key
         if is_matrix(delay):
-            law, name = 0 if i == j else delay[i][j], f"{key}[{i}][{j}]"
+            law = 0 if i == j else delay[i][j]
+            name = f"{key}[{i}][{j}]"
         if law not in distinct:
             distinct.append(law)
             samplers.append(sampler_of(law, dt, key=name))

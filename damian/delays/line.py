@@ -63,7 +63,8 @@ class DelayLine:
     def init_memory(self, values: list[Tensor], streams: Tensor) -> Memory:
         """Create the memory for messages like ``values`` [M, ...] and senders with random
         ``streams`` [M]."""
-        n_rows, zero = self.sampler.lost + 1, torch.zeros_like(streams)
+        n_rows = self.sampler.lost + 1
+        zero = torch.zeros_like(streams)
         memory = {
             "clock": zero,
             "place": torch.arange(len(streams), device=streams.device),
@@ -102,8 +103,10 @@ class DelayLine:
     ) -> tuple[Memory, Delivery]:
         """Send ``values`` [M, ...] of the senders ``sent`` [M] (None: all), and deliver what
         arrives now."""
-        clock, generated_at = memory["clock"] + 1, memory["generated_at"]
-        n_slots, n_senders = self.sampler.lost, len(generated_at)
+        clock = memory["clock"] + 1
+        generated_at = memory["generated_at"]
+        n_slots = self.sampler.lost
+        n_senders = len(generated_at)
         n_places = n_slots * n_senders
         row_now = (memory["place"] + n_senders) % n_places
         delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
@@ -132,7 +135,8 @@ class DelayLine:
         }
         held = []
         for i, value in enumerate(values):
-            flat, old = memory[f"slots_{i}"].flatten(0, 1), memory[f"held_{i}"]
+            flat = memory[f"slots_{i}"].flatten(0, 1)
+            old = memory[f"held_{i}"]
             flat.index_copy_(0, row_sent, value)
             held.append(torch.where(expand_mask(fresh, old), flat.index_select(0, row_now), old))
             memory[f"held_{i}"] = held[i]

@@ -63,7 +63,8 @@ def read_log(path: Path) -> pd.DataFrame:
 def _journal_rows(text: str) -> list[tuple[str, Any, Any]]:
     """Reports of a journal, but for an unfinished last line, with their places and when they came
     in."""
-    rows, lines = [], text.rpartition("\n")[0].split("\n")
+    rows = []
+    lines = text.rpartition("\n")[0].split("\n")
     for n, line in enumerate(lines, 1):
         with named(where := f"line {n}"):
             try:

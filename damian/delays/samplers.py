@@ -70,7 +70,8 @@ class Sampler(nn.Module, ABC):
     def __init__(self, longest: int, loses: bool = True, loss: float = 0.0) -> None:
         super().__init__()
         checks.in_range("loss", loss, 0.0, 1.0)
-        self.longest, self.loss = longest, loss
+        self.longest = longest
+        self.loss = loss
         self.lost = longest + 1
         """Delay value that marks a message that never arrives."""
         self.loses = loses or loss > 0
@@ -201,7 +202,9 @@ class HeldSampler(Sampler):
 
     def __init__(self, drawn: Sampler) -> None:
         super().__init__(drawn.longest, drawn.loses)
-        self.drawn, self.sees_context, self.reads = drawn, drawn.sees_context, drawn.reads
+        self.drawn = drawn
+        self.sees_context = drawn.sees_context
+        self.reads = drawn.reads
         self.same_draws_for_all_agents = drawn.same_draws_for_all_agents
         self.constant_delay = None if self.loses else self.longest
 
@@ -224,7 +227,9 @@ class LossSampler(HeldSampler):
 
     def __init__(self, drawn: Sampler) -> None:
         super().__init__(drawn)
-        self.loses, self.constant_delay, self.sees_context = True, None, True
+        self.loses = True
+        self.constant_delay = None
+        self.sees_context = True
         self.reads = (*drawn.reads, "loss")
 
     def forward(
@@ -245,14 +250,17 @@ class LagSampler(Sampler):
     """
 
     def __init__(self, law: Any, chances: list[float], loss: float, period: int | None) -> None:
-        table, arrives = TableSampler([chances], loss=loss), sum(chances)
+        table = TableSampler([chances], loss=loss)
+        arrives = sum(chances)
         super().__init__(table.longest, loses=False, loss=table.chances[0, -1].item())
         self.constant_delay = table.constant_delay
         self._lags = TableSampler(
             [[chance / arrives for chance in chances]] if arrives else [[1.0]]
         )
-        self._period, self._hold_probability = period or _NEVER, law.hold_probability
-        self.same_draws_for_all_agents, self._stagger = law.shared, law.stagger
+        self._period = period or _NEVER
+        self._hold_probability = law.hold_probability
+        self.same_draws_for_all_agents = law.shared
+        self._stagger = law.stagger
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return torch.stack([torch.full_like(streams, -1), torch.zeros_like(streams)], -1)
@@ -266,8 +274,10 @@ class LagSampler(Sampler):
         if self.constant_delay is not None:
             return torch.full_like(streams, self.constant_delay), state
         lag, wait = state.unbind(-1)
-        first, due = lag < 0, wait == 0
-        renewed, interval = due, torch.full_like(streams, self._period)
+        first = lag < 0
+        due = wait == 0
+        renewed = due
+        interval = torch.full_like(streams, self._period)
         if self._hold_probability:
             draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _HOLD_DRAW))
             renewed = first | (due & (draw >= self._hold_probability))
@@ -314,8 +324,10 @@ class ContextSampler(Sampler):
         reads: Sequence[str] = (),
     ) -> None:
         super().__init__(longest, loses, loss)
-        self.sees_context, self.reads = True, tuple(reads)
-        self._delay_fn, self._lost_if_negative = delay_fn, loses
+        self.sees_context = True
+        self.reads = tuple(reads)
+        self._delay_fn = delay_fn
+        self._lost_if_negative = loses
 
     def forward(
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
@@ -368,7 +380,9 @@ class LinkSampler(Sampler):
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
         n_links = len(self._law_index)
-        n_worlds, delay, states = len(streams) // n_links, torch.zeros_like(streams), []
+        n_worlds = len(streams) // n_links
+        delay = torch.zeros_like(streams)
+        states = []
         index = self._law_index.repeat(n_worlds)
         for k, (sampler, part) in enumerate(zip(self.samplers, self._split(state), strict=True)):
             drawn, new_state = sampler(streams_for(sampler, streams, n_links), clock, part, context)
@@ -382,7 +396,8 @@ class LinkSampler(Sampler):
 
     def _split(self, state: Tensor) -> list[Tensor]:
         """The state of each sampler, [M, ...]."""
-        parts, states = state.split([size for size, _, _ in self._state_forms], -1), []
+        parts = state.split([size for size, _, _ in self._state_forms], -1)
+        states = []
         for part, (_, shape, dtype) in zip(parts, self._state_forms, strict=True):
             number = part.view(torch.double) if dtype.is_floating_point else part
             states.append(number.to(dtype).reshape(len(part), *shape))

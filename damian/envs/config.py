@@ -44,7 +44,8 @@ class ClockConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        fast, triggered = ("simulation", "agents", "server"), ("trigger", "shortest", "longest")
+        fast = ("simulation", "agents", "server")
+        triggered = ("trigger", "shortest", "longest")
         for slower, faster in itertools.permutations((*fast, "system"), 2):
             if self._seconds(slower) >= self._seconds(faster) or faster == "simulation":
                 self._check_multiple(slower, faster)
@@ -92,7 +93,9 @@ class ScenarioConfig(WorldConfig):
         super().__post_init__()
         if "source.level_db" in self.randomise and FOOTPRINT not in self.sensors:
             self.sensors = [*self.sensors, FOOTPRINT]
-        links, observation, episode = self.links.kind, self.observation, self.episode
+        links = self.links.kind
+        observation = self.observation
+        episode = self.episode
         problem = "does not go with clock.server: between two broadcasts no observation changes"
         self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)
         problem = "does not go with links=updown: the server has computed what a UAV receives"

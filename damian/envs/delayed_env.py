@@ -63,7 +63,8 @@ class DelayedEnv(TransformedEnv):
         for transform in cast(Compose, self.transform):
             if isinstance(transform, ActionHistory):
                 for key in transform.in_keys:
-                    name, spec = keys.last_part(key), self.observation_spec[key]
+                    name = keys.last_part(key)
+                    spec = self.observation_spec[key]
                     layouts[name] = _with_past_actions(layouts[name], transform.steps, spec)
         return layouts
 
@@ -140,7 +141,8 @@ class DelayedEnv(TransformedEnv):
 
         ``entries`` are those that a policy has written, and those that it has read.
         """
-        transforms, changed = self._fused(), list(memories)
+        transforms = self._fused()
+        changed = list(memories)
         for i, transform in reversed([*enumerate(transforms)]):
             changed[i], written = transform.on_action(changed[i], entries)
             entries = entries | written
@@ -156,7 +158,8 @@ class DelayedEnv(TransformedEnv):
         self, worlds: PackedState, memories: list[Memory], mask: Tensor
     ) -> tuple[PackedState, list[Memory], Outputs]:
         """Begin new episodes in the worlds of the mask [B] bool."""
-        transforms, changed = self._fused(), list(memories)
+        transforms = self._fused()
+        changed = list(memories)
         worlds, outputs = self.uav_env.reset_fn(worlds, mask)
         for i, transform in enumerate(transforms):
             changed[i], written = transform.on_reset(
@@ -260,7 +263,8 @@ class DelayedEnv(TransformedEnv):
     ) -> tuple[list[Memory], Entries]:
         """The memories of the transforms, and the entries that they and the worlds read before a
         step."""
-        memories, entries = [], select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
+        memories = []
+        entries = select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
         for transform in fused:
             transform.require_memory()
             entries |= select_entries(tensordict, transform.action_keys)
@@ -280,7 +284,8 @@ def _with_past_actions(layout: Layout, n_actions: int, spec: TensorSpec) -> Layo
     observation."""
     bounds = {}
     if isinstance(spec, Bounded):
-        low, high = spec.low[..., layout.width :].amin(), spec.high[..., layout.width :].amax()
+        low = spec.low[..., layout.width :].amin()
+        high = spec.high[..., layout.width :].amax()
         bounds = {"low": low.item(), "high": high.item()}
     shape = (n_actions, (spec.shape[-1] - layout.width) // n_actions)
     meaning = f"The latest {n_actions} actions of the UAV itself, scaled, the oldest first."

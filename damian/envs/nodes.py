@@ -86,9 +86,12 @@ class ServerNode(WorldTransform):
         created = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.REWARD]
         created += [(*keys.REWARD_TERMS, name) for name in names]
         super().__init__([message_key], [*created, keys.SUCCESS, *keys.ENDS])
-        self.server, self.heard_key, self.reward_terms = server, heard_key, reward_terms
+        self.server = server
+        self.heard_key = heard_key
+        self.reward_terms = reward_terms
         self.own_key = keys.MESSAGE if server.observation.own else None
-        own, timeline = server.observation.own, server.observation.timeline > 0
+        own = server.observation.own
+        timeline = server.observation.timeline > 0
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + own] if server.grid else []
         heard = [keys.HEARD_STOPS] if heard_key else [keys.OWN_STOPS] if own else []
         self.stop_keys = [keys.STOPS, *heard] if timeline else []
@@ -125,14 +128,17 @@ class ServerNode(WorldTransform):
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
+        elapsed = memory["elapsed"] + 1
+        received = entries[self.in_keys[0]]
         sent = entries.get(keys.MESSAGE, received)
         if self.known_key:
             received = self.server.with_own_knowledge(received, sent)
-        steps, messages = elapsed.view(self.rows), self.server.messages(received)
+        steps = elapsed.view(self.rows)
+        messages = self.server.messages(received)
         news = messages.time != memory["held"]
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
-        over, belief = entries.get(keys.SOURCE_OVER), entries.get(keys.BELIEF)
+        over = entries.get(keys.SOURCE_OVER)
+        belief = entries.get(keys.BELIEF)
         timeline = entries.get(keys.STOPS)
         outputs = self.server(messages, steps, over, known, belief, timeline, news=news)
         written = outputs.entries(self.reward_terms)
@@ -191,27 +197,31 @@ class Belief(WorldTransform):
             *([keys.DELAY] if delayed else []),
         ]
         super().__init__(reads, [keys.BELIEF, *([keys.OWN_BELIEF] if own else [])])
-        self.server, self.longest, self.delayed, self.own = server, longest, delayed, own
+        self.server = server
+        self.longest = longest
+        self.delayed = delayed
+        self.own = own
         self.step_keys = reads
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        n_beliefs, n_agents = (
-            self.rows.numel() * self.grid.n_sources,
-            tensordict[keys.MESSAGE].shape[-2],
-        )
+        n_beliefs = self.rows.numel() * self.grid.n_sources
+        n_agents = tensordict[keys.MESSAGE].shape[-2]
         return empty_window(self.grid, self.longest, n_beliefs, n_agents, self.own)._asdict()
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         messages = self.server.messages(self.to_rows(entries[keys.MESSAGE]))
-        region, level = self.server.region_of(messages), self.server.level(messages)
-        rows, place = report_rows(self.grid, messages, level), places(self.grid, region, level)
+        region = self.server.region_of(messages)
+        level = self.server.level(messages)
+        rows = report_rows(self.grid, messages, level)
+        place = places(self.grid, region, level)
         told = rows.flatten(0, 1), place.flatten(), self._of_each(mask)
         return memory, self._written(begin_beliefs(self.grid, Window(**memory), *told))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         rows = {key: self.to_rows(entries[key]) for key in self.in_keys}
         messages = self.server.messages(rows[keys.MESSAGE])
-        region, level = self.server.region_of(messages), self.server.level(messages)
+        region = self.server.region_of(messages)
+        level = self.server.level(messages)
         report = report_rows(self.grid, messages, level, rows[keys.MESSAGE_SENT])
         delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(messages.motions)
         every = torch.ones_like(region, dtype=torch.bool)
@@ -244,10 +254,8 @@ class Belief(WorldTransform):
         return self.server.grid
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        worlds, n_agents = (
-            observation_spec[keys.MESSAGE].shape[:-2],
-            observation_spec[keys.MESSAGE].shape[-2],
-        )
+        worlds = observation_spec[keys.MESSAGE].shape[:-2]
+        n_agents = observation_spec[keys.MESSAGE].shape[-2]
         cells = self.grid.n_sources, self.grid.prior.shape[-1]
         for key, shape in ((keys.BELIEF, worlds), (keys.OWN_BELIEF, (*worlds, n_agents))):
             if key in self.out_keys:

@@ -99,7 +99,8 @@ def make_transforms(
 def action_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
     """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not
     sent."""
-    clock, act = scenario.clock, delays.act
+    clock = scenario.clock
+    act = delays.act
     if not act.late and clock.steps("agents") == 1:
         return []
     late = ActionDelay(
@@ -118,7 +119,9 @@ def server_transforms(
 ) -> list[Transform]:
     """The message delay (paper, section 3.4), links, and the server node, which uses arrived
     messages."""
-    output_messages, delayed, links = "message" in extras, delays.obs.late, scenario.links
+    output_messages = "message" in extras
+    delayed = delays.obs.late
+    links = scenario.links
     remembers = (
         server.grid is not None or scenario.delay.messages > 0 or scenario.observation.timeline > 0
     )
@@ -139,9 +142,11 @@ def server_transforms(
         transforms.append(uplink)
     longest = delays.obs.longest if delayed else 0
     transforms += remembering_transforms(scenario, server, longest, delayed)
-    held, heard = keys.RECEIVED if delayed else keys.MESSAGE, None
+    held = keys.RECEIVED if delayed else keys.MESSAGE
+    heard = None
     if links.kind == "matrix":
-        heard, law = keys.LINKED, delays.links
+        heard = keys.LINKED
+        law = delays.links
         channel = Channel(
             law,
             keys.MESSAGE,
@@ -167,7 +172,8 @@ def remembering_transforms(
     scenario: ScenarioConfig, server: Server, longest: int, delayed: bool
 ) -> list[Transform]:
     """What keeps messages of earlier steps: the belief, and the history to learn a belief from."""
-    own, transforms = scenario.observation.own, list[Transform]()
+    own = scenario.observation.own
+    transforms = list[Transform]()
     if server.grid is not None:
         transforms.append(Belief(server, longest, delayed=delayed, own=own))
     if scenario.delay.messages:
@@ -228,7 +234,8 @@ def reward_transforms(
 ) -> list[Transform]:
     """The reward delay, and the discounted sum of the latest rewards
     (paper, section 3.5, eq. 4)."""
-    delay, reported = scenario.delay, "message" in extras
+    delay = scenario.delay
+    reported = "message" in extras
     transforms: list[Transform] = []
     if delays.rew.late:
         # With a message delay the server computes in hindsight what was earned.
@@ -249,7 +256,9 @@ def reward_transforms(
 def observation_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
     """Clocks of server and UAVs (paper, section 3.6), the broadcast, and the action history
     (section 3.3)."""
-    clock, links, n_actions = scenario.clock, scenario.links, scenario.delay.history
+    clock = scenario.clock
+    links = scenario.links
+    n_actions = scenario.delay.history
     transforms: list[Transform] = []
     broadcast = [keys.OBSERVATION, *[keys.TIMELINE] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
@@ -300,7 +309,8 @@ def history_since_message(scenario: ScenarioConfig, delays: ScenarioDelays) -> b
 
 def has_server_node(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
     """Whether a ``ServerNode`` computes observations and rewards, instead of ``UavEnv``."""
-    observation, messages = scenario.observation, scenario.delay.messages
+    observation = scenario.observation
+    messages = scenario.delay.messages
     remembers = bool(observation.belief) or messages > 0 or observation.timeline > 0
     return delays.obs.late or remembers or scenario.links.kind == "matrix"
 

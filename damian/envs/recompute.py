@@ -65,7 +65,8 @@ def server_recompute(
 def timeline_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     """What is known of stops after each stored step, by all that has arrived by now,
     [T, B, N, slots, 3]."""
-    messages, n_steps = steps[next_key(keys.MESSAGE)], len(steps)
+    messages = steps[next_key(keys.MESSAGE)]
+    n_steps = len(steps)
     places, told = told_slots(
         server.stop_places(messages), server.stop_ages(messages), server.observation.timeline
     )
@@ -77,7 +78,8 @@ def timeline_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     told = (told & arrived.unsqueeze(-1)).unsqueeze(-1)
     new = torch.cat([places, torch.ones_like(places[..., :1])], -1)
     begins = expand_mask(steps[keys.STEP_COUNT].squeeze(-1) == 0, new)
-    known, found = steps[keys.STOPS][0], []
+    known = steps[keys.STOPS][0]
+    found = []
     for i in range(n_steps):  # each one follows from the one before
         known = torch.where(begins[i], steps[keys.STOPS][i], known)
         older = F.pad(known[..., :-1, :], (0, 0, 1, 0))  # a step older
@@ -92,18 +94,23 @@ def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     """The belief after each stored step, from what has arrived by now, [T, B, K, C]; the first is
     final."""
     assert server.grid is not None
-    grid, messages = server.grid, server.messages(steps[next_key(keys.MESSAGE)])
+    grid = server.grid
+    messages = server.messages(steps[next_key(keys.MESSAGE)])
     delay = steps[next_key(keys.DELAY)].squeeze(-1)
     step = torch.arange(len(delay), device=delay.device).view(-1, 1, 1)
     arrived = arrived_by_now(delay, len(delay) - 1 - step)
     begins = (steps[keys.STEP_COUNT] == 0).unsqueeze(-1)
-    before, after = steps[keys.BELIEF], steps[next_key(keys.BELIEF)]
-    level, first = server.level(messages), server.messages(steps[keys.MESSAGE])
-    rows, first = report_rows(grid, messages, level, arrived), report_rows(grid, first, level)
+    before = steps[keys.BELIEF]
+    after = steps[next_key(keys.BELIEF)]
+    level = server.level(messages)
+    first = server.messages(steps[keys.MESSAGE])
+    rows = report_rows(grid, messages, level, arrived)
+    first = report_rows(grid, first, level)
     previous = torch.where(begins, first, rows.roll(1, 0))
     place = places(grid, server.region_of(messages), level)
     likely = likelihood(grid, repeated(grid, rows, previous), place)
-    belief, corrected = before[0], []
+    belief = before[0]
+    corrected = []
     for i in range(len(delay)):  # each belief follows from the one before
         belief = torch.where(begins[i], before[i], belief)
         belief = weigh(predict(grid, belief, place[i]), likely[i])

@@ -93,7 +93,8 @@ class UavEnv(EnvBase):
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
         self.scenario = copy.deepcopy(scenario) if scenario else ScenarioConfig()
         checks.device("device", str(device))
-        self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
+        self.extras = checks.names("extras", extras, ALL_EXTRAS)
+        self.messages_only = messages_only
         of = self.scenario
         self.simulation = Simulation(of, of.clock.dt, of.observation.carried_stops, seed)
         self.server = Server(self.simulation, of.observation, of.reward, of.episode, of.time_scale)
@@ -169,7 +170,8 @@ class UavEnv(EnvBase):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action, valid = tensordict.get(keys.ACTION), tensordict.get(keys.ACTION_VALID, None)
+        action = tensordict.get(keys.ACTION)
+        valid = tensordict.get(keys.ACTION_VALID, None)
         before = self.worlds
         self.worlds, outputs = self.step_fn(before, action, valid)
         if self.messages_only:  # TorchRL expects a reward from every environment
@@ -302,7 +304,8 @@ class UavEnv(EnvBase):
         for key, value in outputs.items():
             *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
             levels.setdefault(tuple(path), {})[name] = value
-        root, agents = levels.pop(()), levels.pop((keys.AGENTS,))
+        root = levels.pop(())
+        agents = levels.pop((keys.AGENTS,))
         for path, level in levels.items():
             agents[path[-1]] = make(level, shape, self.device)
         root[keys.AGENTS] = make(agents, shape, self.device)
@@ -323,7 +326,8 @@ class UavEnv(EnvBase):
         bounds: Bounds = {
             (keys.AGENTS, name): layout.bounds() for name, layout in self.layout.items()
         }
-        worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
+        worlds = self.batch_size
+        agents = torch.Size((*self.batch_size, self.n_agents))
         ends: Outputs = {
             key: table for key, table in self._reset_outputs.items() if key in keys.ENDS
         }

@@ -126,10 +126,8 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         dt: float = 1.0,
     ) -> None:
         super().__init__(env)
-        mode, self._worlds = (
-            env.metadata.get("autoreset_mode"),
-            [str(i) for i in range(env.num_envs)],
-        )
+        mode = env.metadata.get("autoreset_mode")
+        self._worlds = [str(i) for i in range(env.num_envs)]
         self._at_once = mode == AutoresetMode.SAME_STEP
         known = self._at_once or mode == AutoresetMode.NEXT_STEP
         checks.require(
@@ -143,7 +141,8 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         }
         told |= {"history": history, "timeline": timeline, "dt": dt}
         told["default"] = {} if default is None else dict.fromkeys(self._worlds, default)
-        space, acting = env.single_observation_space, env.single_action_space
+        space = env.single_observation_space
+        acting = env.single_action_space
         self._delays = Delays(
             dict.fromkeys(self._worlds, space), dict.fromkeys(self._worlds, acting), told
         )
@@ -161,7 +160,8 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         return self._batch(self.single_observation_space, told), self._with(infos, more)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        chosen, begin = self._by_world(self.action_space, actions), self._over
+        chosen = self._by_world(self.action_space, actions)
+        begin = self._over
         going = {world: action for world, action in chosen.items() if world not in begin}
         executed = self._batch(self.env.single_action_space, chosen | self._delays.act(going))
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
@@ -169,11 +169,13 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         over = [self._worlds[i] for i in np.flatnonzero(terminated | truncated)]
         final = {world: infos["final_obs"][int(world)] for world in over if self._at_once}
         paid = dict(zip(chosen, rewards.tolist(), strict=True))
-        seen, earned = {w: (now | final)[w] for w in going}, {w: paid[w] for w in going}
+        seen = {w: (now | final)[w] for w in going}
+        earned = {w: paid[w] for w in going}
         told, received, more = self._delays.step(seen, earned, over)
         if self._at_once:
             last = {w: {"final_obs": told[w], "final_info": more[w]} for w in over}
-            begin, infos = over, self._with(infos, last)
+            begin = over
+            infos = self._with(infos, last)
         else:
             self._over = over
         first, at_first = self._delays.begin({w: now[w] for w in begin}) if begin else ({}, {})
@@ -210,12 +212,14 @@ class Delays:
     def __init__(self, observed: ByName, acting: ByName, told: ByName) -> None:
         for name in ("history", "timeline"):
             checks.whole(name, told[name], 0, unit="steps")
-        self._history, self._timeline = told["history"], told["timeline"]
+        self._history = told["history"]
+        self._timeline = told["timeline"]
         self._parts = {agent: [agent] if agent in observed else [*observed] for agent in acting}
         self._observations = _Link("observation", observed, told)
         self.actions, self._rewards = (_Link(name, acting, told) for name in ("action", "reward"))
         checks.require(not self._rewards.sampler.loses, "reward", told["reward"], LOSES)
-        needed, given = self.actions.sampler.late or self._history, told["default"]
+        needed = self.actions.sampler.late or self._history
+        given = told["default"]
         default = {
             a: given[a] if a in given else _zero(acting[a]) if needed else None for a in acting
         }
@@ -265,7 +269,8 @@ class Delays:
         self, observations: ByName, rewards: ByName, ended: list[str]
     ) -> tuple[ByName, ByName, ByName]:
         """What agents are told, receive, and their infos; the episodes of some have ``ended``."""
-        agents, rewards = self._agents(observations), dict(rewards)
+        agents = self._agents(observations)
+        rewards = dict(rewards)
         self._observations.send(observations)
         if joining := {*agents} - self.present:
             self.begin(
@@ -294,12 +299,14 @@ class Delays:
 
     def _told(self, agents: list[str]) -> tuple[ByName, ByName]:
         """What agents are told, and their infos."""
-        told, infos = {}, {}
+        told = {}
+        infos = {}
         for agent in agents:
             found: Any = {part: self._observations.held(part) for part in self._parts[agent]}
             age: Any = {part: self._observations.age[part] for part in found}
             if agent in found:
-                found, age = found[agent], age[agent]
+                found = found[agent]
+                age = age[agent]
             if added := self._added(agent):
                 found = {
                     **(found if isinstance(found, Mapping) else {"observation": found}),
@@ -310,11 +317,14 @@ class Delays:
 
     def _added(self, agent: str) -> dict[str, NDArray[np.float32]]:
         """The entries that are added to the observation of an agent."""
-        added, parts, link = {}, self._parts[agent], self._observations
+        added = {}
+        parts = self._parts[agent]
+        link = self._observations
         if self._timeline:
             added["timeline"] = np.concatenate([self._slots(part) for part in parts], -1)
         if self._history:
-            sent, first = self.actions.recent(agent), (self._default[agent], 0)
+            sent = self.actions.recent(agent)
+            first = (self._default[agent], 0)
             space, low, width = self._chosen[agent]
             chosen = [sent.get(age, first)[0] for age in reversed(range(self._history))]
             numbers = [np.asarray(flatten(space, action), np.float32) for action in chosen]
@@ -379,7 +389,8 @@ class _Link:
             streams = counter_rng.bits64(torch.from_numpy(entropy), self._numbers)
             streams = streams_for(self.sampler, streams, len(streams))
             memory = self._line.init_memory([], streams)
-            self._memory, self._now = memory | {"agents": torch.arange(len(streams))}, 0
+            self._memory = memory | {"agents": torch.arange(len(streams))}
+            self._now = 0
 
     def begin(self, firsts: ByName) -> None:
         """Begin the episodes of some senders, whose ``firsts`` are known at once."""
@@ -402,11 +413,13 @@ class _Link:
             self.age = dict(zip(self.age, delivery.age.tolist(), strict=True))
             delays = delivery.delay.tolist()
         for sender, delay in zip(self.age, delays, strict=True):
-            sent, now = self._sent[sender], self._now
+            sent = self._sent[sender]
+            now = self._now
             if sender in things:
                 sent[now] = things[sender], now + delay if delay < self.sampler.lost else math.inf
             # What is neither recent nor held is never asked for again.
-            recent, held = now - self._kept, now - self.age[sender]
+            recent = now - self._kept
+            held = now - self.age[sender]
             self._sent[sender] = {t: each for t, each in sent.items() if t >= recent or t == held}
 
     def held(self, sender: str) -> Any:
@@ -430,7 +443,8 @@ def _flat(
     if not isinstance(flat, Box):
         raise InputError(f"{key}: {space} has no vectors of a fixed length")
     with np.errstate(over="ignore"):  # a bound may be the largest number
-        low, width = np.float32(flat.low), np.float32(flat.high) - np.float32(flat.low)
+        low = np.float32(flat.low)
+        width = np.float32(flat.high) - np.float32(flat.low)
     bounded = np.isfinite(width)
     return (
         space,

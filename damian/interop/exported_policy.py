@@ -29,7 +29,8 @@ class ExportedPolicy(nn.Module):
         *layers, last = copy.deepcopy(actor.module)
         self.last: Any = last
         self.last.return_log_prob = False
-        self.layers, self.in_keys = nn.ModuleList(layers), [*actor.in_keys]
+        self.layers = nn.ModuleList(layers)
+        self.in_keys = [*actor.in_keys]
         self.recurrent = keys.HIDDEN in self.in_keys
         self.discrete = isinstance(spec, Categorical) and hasattr(
             self.last.distribution_class, "probs"
@@ -87,11 +88,13 @@ def exported(
     said = redirect_stderr(StringIO())  # torch prints the whole program if it refuses it
     with torch.no_grad(), warnings.catch_warnings(), naming_errors(key), said:
         warnings.simplefilter("ignore", FutureWarning)  # torch's own
-        live, name = actor(steps)[keys.ACTION], policy.last.distribution_class.__name__
+        live = actor(steps)[keys.ACTION]
+        name = policy.last.distribution_class.__name__
         should = "needs a property deterministic_sample: without it the action is drawn by chance"
         checks.require(policy(*inputs)[0].allclose(live), key, name, should)
         program = torch.export.export(policy, examples, dynamic_shapes=((sizes,) * len(examples),))
-        found, should = program.module()(*inputs)[0], "are not those of the program"
+        found = program.module()(*inputs)[0]
+        should = "are not those of the program"
         checks.require(found.allclose(live), key, "the actor's actions", should)
         onnx = torch.onnx.export(
             program, (), input_names=policy.inputs, output_names=outputs, verbose=False

@@ -38,7 +38,8 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         view: str = "2d",
     ) -> None:
         one_uav(scenario)
-        self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
+        self.flight = Flight(scenario, 1, seed, render_mode, view)
+        self.render_mode = render_mode
         self.observation_space = self.flight.observation_space(0)
         self.action_space = self.flight.action_space()
         self._infos: dict[str, Array] = {}
@@ -53,7 +54,8 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
 
     def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
         instant, _ = self.flight.step(actions_in(self.action_space, "action", action)[None, None])
-        self._infos, info = instant.infos, row(instant.infos, 0, 0)
+        self._infos = instant.infos
+        info = row(instant.infos, 0, 0)
         ends = bool(instant.terminated[0]), bool(instant.truncated[0])
         return instant.observation[0, 0], float(instant.reward[0, 0]), *ends, info
 
@@ -78,7 +80,8 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
         one_uav(scenario)
         checks.in_range("num_envs", num_envs, 1, checks.WORLDS)
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.num_envs, self.flight = num_envs, Flight(scenario, num_envs, seed)
+        self.num_envs = num_envs
+        self.flight = Flight(scenario, num_envs, seed)
         self.single_observation_space = self.flight.observation_space(0)
         self.single_action_space = self.flight.action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -96,7 +99,8 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         chosen = actions_in(self.action_space, "actions", actions)
         last, instant = self.flight.step(chosen[:, None], reset=True)
-        infos, done = _infos(instant.infos), last.terminated | last.truncated
+        infos = _infos(instant.infos)
+        done = last.terminated | last.truncated
         if done.any():
             final = np.full(self.num_envs, None, object)
             for world in done.nonzero()[0]:

@@ -33,7 +33,8 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
         view: str = "2d",
     ) -> None:
         self.metadata = {**METADATA, "name": "damian_v0", "is_parallelizable": True}
-        self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
+        self.flight = Flight(scenario, 1, seed, render_mode, view)
+        self.render_mode = render_mode
         self.possible_agents = [f"uav_{number}" for number in range(scenario.agents)]
         self.agents: list[str] = []
         self.observation_spaces = {
@@ -63,8 +64,10 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
             for name in self.agents
         ]
         instant, _ = self.flight.step(np.stack(chosen)[None])
-        n_agents, infos = len(self.agents), self._infos(instant.infos)
-        terminated, truncated = bool(instant.terminated[0]), bool(instant.truncated[0])
+        n_agents = len(self.agents)
+        infos = self._infos(instant.infos)
+        terminated = bool(instant.terminated[0])
+        truncated = bool(instant.truncated[0])
         results = (
             self._by_agent(instant.observation[0]),
             self._by_agent(instant.reward[0].tolist()),

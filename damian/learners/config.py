@@ -168,11 +168,9 @@ class MappoConfig(LearnerConfig):
     learner: ClassVar[str] = "damian.learners.mappo:Mappo"
 
     def check(self, setup: LearningSetup) -> None:
-        recurrent, shortest, longest = (
-            setup.model.recurrent,
-            setup.shortest_period,
-            setup.longest_delay,
-        )
+        recurrent = setup.model.recurrent
+        shortest = setup.shortest_period
+        longest = setup.longest_delay
         most_minibatches = setup.worlds if recurrent else setup.worlds * shortest
         checks.in_range("learner.minibatches", self.minibatches, 1, most_minibatches)
         should = (

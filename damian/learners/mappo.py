@@ -50,7 +50,9 @@ class Mappo:
         setup: LearningSetup,
         buffer: ReplayBuffer | None = None,
     ) -> None:
-        self.config, self.setup, self.buffer = config, setup, buffer
+        self.config = config
+        self.setup = setup
+        self.buffer = buffer
         self.actor = config.make_actor(env, setup.model)
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
@@ -88,7 +90,8 @@ class Mappo:
         """
         if self.buffer is None:
             return batch
-        storage, settle = cast(BackupdateStorage, self.buffer.storage), self.setup.settle_steps
+        storage = cast(BackupdateStorage, self.buffer.storage)
+        settle = self.setup.settle_steps
         self.buffer.extend(batch.exclude(*self.unread))
         latest = storage.latest(batch.shape[1] + settle)
         batch = storage[latest[: len(latest) - settle]].transpose(0, 1)
@@ -119,7 +122,8 @@ class Mappo:
         samples = {
             k: v if recurrent else v.flatten(0, 1) for k, v in found.items() if v is not None
         }
-        n_samples, device = len(samples[keys.READY]), samples[keys.READY].device
+        n_samples = len(samples[keys.READY])
+        device = samples[keys.READY].device
         n_minibatches = min(self.config.minibatches, n_samples)
         for _ in range(self.config.epochs):
             order = torch.randperm(n_samples, device=device)
@@ -155,10 +159,12 @@ def mappo_losses(
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
     log_ratio, entropy = policy_terms(steps, actor)
-    ratio, advantage = log_ratio.exp(), entries[keys.ADVANTAGE].squeeze(-1)
+    ratio = log_ratio.exp()
+    advantage = entries[keys.ADVANTAGE].squeeze(-1)
     clipped = ratio.clamp(1 - config.clip_epsilon, 1 + config.clip_epsilon)
     objective = torch.minimum(ratio * advantage, clipped * advantage)
-    n_decisions, scale = ready.sum().clamp(min=1), value_scale(critic)
+    n_decisions = ready.sum().clamp(min=1)
+    scale = value_scale(critic)
     mean_entropy = (entropy * ready).sum() / n_decisions
     error = smooth_l1_loss(
         critic(steps)[keys.STATE_VALUE] / scale, entries[keys.VALUE_TARGET] / scale
@@ -225,7 +231,8 @@ def explained_variance(batch: TensorDictBase) -> Tensor:
     """Share of the variance of a batch's value targets that its values explain, []; nan if there is
     none."""
     target = batch[keys.VALUE_TARGET].double()
-    variance, left = target.var(correction=0), (target - batch[keys.STATE_VALUE]).var(correction=0)
+    variance = target.var(correction=0)
+    left = (target - batch[keys.STATE_VALUE]).var(correction=0)
     return torch.where(variance > 0, 1 - left / variance, torch.nan)
 
 

@@ -36,7 +36,9 @@ class Sac:
         self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer | None
     ) -> None:
         assert buffer is not None, "SAC needs a replay buffer on a TimeStorage"
-        self.config, self.setup, self.buffer = config, setup, buffer
+        self.config = config
+        self.setup = setup
+        self.buffer = buffer
         self.actor = config.make_actor(env, setup.model)
         read = config.critic_keys(setup)
         critics = [make_action_value(env, setup.model, read) for _ in range(N_CRITICS)]
@@ -68,7 +70,8 @@ class Sac:
         begins."""
         self.buffer.extend(batch.exclude(*self.unread))
         storage = cast(TimeStorage, self.buffer.storage)
-        steps, order = storage.steps, storage.latest()
+        steps = storage.steps
+        order = storage.latest()
         settled = order[: max(len(order) - self.setup.settle_steps, 0)]
         ready, ready_next = (
             cast(Tensor, steps[k])[settled] for k in (keys.READY, next_key(keys.READY))
@@ -152,7 +155,8 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
     def __init__(self, actor: Any, critics: Any, n: int, share: float, **options: Any) -> None:
         options |= {"target_entropy": 0.0}  # ``forward`` adds the target itself
         super().__init__(actor, critics, action_space="categorical", num_actions=n, **options)
-        self.share, self.n_actions = share, n
+        self.share = share
+        self.n_actions = n
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """TorchRL's losses of transitions [K], by private parts of it, so that critics are
@@ -165,7 +169,8 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
         error = values.gather(-1, action).squeeze(-1) - target
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             policy = self.actor_network.get_dist(tensordict.copy())
-        prob, log_prob = policy.probs, policy.logits
+        prob = policy.probs
+        log_prob = policy.logits
         cost = self._alpha * log_prob - values.detach().amin(0)
         entropy = -(prob * log_prob).sum(-1).detach()
         too_certain = self.target_entropies(tensordict) - entropy

@@ -14,7 +14,8 @@ class SystemClock:
     (paper, sections 3.6 and 4.3)."""
 
     def __init__(self, config: ClockConfig, period: int) -> None:
-        self.period, self.change = period, 0
+        self.period = period
+        self.change = 0
         self.shortest = self.longest = period
         if config.trigger is not None:
             self.change = config.steps("trigger")

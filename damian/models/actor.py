@@ -23,10 +23,8 @@ the log."""
 
 def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
     """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``."""
-    layout, n_agents = (
-        layout_at(env, keys.OBSERVATION),
-        env.observation_spec[keys.OBSERVATION].shape[-2],
-    )
+    layout = layout_at(env, keys.OBSERVATION)
+    n_agents = env.observation_spec[keys.OBSERVATION].shape[-2]
 
     def make(n_out: int, *out_keys: NestedKey) -> TensorDictModule:
         if not model.recurrent:
@@ -75,7 +73,8 @@ class SkipConnection(nn.Module):
 
     def __init__(self, network: nn.Module, columns: slice) -> None:
         super().__init__()
-        self.network, self.columns = network, columns
+        self.network = network
+        self.columns = columns
         self.weight = nn.Parameter(torch.tensor(FIRST_WEIGHT))
         last = [each for each in network.modules() if isinstance(each, nn.Linear)][-1]
         for parameter in last.parameters():

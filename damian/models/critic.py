@@ -25,7 +25,8 @@ def make_critic(
 ) -> TensorDictModule:
     """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")``
     [*, N, 1]."""
-    layout, n_agents = layout_at(env, critic_key), env.observation_spec[critic_key].shape[-2]
+    layout = layout_at(env, critic_key)
+    n_agents = env.observation_spec[critic_key].shape[-2]
     if model.shared_value:
         network: nn.Module = SharedValue(model.make_network(joined([layout] * n_agents), 1))
     else:
@@ -39,14 +40,16 @@ def make_critic(
 
 def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -> TensorDictModule:
     """Make a Q-function of the entries ``read``: values of all discrete actions, or of the one."""
-    layout, spec = (
-        joined([layout_at(env, key) for key in read]),
-        env.full_action_spec_unbatched[keys.ACTION],
-    )
+    layout = joined([layout_at(env, key) for key in read])
+    spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
-        in_keys, out_key, n_out = read, "action_value", spec.n
+        in_keys = read
+        out_key = "action_value"
+        n_out = spec.n
     else:
-        in_keys, out_key, n_out = [*read, keys.ACTION], "state_action_value", 1
+        in_keys = [*read, keys.ACTION]
+        out_key = "state_action_value"
+        n_out = 1
         layout = layout.appended("action", (spec.shape[-1],))
     network = JoinedInputs(model.make_network(layout, n_out))
     return TensorDictModule(network, in_keys=in_keys, out_keys=[out_key]).to(env.device)

@@ -33,12 +33,14 @@ class AgentGRU(TensorDictModuleBase):
             [keys.OBSERVATION, keys.HIDDEN],
             [keys.HIDDEN, keys.HIDDEN_BEFORE],
         )  # type: ignore[assignment]
-        self.encoder, self.cell = encoder, nn.GRUCell(n_features, n_hidden)
+        self.encoder = encoder
+        self.cell = nn.GRUCell(n_features, n_hidden)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         features = self.encoder(tensordict[keys.OBSERVATION])
         if recurrent_mode():
-            first, begins = tensordict[keys.HIDDEN_BEFORE][:, 0], tensordict[keys.IS_INIT]
+            first = tensordict[keys.HIDDEN_BEFORE][:, 0]
+            begins = tensordict[keys.IS_INIT]
             return tensordict.set(keys.HIDDEN, self.replay(features, first, begins))
         before = tensordict[keys.HIDDEN]
         return tensordict.set(keys.HIDDEN_BEFORE, before).set(

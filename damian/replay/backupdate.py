@@ -95,7 +95,9 @@ class BackupdateStorage(TimeStorage):
     ) -> None:
         checks.whole("longest", longest, 0, unit="steps")
         super().__init__(max_size, **options)
-        self.recompute, self.longest, self.corrections = recompute, longest, list(corrections)
+        self.recompute = recompute
+        self.longest = longest
+        self.corrections = list(corrections)
         self._late_rewards = next((found for found in corrections if found.paid), None)
         if recompute is None:
             if self._late_rewards is None or hindsight_key is not None:
@@ -106,7 +108,8 @@ class BackupdateStorage(TimeStorage):
             delay_key = cast(NestedKey, self._late_rewards.delay_key)
         delay_key = unravel_key(delay_key)
         self._sent, self._held = (next_key(unravel_key(key)) for key in (message_key, received_key))
-        self._delay, self._age = next_key(delay_key), next_key(unravel_key(age_key))
+        self._delay = next_key(delay_key)
+        self._age = next_key(unravel_key(age_key))
         self._count = unravel_key(step_count_key)
         self._hindsight = None if hindsight_key is None else next_key(unravel_key(hindsight_key))
         # The storage adds these, but not under "next".
@@ -136,7 +139,8 @@ class BackupdateStorage(TimeStorage):
 
     def _require_entries(self, data: TensorDictBase) -> None:
         """Require that steps [T, B] have the entries that the storage reads, and fit into it."""
-        late, present = self._late_rewards, data.keys(True)
+        late = self._late_rewards
+        present = data.keys(True)
         delays = {"reward": next_key(late.delay_key)} if late and late.delay_key else {}
         needed = [("step_count_key", self._count), ("done", ENDS[0])]
         if self.recompute is not None:
@@ -179,7 +183,8 @@ class BackupdateStorage(TimeStorage):
     def _with_added_entries(self, data: TensorDictBase) -> TensorDictBase:
         """Copy of steps [T, B], with the entries that the storage adds, before any
         back-updating."""
-        done, delay = data[ENDS[0]], data[self._delay]
+        done = data[ENDS[0]]
+        delay = data[self._delay]
         data = data.copy().update(
             {keys.VALID: torch.ones_like(done), keys.RESET_AFTER: done.clone()}
         )
@@ -206,14 +211,17 @@ class BackupdateStorage(TimeStorage):
         ``hindsight_key``."""
         if self.recompute is None:
             return None, {}
-        held, age, delay = steps[self._held], steps[self._age].long(), steps[self._delay]
+        held = steps[self._held]
+        age = steps[self._age].long()
+        delay = steps[self._delay]
         if self._hindsight is not None:
             # At the first step, the storage may know a newer message than the receiver held; its
             # sender may have sent it before that step, so that it is in no row of these steps.
             held = torch.cat([steps[self._hindsight][:1], held[1:]])
             age = torch.cat([steps[self._hindsight_age][:1], age[1:]])
         latest, age = latest_arrived(steps[self._sent], delay.squeeze(-1), held, age.squeeze(-1))
-        latest, age = latest[-last:], age[-last:].unsqueeze(-1)
+        latest = latest[-last:]
+        age = age[-last:].unsqueeze(-1)
         hindsight = {self._hindsight: latest, self._hindsight_age: age}
         return latest, cast(Entries, hindsight if self._hindsight else {})
 

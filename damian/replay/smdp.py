@@ -61,7 +61,8 @@ def transitions(
     and after the decision.
     """
     begin, world, agent, end = decisions
-    before, last = (order[begin], world, agent), (order[end], world, agent)
+    before = (order[begin], world, agent)
+    last = (order[end], world, agent)
     agents, after = (
         cast(TensorDictBase, steps[key]) for key in (keys.AGENTS, next_key(keys.AGENTS))
     )

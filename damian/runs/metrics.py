@@ -78,7 +78,8 @@ def evaluate(
 
 def evaluation(rollout: TensorDictBase, server: Server, metrics: Sequence[str] = ()) -> Evaluation:
     """Metrics of the first episode of each world in a rollout [B, T]."""
-    flights, found = flights_of(rollout, server), Evaluation(episodes=len(rollout))
+    flights = flights_of(rollout, server)
+    found = Evaluation(episodes=len(rollout))
     for name in dict.fromkeys((*BUILT_IN, *metrics)):
         with naming_errors(f"metric {name}"):
             found[name] = (
@@ -92,7 +93,8 @@ def flights_of(rollout: TensorDictBase, server: Server) -> Flights:
     next_step = cast(TensorDictBase, rollout["next"])
     elapsed = torch.arange(1, rollout.shape[1] + 1, device=rollout.device).expand(rollout.shape)
     message = next_step[keys.MESSAGE]
-    over, belief = next_step.get(keys.SOURCE_OVER, None), _true_belief(rollout, server, elapsed)
+    over = next_step.get(keys.SOURCE_OVER, None)
+    belief = _true_belief(rollout, server, elapsed)
     truth = server(server.messages(message), elapsed, over, belief=belief)
     done, success, reward = (
         next_step[k].squeeze(-1) for k in (keys.DONE, keys.SUCCESS, keys.REWARD)
@@ -100,7 +102,8 @@ def flights_of(rollout: TensorDictBase, server: Server) -> Flights:
     in_episode = _up_to_first_end(done)
     true_end = in_episode & _up_to_first_end(truth.status.terminated)
     held = server.messages(next_step.get(keys.RECEIVED, message))
-    sent, delay = cast(Tensor, next_step[keys.MESSAGE_SENT])[in_episode], torch.zeros(1)
+    sent = cast(Tensor, next_step[keys.MESSAGE_SENT])[in_episode]
+    delay = torch.zeros(1)
     if sent.any() and keys.DELAY in next_step.keys(True):
         delay = cast(Tensor, next_step[keys.DELAY]).squeeze(-1)[in_episode][sent]
     can_succeed = server.episode.can_succeed
@@ -117,7 +120,8 @@ def flights_of(rollout: TensorDictBase, server: Server) -> Flights:
 
 def _episodes(success: Tensor, reward: Tensor, counted: Tensor, can_succeed: bool) -> Episodes:
     """Episodes from the steps that count, a mask [B, T]."""
-    succeeded, steps = (success & counted).any(-1), counted.sum(-1)
+    succeeded = (success & counted).any(-1)
+    steps = counted.sum(-1)
     if can_succeed:
         steps = torch.where(succeeded, steps, counted.shape[1])
     return Episodes(succeeded, steps, (reward.mean(-1) * counted).sum(-1))
@@ -154,7 +158,8 @@ class EpisodeLog:
     EPISODES = 100
 
     def __init__(self, worlds: int, hindsight: "HindsightReturns | None" = None) -> None:
-        self.finished, self.hindsight = 0, hindsight
+        self.finished = 0
+        self.hindsight = hindsight
         parts = [(worlds, len(self.NAMES)), *([(hindsight.worlds, 1)] if hindsight else [])]
         self._known = [
             torch.full((b, math.ceil(self.EPISODES / b), n), torch.nan) for b, n in parts
@@ -178,7 +183,8 @@ class EpisodeLog:
         return {"finished": self.finished, "known": self._known, "hindsight": hindsight}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.finished, self._known = state["finished"], state["known"]
+        self.finished = state["finished"]
+        self._known = state["known"]
         if self.hindsight:
             self.hindsight.load_state_dict(state["hindsight"])
 
@@ -224,7 +230,8 @@ class HindsightReturns:
     """Most worlds to follow."""
 
     def __init__(self, storage: BackupdateStorage, worlds: int) -> None:
-        self.storage, self.worlds = storage, worlds
+        self.storage = storage
+        self.worlds = worlds
         self._written = 0
         """Number of steps written so far."""
         self._waiting = 0
@@ -270,7 +277,8 @@ class HindsightReturns:
         return {"rows": rows, "waiting": self._waiting, "running": self._running}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._waiting, self._running = int(state["waiting"]), state["running"]
+        self._waiting = int(state["waiting"])
+        self._running = state["running"]
         if state["rows"] is not None:
             self._store(to_tensordict(state["rows"]).to(self.storage.device), corrected=True)
 

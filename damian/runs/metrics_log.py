@@ -80,7 +80,8 @@ class TensorBoard:
 def read_logger(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
     """Path, class and parameters of ``package.module:Name`` or
     ``{logger: package.module:Name, ...}``."""
-    key, entry = "logger.custom", written if isinstance(written, Mapping) else {"logger": written}
+    key = "logger.custom"
+    entry = written if isinstance(written, Mapping) else {"logger": written}
     path, make, parameters = LOGGERS.read(entry, key, "logger")
     check_parameters(make, parameters, path, key)
     return path, make, parameters

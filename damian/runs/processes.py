@@ -74,7 +74,8 @@ def each_in_processes(
 
 
 def _in_pool(perform: Callable[[R], None], runs: Sequence[R], processes: int) -> Iterator[R]:
-    waiting, futures = iter(runs), dict[Future[None], R]()
+    waiting = iter(runs)
+    futures = dict[Future[None], R]()
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin) as pool:
         try:
             while True:

@@ -26,7 +26,8 @@ class ReplayMemory:
     """
 
     def __init__(self, buffer: ReplayBuffer | None, folder: Path) -> None:
-        self._buffer, self._folder = buffer, folder
+        self._buffer = buffer
+        self._folder = folder
         self._files: list[int] = []
         """Numbers of the files that the latest state needs."""
 
@@ -38,8 +39,10 @@ class ReplayMemory:
         """Write the files that are complete by now, and return what else there is to store."""
         if self._buffer is None or not self._buffer.write_count:
             return {"written": 0}
-        storage, written = self._storage, cast(int, self._buffer.write_count)
-        oldest, per_file = written - len(storage.latest()), -(-len(storage.steps) // FILES)
+        storage = self._storage
+        written = cast(int, self._buffer.write_count)
+        oldest = written - len(storage.latest())
+        per_file = -(-len(storage.steps) // FILES)
         # Late messages correct rows after these (``BackupdateStorage``).
         final = written - cast(int, getattr(storage, "longest", -1)) - 1
         files = range(oldest // per_file, max(final // per_file, oldest // per_file))

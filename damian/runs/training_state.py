@@ -52,11 +52,10 @@ class TrainingState:
         buffer: ReplayBuffer | None = None,
         hindsight: HindsightReturns | None = None,
     ) -> None:
-        self.folder, self.components = folder, components
-        self.progress, self.episodes = (
-            Progress(),
-            EpisodeLog(collector.env.batch_size[0], hindsight),
-        )
+        self.folder = folder
+        self.components = components
+        self.progress = Progress()
+        self.episodes = EpisodeLog(collector.env.batch_size[0], hindsight)
         self.saved = 0
         """The update after which the checkpoint of the run was written."""
         self._replay = ReplayMemory(buffer, folder / REPLAY)
@@ -74,7 +73,8 @@ class TrainingState:
         """Replace the checkpoint of the run; if that fails, the older one is intact."""
         # The states of the parts first: that of the replay memory writes files, which the
         # checkpoint names.
-        parts, networks = _states(self._parts), _states(self.components)
+        parts = _states(self._parts)
+        networks = _states(self.components)
         write_checkpoint(self.folder / CHECKPOINT, {"components": networks, "training": parts})
         self.saved = self.progress.updates
         self._replay.remove_old()

@@ -121,7 +121,8 @@ def build_source_grids(
         [region.polygon for region in airspace.regions], min(map(footprint_radius, kinds))
     )
     grids = [build_source_grid(airspace, kind, footprint_radius(kind), dt, cell) for kind in kinds]
-    still, half = torch.eye(len(grids[0].centres)).unsqueeze(0), grids[0].no_report // 2
+    still = torch.eye(len(grids[0].centres)).unsqueeze(0)
+    half = grids[0].no_report // 2
     moves = [still if each.moves is None else each.moves for each in grids]
     reports = [each.log_reports[rows] for rows in (slice(half), slice(half, -1)) for each in grids]
     by_place = ("prior", "staying", "next_detection", "emits", "false_alarm")
@@ -167,12 +168,14 @@ def build_source_grid(
         np.stack([shapely.area(shapely.intersection(squares, p)) for p in polygons])
     )
     prior = (prior / prior.sum(-1, keepdim=True)).float()
-    moves, staying = None, torch.ones_like(prior)
+    moves = None
+    staying = torch.ones_like(prior)
     if source.motion == "dynamic":
         moves = _moves(columns, _displacements(polygons, source, dt) / edge)
         staying = (prior > 0).float() @ moves.T
         if len(polygons) == 1:
-            moves, staying = moves * (prior > 0) / staying.T, torch.ones_like(prior)
+            moves = moves * (prior > 0) / staying.T
+            staying = torch.ones_like(prior)
     pairs = zip(polygons, airspace.points, strict=True)
     shares = [_detected_shares(*each, columns * edge, edge, radius) for each in pairs]
     covered = LEAST_REPORT_PROBABILITY + (1 - 2 * LEAST_REPORT_PROBABILITY) * torch.cat(shares)
@@ -205,7 +208,8 @@ def build_source_grid(
 def _columns(polygons: list, edge: float) -> np.ndarray:
     """Column and row numbers of all cells that any of the polygons touches, [C, 2]."""
     bounds = np.array([polygon.bounds for polygon in polygons])
-    first, last = np.floor(bounds[:, :2].min(0) / edge), np.ceil(bounds[:, 2:].max(0) / edge)
+    first = np.floor(bounds[:, :2].min(0) / edge)
+    last = np.ceil(bounds[:, 2:].max(0) / edge)
     axes = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
     columns = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     squares = shapely.box(*((columns - 0.5) * edge).T, *((columns + 0.5) * edge).T)
@@ -219,7 +223,8 @@ def _columns(polygons: list, edge: float) -> np.ndarray:
 def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarray:
     """Moves of the source in steps of ``dt``, counted from walks, [S, 2] metres."""
     # Independent moves like these get as far in STEPS_PER_MOVE steps as the source does.
-    rng, polygons = np.random.default_rng(_SEED), polygons[:_WALKS]
+    rng = np.random.default_rng(_SEED)
+    polygons = polygons[:_WALKS]
     time = torch.arange(_STEPS + 1, dtype=torch.float64) * dt
     found = []
     for polygon in polygons:
@@ -270,16 +275,16 @@ def _log_reports(covered: Tensor, source: SourceConfig, renewed: float) -> Tenso
     counts only as far as it may have moved: with probability ``renewed`` it is anywhere in its
     cell. Where it stays, reports in and out of reach are independent.
     """
-    emits, miss, alarm = source.emits, source.miss, source.false_alarm
+    emits = source.emits
+    miss = source.miss
+    alarm = source.false_alarm
     known = 1 - miss - alarm
     reports = alarm + covered * known
     silent = 1 - reports
     # Probabilities of silence and of a report one step before in reach; out of reach only alarms
     # are heard.
-    was_silent, reported = (
-        emits * miss + (1 - emits) * (1 - alarm),
-        emits * (1 - miss) + (1 - emits) * alarm,
-    )
+    was_silent = emits * miss + (1 - emits) * (1 - alarm)
+    reported = emits * (1 - miss) + (1 - emits) * alarm
     both = covered * (miss * was_silent) + (1 - covered) * (1 - alarm) ** 2
     again = renewed * silent + (1 - renewed) * both / (1 - alarm - emits * covered * known)
     twice = covered * ((1 - miss) * reported) + (1 - covered) * alarm**2
@@ -365,7 +370,8 @@ def likelihood(grid: SourceGrid, rows: Tensor, place: Tensor) -> Tensor:
     match = log.exp_().view(*rows.shape[:-1], log.shape[-1])
     if grid.emits is not None:
         reported = rows % 2 == 1  # the row of no report is even
-        alarms, reports = reported.sum(-1, True), (rows != grid.no_report).sum(-1, True)
+        alarms = reported.sum(-1, True)
+        reports = (rows != grid.no_report).sum(-1, True)
         emits, alarm = (
             gather_rows(each, place).unsqueeze(-1) for each in (grid.emits, grid.false_alarm)
         )
@@ -380,10 +386,8 @@ def predict(grid: SourceGrid, belief: Tensor, place: Tensor) -> Tensor:
         return belief
     if len(grid.prior) == 1:  # the moves are probabilities
         return belief @ grid.moves[0]
-    stays, kind = (
-        belief / gather_rows(grid.staying, place),
-        place // (len(grid.prior) // len(grid.moves)),
-    )
+    stays = belief / gather_rows(grid.staying, place)
+    kind = place // (len(grid.prior) // len(grid.moves))
     moved = stays @ grid.moves[0]
     for number in range(1, len(grid.moves)):
         moved = torch.where((kind == number).unsqueeze(-1), stays @ grid.moves[number], moved)
@@ -470,11 +474,14 @@ def empty_window(
 ) -> Window:
     """A window for messages that are at most ``longest`` steps late; with ``own`` also for each
     UAV."""
-    device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
+    device = grid.prior.device
+    n_slots = longest + 2
+    n_viewers = 1 + n_agents * own
     belief = torch.ones(n_slots, n_viewers, n_beliefs, grid.prior.shape[-1], device=device)
     report = torch.full((n_slots, n_agents, n_beliefs), grid.no_report, device=device)
     same = torch.ones(belief.shape[:-1], dtype=torch.bool, device=device)
-    slot, delay = torch.zeros_like(report[0, 0]), torch.full_like(report, -1)
+    slot = torch.zeros_like(report[0, 0])
+    delay = torch.full_like(report, -1)
     return Window(belief, same, report, delay, slot)
 
 
@@ -508,7 +515,8 @@ def latest(window: Window, slot: Tensor) -> Beliefs:
     """The beliefs of a step, by its slot in each world, [B]."""
     viewer = torch.arange(window.belief.shape[1], device=slot.device)
     world = torch.arange(len(slot), device=slot.device).unsqueeze(-1)
-    row, held = _row(window, slot.unsqueeze(-1), viewer, world), window.belief.flatten(0, 2)
+    row = _row(window, slot.unsqueeze(-1), viewer, world)
+    held = window.belief.flatten(0, 2)
     return held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:])
 
 
@@ -528,7 +536,8 @@ def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, _Ring, Tensor]:
 def _begin(
     tables: _Tables, ring: _Ring, slot: Tensor, first: Tensor, place: Tensor, mask: Tensor
 ) -> None:
-    grid, window = SourceGrid._make(tables), Window._make([*ring, slot])
+    grid = SourceGrid._make(tables)
+    window = Window._make([*ring, slot])
     (world,) = _chosen(mask)
     if not len(world):
         return
@@ -555,7 +564,8 @@ def _advance(
     place: Tensor,
     stepped: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    grid, window = SourceGrid._make(tables), Window._make([*ring, slot])
+    grid = SourceGrid._make(tables)
+    window = Window._make([*ring, slot])
     n_slots = len(window.belief)
     slot = torch.where(stepped, (slot + 1) % n_slots, slot)
     _write_step(window.report, slot, sent.T, stepped)
@@ -575,7 +585,8 @@ def _advance(
 @_advance.register_fake
 def _(tables, ring, slot, sent, sent_delay, place, stepped):
     _, n_viewers, n_worlds, n_cells = ring[0].shape
-    server, own = (n_worlds, n_cells), (n_worlds, n_viewers - 1, n_cells)
+    server = (n_worlds, n_cells)
+    own = (n_worlds, n_viewers - 1, n_cells)
     return torch.empty_like(slot), ring[0].new_empty(server), ring[0].new_empty(own)
 
 
@@ -587,7 +598,8 @@ def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped:
     that the UAV has reported since; this is noted in place. ``slot_age`` [S, B] tells how long ago
     each slot's step was, and is also the slot of the step that was so long ago.
     """
-    sent, age = window.report != grid.no_report, slot_age.unsqueeze(1)
+    sent = window.report != grid.no_report
+    age = slot_age.unsqueeze(1)
     arrives = (sent & (window.delay == age)).amax(1)
     first = torch.where(stepped, (arrives * slot_age).amax(0), -1).unsqueeze(0)
     same = window.same_as_server
@@ -611,16 +623,15 @@ def _to_compute(
     bool, their places [M], and what their receivers know of the step, as rows of ``log_reports``
     [M, N].
     """
-    n_worlds, n_steps = outdated.shape[1], len(slot_age) - 1
+    n_worlds = outdated.shape[1]
+    n_steps = len(slot_age) - 1
     due = torch.arange(n_steps, device=slot_age.device).view(-1, 1, 1) <= outdated
     age, viewer, world = _chosen(due)
     slot, earlier = (
         slot_age.flatten().index_select(0, each * n_worlds + world) for each in (age, age + 1)
     )
-    receiver, agent = (
-        viewer * n_worlds + world,
-        torch.arange(window.report.shape[1], device=slot.device),
-    )
+    receiver = viewer * n_worlds + world
+    agent = torch.arange(window.report.shape[1], device=slot.device)
     at = (slot * len(agent) * n_worlds + world).unsqueeze(-1) + agent * n_worlds
     unknown = (window.delay < 0) | (window.delay > slot_age.unsqueeze(1))
     known = window.report.maximum(unknown * grid.no_report)  # no report is the last row
@@ -628,7 +639,8 @@ def _to_compute(
     if len(outdated) > 1:
         own = gather_rows(repeated(grid, window.report, window.report.roll(1, 0)).flatten(), at)
         reports = torch.where(viewer.unsqueeze(-1) == agent + 1, own, reports)
-    before, row = _row(window, earlier, viewer, world), slot * due[0].numel() + receiver
+    before = _row(window, earlier, viewer, world)
+    row = slot * due[0].numel() + receiver
     changes = age <= outdated.flatten().index_select(0, receiver)
     counts = [due[0].numel()] * n_steps
     if devices.data_dependent(due.device):

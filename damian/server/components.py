@@ -18,7 +18,8 @@ from damian.server.rewards import Counters
 from damian.server.server import Features, Server
 from damian.world.messages import Messages
 
-_WORLDS, _ROUNDING = 16, 1e-5
+_WORLDS = 16
+_ROUNDING = 1e-5
 
 
 def checked_features(server: Server, messages: Messages, steps: Tensor) -> Features:
@@ -31,9 +32,12 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
     Raises:
         InputError: a component does not keep what it declares; the message names it.
     """
-    some, elapsed, found = tree_map(lambda field: field[:_WORLDS], messages), steps[:_WORLDS], {}
+    some = tree_map(lambda field: field[:_WORLDS], messages)
+    elapsed = steps[:_WORLDS]
+    found = {}
     for name in server.names:
-        declared, key = feature_of(name), f"feature {name}"
+        declared = feature_of(name)
+        key = f"feature {name}"
         with naming_errors(key):
             found |= server.features(messages, steps, [name])
             values = found[name].float()

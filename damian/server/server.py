@@ -84,13 +84,18 @@ class Server:
         episode: EpisodeConfig,
         time_scale: float,
     ) -> None:
-        airspace, battery = simulation.airspace, simulation.config.battery
+        airspace = simulation.airspace
+        battery = simulation.config.battery
         n_points = airspace.points.shape[:2].numel()
         should = "are more landing points than a message can number: take a larger step"
         checks.require(n_points < MAX_EXACT_INTEGER, "region.lattice_step", n_points, should)
         check_features(observation)
-        self.observation, self.reward, self.episode = observation, reward, episode
-        self.battery, self.dt, self._scales = battery, simulation.dt, airspace.scale
+        self.observation = observation
+        self.reward = reward
+        self.episode = episode
+        self.battery = battery
+        self.dt = simulation.dt
+        self._scales = airspace.scale
         self._read_terms()
         self.names: list[str] = sorted({*observation.actor, *observation.critic, *self.reads})
         widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
@@ -327,7 +332,8 @@ class Server:
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m],
         [*]."""
-        region, scales = self.region_of(messages), self._scales
+        region = self.region_of(messages)
+        scales = self._scales
         return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)
 
 

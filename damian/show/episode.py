@@ -29,7 +29,8 @@ from damian.envs.uav_env import UavEnv
 from damian.world.signal_source import footprint_radius
 from damian.world.state import Truth
 
-SCHEMA, VERSION = "damian-episode", 3
+SCHEMA = "damian-episode"
+VERSION = 3
 DIGITS = 5
 """Significant digits of the numbers in a file."""
 TIME_DIGITS = 9
@@ -244,26 +245,30 @@ def at_instant(outputs: TensorDictBase) -> TensorDictBase:
 def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> Episode:
     """The episode of one world from ``at_instant`` of the reset and of each step, stacked,
     [T + 1]."""
-    message, vehicles = cast(Tensor, instants[keys.MESSAGE]), env.simulation.vehicles
-    state, n_drawn = cast(Tensor, instants[keys.STATE]), len(vehicles.values.choices)
+    message = cast(Tensor, instants[keys.MESSAGE])
+    vehicles = env.simulation.vehicles
+    state = cast(Tensor, instants[keys.STATE])
+    n_drawn = len(vehicles.values.choices)
     truth = Truth.unpack(state, env.simulation.widths, n_drawn)
     sent = cast(Tensor, instants[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on
     delay = instants.get(keys.DELAY, torch.zeros_like(sent[..., None], dtype=torch.long))
-    own, held = (
-        env.server.messages(message),
-        env.server.messages(instants.get(keys.RECEIVED, message)),
-    )
+    own = env.server.messages(message)
+    held = env.server.messages(instants.get(keys.RECEIVED, message))
     dt = env.scenario.clock.dt
     time = torch.arange(len(sent), dtype=torch.float64) * dt
-    belief, grid = instants.get(keys.BELIEF, None), env.server.grid
-    airspace, region = env.simulation.airspace, int(env.server.region_of(own)[0])
-    about, over = {**about, **_drawn(env, truth.drawn[:1])}, airspace.regions[region]
+    belief = instants.get(keys.BELIEF, None)
+    grid = env.server.grid
+    airspace = env.simulation.airspace
+    region = int(env.server.region_of(own)[0])
+    about = {**about, **_drawn(env, truth.drawn[:1])}
+    over = airspace.regions[region]
     points = np.asarray(airspace.points[region, : airspace.n_points[region]].cpu())
     if env.scenario.battery.charging_points:  # else UAVs charge wherever they land
         charges = vehicles.chargers.view(airspace.points.shape[:2])[region].cpu()
         about["charging_points"] = _listed(points[charges[: len(points)].numpy()])
-    level, source = about.get("drawn", {}).get("source.level_db"), env.scenario.source
+    level = about.get("drawn", {}).get("source.level_db")
+    source = env.scenario.source
     n_sources = source.count if env.scenario.seeks_source else 0
     columns: dict[str, Any] = {
         "time": time,
@@ -304,7 +309,8 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
 def _drawn(env: UavEnv, drawn: Tensor) -> dict[str, Any]:
     """What was drawn for the episode, [1, D], by key, and its wind: speed [m/s], direction
     [deg]."""
-    values, about = env.simulation.vehicles.values, {}
+    values = env.simulation.vehicles.values
+    about = {}
     if values.choices:
         about["drawn"] = dict(zip(values.choices, drawn[0].tolist(), strict=True))
     if env.simulation.vehicles.is_windy:

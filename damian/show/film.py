@@ -35,7 +35,8 @@ _STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5}
 
 def save_film(episode: Episode, path: Path, view: str = "2d", shown: Collection[str] = ()) -> None:
     """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path."""
-    film, steps = Film(episode, view, shown), range(episode.n_steps + 1)
+    film = Film(episode, view, shown)
+    steps = range(episode.n_steps + 1)
     if path.suffix != ".gif":
         writer = FFMpegWriter(STEPS_PER_SECOND)
         with writer.saving(film.figure, str(not_linked(path)), DPI):
@@ -72,12 +73,15 @@ class Film:
     """
 
     def __init__(self, episode: Episode, view: str = "2d", shown: Collection[str] = ()) -> None:
-        self.episode, self.chosen = episode, chosen_of(episode, shown)
+        self.episode = episode
+        self.chosen = chosen_of(episode, shown)
         uavs = frame_of(episode, 0, self.chosen).uavs
         self.colours = {uav: uavs[uav].colour for uav in self.chosen}
         with matplotlib.rc_context(_STYLE):
-            rows, height = height_of_rows(len(self.chosen)), HEIGHT
-            low, size = rows + 1.0, (WIDTH, round(rows + height + 1.4, 1))
+            rows = height_of_rows(len(self.chosen))
+            height = HEIGHT
+            low = rows + 1.0
+            size = (WIDTH, round(rows + height + 1.4, 1))
             self.figure = Figure(figsize=size, dpi=DPI)
             FigureCanvasAgg(self.figure)
 
@@ -150,7 +154,8 @@ class Film:
         )
         if len(self.chosen) < episode.n_agents:  # lines of many UAVs would hide each other
             title = f"{title.replace(' of information', '')}, grey: all UAVs"
-            step, ends = None if used else "post", (values.min(-1), values.max(-1))
+            step = None if used else "post"
+            ends = (values.min(-1), values.max(-1))
             self.charts[1].fill_between(episode.time, *ends, color="0.85", step=step, linewidth=0)
         for uav, colour in self.colours.items():
             style = {"drawstyle": "default" if used else "steps-post", "linewidth": 1.2}
@@ -180,7 +185,8 @@ class LiveFilm:
     """
 
     def __init__(self, env: UavEnv, view: str = "2d") -> None:
-        self.env, self.view = env, view
+        self.env = env
+        self.view = view
         self._instants: list[TensorDictBase] = []
 
     def reset(self, outputs: TensorDictBase) -> None:

@@ -73,7 +73,9 @@ def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None)
         uav: place
         for place, uav in enumerate(range(episode.n_agents) if chosen is None else chosen)
     }
-    known, emits, asked = episode.source, episode.emits, episode.requests
+    known = episode.source
+    emits = episode.emits
+    asked = episode.requests
     belief = [] if episode.belief is None else 1 - (1 - episode.belief[step]).prod(0)
     uavs = [
         Uav(

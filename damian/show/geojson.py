@@ -62,7 +62,8 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
     """Geometries in local metres, each with its properties."""
     yield episode.region, {"kind": "region", "name": episode.about.get("region")}
     yield shapely.MultiPoint(episode.landing_points), {"kind": "landing points"}
-    frame, times = frame_of(episode, step), {"times": episode.time[: step + 1].tolist()}
+    frame = frame_of(episode, step)
+    times = {"times": episode.time[: step + 1].tolist()}
     if isinstance(
         began := episode.about.get("began"), str
     ):  # a journal's, whose clock is the calendar's
@@ -71,10 +72,8 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
             (begin + timedelta(seconds=time)).isoformat() for time in times["times"]
         ]
     for number, uav in enumerate(frame.uavs):
-        path, label = (
-            episode.true[: step + 1, number],
-            {"uav": number, "name": episode.names[number]},
-        )
+        path = episode.true[: step + 1, number]
+        label = {"uav": number, "name": episode.names[number]}
         up = {"altitudes_m": episode.position[: step + 1, number, 2].round(2).tolist()}
         places: Any = shapely.points(path)
         footprints: Any = shapely.buffer(places, episode.radius, quad_segs=_CORNERS)

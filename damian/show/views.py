@@ -61,7 +61,8 @@ class MapView:
     """Style of the latest ways of UAVs."""
 
     def __init__(self, axis: Any, episode: Episode) -> None:
-        self.axis, self.radius = axis, episode.radius
+        self.axis = axis
+        self.radius = episode.radius
         turns = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
         self._circle = self.radius * np.stack([np.cos(turns), np.sin(turns)], -1)
         lands = [shapely.get_coordinates(part.exterior) for part in _polygons(episode.region)]
@@ -186,7 +187,8 @@ class MapView:
     def _mark_of(self, uav: Uav) -> list[Any]:
         """A dart that points where the UAV flies, and a line to where the server believes it to
         be."""
-        true, dart = uav.path[-1, :2], DART.transformed(Affine2D().rotate(-uav.heading))
+        true = uav.path[-1, :2]
+        dart = DART.transformed(Affine2D().rotate(-uav.heading))
         style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
         drawn = self.axis.plot(*true, marker=dart, color=uav.colour, **style)
         if uav.age > 0:
@@ -202,7 +204,8 @@ class SpaceView(MapView):
     """The region and the space above it, which turns slowly; ``room`` is what it may fill [px],
     [2]."""
 
-    height, fill = (0.0,), (0.12, 0.35)
+    height = (0.0,)
+    fill = (0.12, 0.35)
     source: ClassVar = {"markersize": 12, "zorder": 5}
     trail: ClassVar = {"zorder": 6}
 
@@ -213,10 +216,8 @@ class SpaceView(MapView):
             False  # the middle of the large ground says nothing about what it hides
         )
         (west, south), (east, north) = limits(episode)
-        size, highest = (
-            np.array([east - west, north - south]),
-            float(episode.position[..., 2].max()),
-        )
+        size = np.array([east - west, north - south])
+        highest = float(episode.position[..., 2].max())
         height = 1.1 * max(highest, 0.001 * size.max())
         times = max(1, round(float(f"{_HIGHEST * size.max() / height:.1g}"))) if highest else 1
         axis.set(xlim=(west, east), ylim=(south, north), zlim=(0, height), proj_type="ortho")
@@ -240,7 +241,8 @@ class SpaceView(MapView):
     def _fit(self, corners: Floats, shape: Floats, room: Floats) -> None:
         """Draw a box of this shape so large that these corners in it, [3, C], are always in the
         room."""
-        axis, far = self.axis, []
+        axis = self.axis
+        far = []
         axis.set_box_aspect(shape)
         axis.apply_aspect()
         for angle in range(0, 360, 4):
@@ -281,8 +283,10 @@ def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> N
     dt = _step_of(episode)
     for row, (uav, colour) in enumerate(colours.items()):
         sent = np.flatnonzero(episode.sent[:, uav])
-        begin, delay = episode.time[sent], episode.delay[sent, uav]
-        late, lost = delay > 0, delay < 0
+        begin = episode.time[sent]
+        delay = episode.delay[sent, uav]
+        late = delay > 0
+        lost = delay < 0
         at_once = begin[~lost & ~late]
         ends = np.stack([begin, begin + np.maximum(delay, 0) * dt], -1)[late]
         lines = [[(a, row), (b, row)] for a, b in ends]

@@ -38,9 +38,11 @@ def _range(spec: TensorSpec) -> tuple[Tensor, Tensor]:
     """Lowest and highest values of each number of an action, in the shape and type of the
     actions."""
     if isinstance(spec, MultiCategorical):  # before Categorical, which is its base class
-        low, high = 0, spec.nvec - 1
+        low = 0
+        high = spec.nvec - 1
     elif isinstance(spec, Categorical):
-        low, high = 0, spec.n - 1
+        low = 0
+        high = spec.n - 1
     else:
         low, high = spec.space.low, spec.space.high  # type: ignore[union-attr]
     low, high = (
@@ -83,7 +85,8 @@ class ActionTransform(StatefulTransform):
     def actions(self) -> ActionSpecs:
         """Shape, range and default of the actions, by the environment's specs."""
         specs = self.env.full_action_spec
-        spec, rows = specs[self.action_key], spec_rows(specs, self.action_key)
+        spec = specs[self.action_key]
+        rows = spec_rows(specs, self.action_key)
         if isinstance(spec, OneHot):
             indices = spec.to_categorical_spec()
             initial = indices.to_one_hot(_default_action(_range(indices), self.default)).to(
@@ -95,7 +98,8 @@ class ActionTransform(StatefulTransform):
         low, high = (bound.float() for bound in space)
         width = high - low
         bounded = isinstance(spec, Categorical | Bounded) & width.isfinite()
-        low, width = torch.where(bounded, low, 0), torch.where(bounded & (width > 0), width, 1)
+        low = torch.where(bounded, low, 0)
+        width = torch.where(bounded & (width > 0), width, 1)
         return ActionSpecs(
             rows, _default_action(space, self.default), low, width, bool(bounded.all())
         )

@@ -244,7 +244,8 @@ class StatefulTransform(Transform):
         outputs = tensordict_reset.detach() if mask is None else None
         # TorchRL restores the entries of the worlds without a reset.
         written = self._write(tensordict_reset, self._change_at_reset(tensordict_reset, mask))
-        self._first, self._in_episode = outputs, True
+        self._first = outputs
+        self._in_episode = True
         return written
 
     def _init(self, outputs: TensorDictBase) -> None:
@@ -317,7 +318,8 @@ class StatefulTransform(Transform):
         memory, first = self.on_reset(change[0], entries, rows)
         merged = dict(change[1])
         for key, new in first.items():
-            begun, old = self.to_rows(new), self.to_rows(merged[key])
+            begun = self.to_rows(new)
+            old = self.to_rows(merged[key])
             merged[key] = self.from_rows(torch.where(expand_mask(rows, begun), begun, old))
         return memory, merged
 
@@ -329,7 +331,8 @@ class StatefulTransform(Transform):
 
         Buffers that a step writes in place are right already, as ``on_step`` knows who has stepped.
         """
-        rows, memory = self.expand_worlds(stepped.reshape(-1)), self.memory
+        rows = self.expand_worlds(stepped.reshape(-1))
+        memory = self.memory
         for name, new in change[0].items():
             if new is not memory[name]:
                 memory[name] = torch.where(expand_mask(rows, new), new, memory[name])
@@ -341,7 +344,8 @@ class StatefulTransform(Transform):
                 value for value in found if value is not None and value.shape == new.shape
             )
             old = next(same_shape, torch.zeros_like(new))
-            new_rows, old_rows = self.to_rows(new), self.to_rows(old)
+            new_rows = self.to_rows(new)
+            old_rows = self.to_rows(old)
             merged[key] = self.from_rows(
                 torch.where(expand_mask(rows, new_rows), new_rows, old_rows)
             )
@@ -455,7 +459,8 @@ class StatefulTransform(Transform):
         is in goes on with its own messages, as TorchRL's collectors need it: right after a reset,
         the random streams are loaded; later, nothing.
         """
-        first, errors = self._first if self._in_episode else None, args[-1]
+        first = self._first if self._in_episode else None
+        errors = args[-1]
         if self._in_episode and first is None:
             text = (
                 "in the middle of an episode no state is loaded: load it before a reset or right "
@@ -480,13 +485,15 @@ class StatefulTransform(Transform):
 
     def set_seed(self, seed: int | None) -> None:
         """Set the seed and delete the memory; the next step or reset allocates it again."""
-        self._seed, self._world_seeds = seed, None
+        self._seed = seed
+        self._world_seeds = None
         self.clear_memory()
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Set a seed for each world, [B] integers: a world's draws then do not depend on the other
         worlds."""
-        self._seed, self._world_seeds = None, seeds.to(torch.long)
+        self._seed = None
+        self._world_seeds = seeds.to(torch.long)
         self.clear_memory()
 
     def streams(self, batch: torch.Size, device: torch.device, sampler: Sampler) -> Tensor:
@@ -530,7 +537,8 @@ def check_order(transforms: Sequence[Transform]) -> None:
     rewards in transit would be lost at an end of the episode.
     """
     for first, second in itertools.combinations(transforms, 2):
-        problem, limits = None, isinstance(second, StepCounter) and second.max_steps is not None
+        problem = None
+        limits = isinstance(second, StepCounter) and second.max_steps is not None
         ends = limits or isinstance(second, RandomTruncationTransform | TerminateTransform)
         if isinstance(first, StatefulTransform) and isinstance(second, StatefulTransform):
             read = {*first.in_keys, *first.in_keys_inv}

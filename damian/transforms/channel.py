@@ -116,7 +116,9 @@ class Channel(StatefulTransform):
             for key in (out_key, age_key, mask_key, delay_key, sent_key, position_key)
         )
         self.out_keys = existing([written, self.age_key, self.mask_key, self.delay_key])
-        self.message_size, self.known_at_reset, self.dt = message_size, known_at_reset, dt
+        self.message_size = message_size
+        self.known_at_reset = known_at_reset
+        self.dt = dt
         self.comm_range = comm_range
         self.sampler = link_sampler(delay, loss, dt)
         self.n_agents = getattr(self.sampler, "n_agents", None)
@@ -124,7 +126,8 @@ class Channel(StatefulTransform):
         for name in self.sampler.reads:
             given = placed and name in ("position", "receiver_position")
             checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
-        self.line, self._n_slots = DelayLine(self.sampler, "generation"), self.sampler.longest + 1
+        self.line = DelayLine(self.sampler, "generation")
+        self._n_slots = self.sampler.longest + 1
         self.action_keys = existing([self.action_key])
         self.step_keys = existing([*self.in_keys, self.position_key, self.sent_key])
 
@@ -152,7 +155,8 @@ class Channel(StatefulTransform):
         n = self.agents[-1]
         streams = self.streams(tensordict.batch_size, content.device, self.sampler)
         links = torch.arange(len(streams), device=streams.device)
-        receiver, sender = links // n, links % n
+        receiver = links // n
+        sender = links % n
         memory = self.line.init_memory([], streams)
         memory |= {"sender": receiver // n * n + sender, "hears": receiver % n != sender}
         memory["link"] = links.view(-1, n, n)[:, -1].flatten()
@@ -206,7 +210,8 @@ class Channel(StatefulTransform):
 
     def _hold(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [M] is true, hold the messages that were generated at ``generated_at``."""
-        slot, old = memory["generated_at"] % self._n_slots, memory["held"]
+        slot = memory["generated_at"] % self._n_slots
+        old = memory["held"]
         rows = slot * len(memory["link"]) + memory["sender"]
         new = memory["contents"].flatten(0, 1).index_select(0, rows)
         return memory | {"held": torch.where(expand_mask(mask, old), new, old)}
@@ -237,7 +242,8 @@ class Channel(StatefulTransform):
 
     def _context(self, memory: Memory, sent: Tensor, position: Tensor | None) -> MessageContext:
         """The circumstances of what is ``sent`` over the links [M]; positions are [B * N, 2]."""
-        n, sender = self.agents[-1], memory["sender"]
+        n = self.agents[-1]
+        sender = memory["sender"]
         receiver = torch.arange(len(sender), device=sender.device) // n
         places = {"position": sender, "receiver_position": receiver}
         read = (
@@ -250,14 +256,13 @@ class Channel(StatefulTransform):
 
     def _outputs(self, memory: Memory) -> Entries:
         """What the agents hold, with ages and flags; each agent holds its own message at once."""
-        n, shape = self.agents[-1], (*self.agents, self.agents[-1])
+        n = self.agents[-1]
+        shape = (*self.agents, self.agents[-1])
         time, now = (
             (memory[name] - memory["reset_at"]).view(-1, n) for name in ("generated_at", "clock")
         )
-        agents, senders = (
-            torch.arange(len(now), device=now.device),
-            torch.arange(n, device=now.device),
-        )
+        agents = torch.arange(len(now), device=now.device)
+        senders = torch.arange(n, device=now.device)
         is_own = (agents % n).unsqueeze(-1) == senders
         own_time = (
             now.masked_fill(now == 1, 0) if self.action_key else now

@@ -33,11 +33,9 @@ class ContextReader:
         beside: NestedKey,
         before_step: bool = False,
     ) -> None:
-        self._sees_context, self._dt, self._since_clock = (
-            sampler.sees_context,
-            dt,
-            0 if before_step else 1,
-        )
+        self._sees_context = sampler.sees_context
+        self._dt = dt
+        self._since_clock = 0 if before_step else 1
         self.keys: dict[str, NestedKey] = {}
         """Keys of the entries that the law gets, by name."""
         known = dict(context_keys or {}) if sampler.sees_context else {}
@@ -62,12 +60,14 @@ class ContextReader:
         none."""
         if not self._sees_context:
             return None
-        agents, streams = memory["agents"], memory["streams"]
+        agents = memory["agents"]
+        streams = memory["streams"]
         n_sending = torch.full_like(streams, len(agents))
         if sent is not None:
             by_world = sent.view(-1, len(agents))
             n_sending = by_world.sum(-1, keepdim=True).expand_as(by_world).reshape(-1)
-        sender, receiver = agents.repeat(len(streams) // len(agents)), torch.full_like(streams, -1)
+        sender = agents.repeat(len(streams) // len(agents))
+        receiver = torch.full_like(streams, -1)
         time = (memory["clock"] + self._since_clock - memory["reset_at"]) * self._dt
         uniform = counter_rng.uniform(streams, memory["clock"] + 1)
         read = {name: as_rows(entries[key], rows) for name, key in self.keys.items()}

@@ -64,7 +64,8 @@ def add_spec(
 ) -> None:
     """Add the spec of an entry without bounds; nothing if the key is None."""
     if key is not None:
-        size, kind = torch.Size(shape), Binary if dtype == torch.bool else Unbounded
+        size = torch.Size(shape)
+        kind = Binary if dtype == torch.bool else Unbounded
         specs[key] = kind(shape=size, dtype=dtype, device=specs.device)
 
 

@@ -70,7 +70,8 @@ class ActionHistory(ActionTransform):
         self.steps, self.recorded_key = steps, sibling_key(self.action_key, recorded_key)
         self.codes = codes
         self.action_keys = existing([self.action_key, self.recorded_key])
-        self.age_key, self.reflected_after = sibling_key(self.action_key, age_key), reflected_after
+        self.age_key = sibling_key(self.action_key, age_key)
+        self.reflected_after = reflected_after
         self.step_keys = existing([*self.in_keys, self.age_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
@@ -109,7 +110,8 @@ class ActionHistory(ActionTransform):
         return memory | changed, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        recent, key = memory["recent"], self.out_keys[0]
+        recent = memory["recent"]
+        key = self.out_keys[0]
         if self.age_key:
             # An observation of this age was generated ``since - age`` steps after the action was
             # chosen.
@@ -147,8 +149,11 @@ class ActionHistory(ActionTransform):
         return ((action.float() - scale["low"]) / scale["width"]).reshape(len(action), -1)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        actions, key, codes = self.actions, self.out_keys[0], self.codes
-        rows, initial = actions.rows, actions.initial
+        actions = self.actions
+        key = self.out_keys[0]
+        codes = self.codes
+        rows = actions.rows
+        initial = actions.initial
         numbers = initial.shape[len(rows) :].numel() if codes is None else codes.shape[-1]
         width = self.steps * numbers
         if not self.in_keys:
@@ -170,7 +175,8 @@ class ActionHistory(ActionTransform):
         if not isinstance(old, Bounded) or (self.codes is None and not self.actions.bounded):
             return Unbounded(shape, dtype=old.dtype, device=old.device)
         if self.codes is None:
-            lowest, highest = torch.zeros(width), torch.ones(width)
+            lowest = torch.zeros(width)
+            highest = torch.ones(width)
         else:
             lowest, highest = (code.repeat(self.steps) for code in self.codes.aminmax(dim=0))
         low, high = (

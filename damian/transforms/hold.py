@@ -52,7 +52,8 @@ class SampleAndHold(StatefulTransform):
         checks.above("dt", dt, 0.0, "s")
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
-        self.ready_key, self.action_keys = ready_key, self.in_keys_inv
+        self.ready_key = ready_key
+        self.action_keys = self.in_keys_inv
         self.step_keys = existing([*self.in_keys, ready_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
@@ -97,7 +98,8 @@ class SampleAndHold(StatefulTransform):
         """Sample the entries where the mask [M] is true, and output the held values everywhere."""
         outputs: Entries = {}
         for i, key in enumerate(keys):
-            new, old = self.to_rows(entries[key]), memory[f"{name}_{i}"]
+            new = self.to_rows(entries[key])
+            old = memory[f"{name}_{i}"]
             held = torch.where(expand_mask(sampled, new), new, old)
             memory = memory | {f"{name}_{i}": held}
             outputs[key] = self.from_rows(held).clone()  # the memory keeps the held values
@@ -112,12 +114,11 @@ class SampleAndHold(StatefulTransform):
         def hold_again(entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
             elapsed = count + 1
             index = torch.arange(len(count), device=count.device).unsqueeze(-1)
-            tick, world = (
-                index - elapsed % self.period,
-                torch.arange(count.shape[1], device=count.device),
-            )
+            tick = index - elapsed % self.period
+            world = torch.arange(count.shape[1], device=count.device)
             # Nothing is late at a reset: what was held until the first tick after it stays.
-            stays, corrected = (elapsed < self.period) | (tick < 0), dict(entries)
+            stays = (elapsed < self.period) | (tick < 0)
+            corrected = dict(entries)
             for key in map(next_key, held):
                 value = entries[key]
                 stored = steps[key][..., : value.shape[-1]]

@@ -102,14 +102,16 @@ class RewardDelay(StatefulTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         reward = _zero_rewards(self)
         streams = self.streams(tensordict.batch_size, reward.device, self.sampler)
-        zero, state = torch.zeros_like(streams), self.sampler.initial_state(streams)
+        zero = torch.zeros_like(streams)
+        state = self.sampler.initial_state(streams)
         memory = {name: zero.clone() for name in ("clock", "slot", "time", "reset_at")}
         memory |= {"streams": streams, "state": state, "due": zero.repeat(self.n_slots, 1)}
         memory["past"] = reward.new_zeros(self.n_slots, *reward.shape)
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        clock, time = memory["clock"], memory["time"] + self.n_slots * mask
+        clock = memory["clock"]
+        time = memory["time"] + self.n_slots * mask
         memory = memory | {"reset_at": torch.where(mask, clock, memory["reset_at"]), "time": time}
         memory["state"] = self.sampler.begin_episode(memory["state"], mask)
         return memory, self._told(torch.zeros_like(clock), torch.zeros_like(memory["past"][0]))
@@ -143,10 +145,13 @@ class RewardDelay(StatefulTransform):
     ) -> Tensor:
         """The slots [K, M, ...] with rewards [M, ...] that arrive after delays [M], in rows that
         step."""
-        past, arrival = memory["past"], memory["time"] + delay
-        flat, due = past.flatten(0, 1), memory["due"].view(-1)
+        past = memory["past"]
+        arrival = memory["time"] + delay
+        flat = past.flatten(0, 1)
+        due = memory["due"].view(-1)
         row = slot_rows((memory["slot"] + delay) % self.n_slots)
-        there, old = flat.index_select(0, row), due.index_select(0, row)
+        there = flat.index_select(0, row)
+        old = due.index_select(0, row)
         added = torch.where(expand_mask(old == arrival, there), there, 0) + reward
         # ``old`` is never later; a compiler that sees that it is read before writes the new times
         # in place.
@@ -195,7 +200,8 @@ class RewardDelay(StatefulTransform):
 
     def _credit(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
         """What the rewards are by now: what a step earned if that has been paid, else 0."""
-        key, earned_key = next_key(self.reward_key), self.earned_key and next_key(self.earned_key)
+        key = next_key(self.reward_key)
+        earned_key = self.earned_key and next_key(self.earned_key)
         if key not in entries and (earned_key is None or earned_key not in steps.keys(True)):
             raise InputError(
                 f"earned_key: nothing says what {key} was earned: give RewardDelay an earned_key"
@@ -221,7 +227,8 @@ class RewardDelay(StatefulTransform):
 
 def _zero_rewards(transform: StatefulTransform) -> Tensor:
     """A reward of 0 for each of the M rows of a transform of rewards, [M, ...]."""
-    specs, key = transform.env.full_reward_spec, transform.in_keys[0]
+    specs = transform.env.full_reward_spec
+    key = transform.in_keys[0]
     return transform.as_rows_of_spec(specs[key].zero(), specs, key)
 
 
@@ -244,7 +251,9 @@ class CumulativeReward(StatefulTransform):
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(reward_key, reward_key)
         self.reward_key: NestedKey = self.in_keys[0]
-        self.step_keys, self.n_slots, self.gamma = self.in_keys, steps, gamma
+        self.step_keys = self.in_keys
+        self.n_slots = steps
+        self.gamma = gamma
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         return {

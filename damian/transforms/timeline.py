@@ -98,7 +98,11 @@ class ObservationTimeline(StatefulTransform):
         alone = not group and ages is None
         checks.require(position_key is None or alone, "position_key", position_key, should)
         super().__init__(message_key)
-        self.slots, self.encode, self.ages, self.group, self.own = slots, encode, ages, group, own
+        self.slots = slots
+        self.encode = encode
+        self.ages = ages
+        self.group = group
+        self.own = own
         written, self.delay_key, self.sent_key, self.position_key = (
             sibling_key(self.row_key, key) for key in (out_key, delay_key, sent_key, position_key)
         )
@@ -139,7 +143,8 @@ class ObservationTimeline(StatefulTransform):
         the observer [..., P].
         """
         message = entry(self.row_key)
-        kept, sent = self.encoded(message), torch.ones_like(message[..., 0], dtype=torch.bool)
+        kept = self.encoded(message)
+        sent = torch.ones_like(message[..., 0], dtype=torch.bool)
         if self.sent_key is not None:
             sent = entry(self.sent_key).view(sent.shape)
         due = torch.zeros_like(sent, dtype=torch.long).unsqueeze(-1)
@@ -159,7 +164,8 @@ class ObservationTimeline(StatefulTransform):
     def _by_row(self, sent: dict[str, Tensor]) -> Memory:
         """The messages of ``_sent`` by rows, [M, ...] each; several rows in order may share a
         position."""
-        n_rows, lead = sent["sent"].numel(), sent["sent"].dim()
+        n_rows = sent["sent"].numel()
+        lead = sent["sent"].dim()
         rows = {
             n: each.reshape(n_rows, *each.shape[lead:])
             for n, each in sent.items()
@@ -172,7 +178,8 @@ class ObservationTimeline(StatefulTransform):
 
     def _added(self, memory: Memory, sent: dict[str, Tensor]) -> Memory:
         """The memory with the messages of a step as the newest."""
-        newest, older = self._by_row(sent), memory | {"due": memory["due"] - 1}
+        newest = self._by_row(sent)
+        older = memory | {"due": memory["due"] - 1}
         newest["due"] = torch.where(newest["sent"].unsqueeze(-1), newest["due"], _NEVER)
         if self.ages is None:
             return {
@@ -240,12 +247,15 @@ class ObservationTimeline(StatefulTransform):
             self._sent(lambda key, at=at: steps[at(key)]) for at in (next_key, lambda key: key)
         )
         first["sent"] = torch.ones_like(first["sent"])
-        step, slots, arrived = torch.arange(len(steps), device=count.device), [], []
+        step = torch.arange(len(steps), device=count.device)
+        slots = []
+        arrived = []
         for k in range(self.slots):  # a slot of all steps and worlds at once
             sent_at = step - k  # before 0 lies what is not among the steps
             is_reset = (k == count + 1) & (sent_at >= -1).unsqueeze(-1)
             exists = is_reset | ((k <= count) & (sent_at >= 0).unsqueeze(-1))
-            of_step, of_reset = sent_at.clamp(min=0), (sent_at + 1).clamp(0, len(steps) - 1)
+            of_step = sent_at.clamp(min=0)
+            of_reset = (sent_at + 1).clamp(0, len(steps) - 1)
             slot = {
                 name: torch.where(expand_mask(is_reset, new), first[name][of_reset], new[of_step])
                 for name, new in after.items()
@@ -284,7 +294,8 @@ class ObservationTimeline(StatefulTransform):
         return message if self.encode is None else self.encode(message)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        spec, rows = observation_spec[self.row_key], spec_rows(observation_spec, self.row_key)
+        spec = observation_spec[self.row_key]
+        rows = spec_rows(observation_spec, self.row_key)
         encoded = self.encoded(spec.zero())
         n_numbers = encoded.shape[-1]
         shape = (*rows, *rows[-1:] * self.group, self.slots, n_numbers + 1)

@@ -105,7 +105,8 @@ class Airspace(NamedTuple):
 
     def nearest(self, places: Floats, region: int) -> Tensor:
         """The landing points nearest to places [P, 2] m, as ids within their region, [P]."""
-        regions, target = torch.full((len(places),), region), torch.as_tensor(places)
+        regions = torch.full((len(places),), region)
+        target = torch.as_tensor(places)
         return nearest_points(self.cells, self.exact_points, regions, target, 1).squeeze(-1)
 
 
@@ -117,7 +118,9 @@ def build_airspace(
     ``longest`` is the longest action [m]; landing points more than twice as far apart are not
     connected in a region that is not convex.
     """
-    step, degrees, n_points = config.lattice_step, config.lattice_angle, config.n_landing_points
+    step = config.lattice_step
+    degrees = config.lattice_angle
+    n_points = config.n_landing_points
     lattices = [landing_lattice(r.polygon, step, degrees, n_points) for r in regions]
     for region, lattice in zip(regions, lattices, strict=True):
         problem = f"UAVs are more than the {len(lattice)} landing points of {region.name}"
@@ -142,7 +145,8 @@ def build_airspace(
 def inside(edges: Tensor, target: Tensor) -> Tensor:
     """Whether targets [*, 2] lie in polygons (even-odd rule) of edges [*, E, 4]; [*] bool."""
     x1, y1, x2, y2 = edges.unbind(-1)
-    x, y = target[..., :1], target[..., 1:]
+    x = target[..., :1]
+    y = target[..., 1:]
     straddles = (y1 > y) != (y2 > y)
     # A horizontal edge divides by zero here, but it never straddles, so the result is not used.
     crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
@@ -187,7 +191,11 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
     the cell, so the n nearest ones of that place are at most two halves farther from the centre
     than the n-th of these.
     """
-    tables, rows_of_cells, shapes, corners, sides = [], [], [], [], []
+    tables = []
+    rows_of_cells = []
+    shapes = []
+    corners = []
+    sides = []
     n_used = 0
     for lattice, polygon in zip(lattices, polygons, strict=True):
         west, south, east, north = polygon.bounds
@@ -223,7 +231,8 @@ def _within_reach(
 ) -> NDArray[np.int64]:
     """Pairs, [2, P]: for each place the n nearest points, and those farther by up to
     ``farther``."""
-    tree, targets = shapely.STRtree(np.asarray(shapely.points(lattice))), shapely.points(place)
+    tree = shapely.STRtree(np.asarray(shapely.points(lattice)))
+    targets = shapely.points(place)
     reach = np.full(len(place), side * math.sqrt(n / math.pi))
     while True:
         found = tree.query(targets, predicate="dwithin", distance=reach)[0]

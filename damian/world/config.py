@@ -8,7 +8,9 @@ from typing import Any, ClassVar
 from damian.common import checks
 from damian.common.fields import Settings, check_place, constant, rules, setting
 
-RANDOM, GEOJSON, FILES = ("random",), ("geojson",), ("fir", "geojson")
+RANDOM = ("random",)
+GEOJSON = ("geojson",)
+FILES = ("fir", "geojson")
 POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 """Variants of a section that read a setting (``kinds``)."""
 FOOTPRINT = "footprint"
@@ -120,7 +122,8 @@ class RegionConfig(Settings):
         self.refuse(not good, "where", problem)
         both = self.index is not None and self.where is not None
         self.refuse(both, "where", "and region.index both choose; give one of them")
-        zones, drawn = self.zones, checks.is_number(self.zones)
+        zones = self.zones
+        drawn = checks.is_number(self.zones)
         wrong = zones % 1 or not 0 <= zones <= 100 if drawn else not isinstance(zones, list | str)
         problem = (
             "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100"
@@ -311,10 +314,8 @@ class SourceConfig(Settings):
             self.refuse(
                 wrong, "each", "has something else than settings of a source: {level_db: 130}"
             )
-        heard, least = (
-            self.microphone_db < self.level_db,
-            f"microphone_db={self.microphone_db:g} dB",
-        )
+        heard = self.microphone_db < self.level_db
+        least = f"microphone_db={self.microphone_db:g} dB"
         self.refuse(not heard, "level_db", f"is not above {least}: not heard even at 1 m")
         static = self.motion != "dynamic"
         problem = "needs source.motion=dynamic: a static source does not walk"

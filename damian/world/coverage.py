@@ -110,7 +110,8 @@ def updated_share(
     changed."""
     changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
     n_uavs, n_last = point_ids.shape[-2:]
-    ids, share = point_ids.reshape(-1, n_uavs, n_last), known.share.reshape(-1, n_uavs)
+    ids = point_ids.reshape(-1, n_uavs, n_last)
+    share = known.share.reshape(-1, n_uavs)
     return _update_share(*tables, ids, points, share, changed.reshape(-1)).view(known.share.shape)
 
 
@@ -124,7 +125,8 @@ def _update_share(
     changed: Tensor,
 ) -> Tensor:
     """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``."""
-    updated, worlds = share.clone(), changed.nonzero().squeeze(-1)
+    updated = share.clone()
+    worlds = changed.nonzero().squeeze(-1)
     if len(worlds):
         ids = ids.index_select(0, worlds)
         tables = FootprintTables(masks, cells_per_metre)
@@ -175,7 +177,8 @@ def _overlap_rows(fleet: Tensor) -> Tensor:
     ``[b, N, n, N + n - 2]``."""
     # First the other UAVs at the same index, then the UAV itself at later ones; a window that
     # slides over the indices leaves out all other pairs, without index tensors.
-    cells, n_last = fleet[..., 0], fleet.shape[-3]
+    cells = fleet[..., 0]
+    n_last = fleet.shape[-3]
     past = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf).unfold(-2, n_last, 1)
     other = torch.cat([fleet[..., 1:], past[..., 1:]], -1)
     # Adding half a cell before truncation rounds to the nearest one.
@@ -205,13 +208,15 @@ def _bit_count(words: Tensor) -> Tensor:
 def _unit_disc_samples(count: int) -> np.ndarray:
     """Well-spread points of equal weight in the unit disc, ``[count, 2]`` (H. Vogel, 1979)."""
     k = np.arange(count)
-    r, angle = np.sqrt((k + 0.5) / count), k * np.pi * (3 - math.sqrt(5))
+    r = np.sqrt((k + 0.5) / count)
+    angle = k * np.pi * (3 - math.sqrt(5))
     return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
 
 
 def _outside(polygon: shapely.Geometry, points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Whether samples around each point lie outside, ``[L, 2]``, ``[S, 2]`` -> bool ``[L, S]``."""
-    boundary, radius = shapely.boundary(polygon), np.hypot(*offsets.T).max()
+    boundary = shapely.boundary(polygon)
+    radius = np.hypot(*offsets.T).max()
     shapely.prepare([polygon, boundary])
     real = np.flatnonzero(np.isfinite(points).all(-1))
     # Far from the boundary all samples lie on the side of their centre.

@@ -70,11 +70,13 @@ class Candidates:
         move = displacement(
             action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi
         ).flatten(0, 1)
-        own, base = flat.flatten(), (flat - flat % self.airspace.max_points).flatten()
+        own = flat.flatten()
+        base = (flat - flat % self.airspace.max_points).flatten()
         exact_points = self.airspace.exact_points
         target = gather_rows(exact_points.flatten(0, 1), own) + move
         where = region.unsqueeze(-1).expand_as(flat).flatten(), target, own - base
-        edges, cells = self.airspace.edges, [*self.airspace.cells]
+        edges = self.airspace.edges
+        cells = [*self.airspace.cells]
         nearest = _nearest_inside(edges, cells, exact_points, *where, self.n_candidates)
         distance = self.airspace.length(
             own.unsqueeze(1).expand_as(nearest), nearest + base.unsqueeze(-1)
@@ -118,7 +120,8 @@ class Candidates:
     def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
         """Candidates [P, A, K] of moves from the points ``own`` [P], and whether these end inside
         [P, A]."""
-        polygon, base = self.airspace.regions[region].polygon, region * self.airspace.max_points
+        polygon = self.airspace.regions[region].polygon
+        base = region * self.airspace.max_points
         target = self.airspace.exact_points[region, own].unsqueeze(1) + move
         shapely.prepare(polygon)
         within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
@@ -127,7 +130,8 @@ class Candidates:
             target.flatten(0, 1),
             own.repeat_interleave(len(move)),
         )
-        cells, exact_points = self.airspace.cells, self.airspace.exact_points
+        cells = self.airspace.cells
+        exact_points = self.airspace.exact_points
         nearest = _nearest_or_own(cells, exact_points, *where, within.flatten(), self.n_candidates)
         nearest = nearest.view(*within.shape, -1)
         origin = (own + base).view(-1, 1, 1).expand_as(nearest)
@@ -197,7 +201,8 @@ def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: T
     """Each UAV takes its first free candidate, one after the other in all worlds."""
     reached = gather_rows(ranking.distance, row) <= reach.unsqueeze(-1)
     wishes = torch.where(reached, gather_rows(ranking.point, row).long(), standing.unsqueeze(-1))
-    taken, goals = standing.t().unsqueeze(-1), []
+    taken = standing.t().unsqueeze(-1)
+    goals = []
     for own, wish in zip(standing.split(1, 1), wishes.unbind(1), strict=True):
         free = (wish == own) | ~(wish == taken).any(0)
         goals.append(
@@ -215,11 +220,9 @@ def _assign_in_rounds(
 
     Each point keeps the earliest UAV that has asked for it; all others ask for their next one.
     """
-    at_once, points, distances = (
-        max(BOOKING_CHUNK // n_points, 1),
-        point.flatten(),
-        distance.flatten(),
-    )
+    at_once = max(BOOKING_CHUNK // n_points, 1)
+    points = point.flatten()
+    distances = distance.flatten()
     first = row * point.shape[1]
     parts = zip(*(each.split(at_once) for each in (first, standing, reach)), strict=True)
     return torch.cat([_rounds(points, distances, f, s, r, n_points) for f, s, r in parts])
@@ -235,7 +238,9 @@ def _rounds(
 ) -> Tensor:
     """The rounds of some worlds; ``first`` [B, N] indexes each UAV's first one of all candidates
     [M*K]."""
-    asked, stands, reach = first.flatten().clone(), standing.flatten(), reach.flatten()
+    asked = first.flatten().clone()
+    stands = standing.flatten()
+    reach = reach.flatten()
     # A world's first point, and the UAV that each point keeps, as a flat number; those of a world
     # count up in index order.
     base = (torch.arange(len(first), device=first.device) * n_points).repeat_interleave(
@@ -244,15 +249,18 @@ def _rounds(
     nobody = first.numel()
     keeper = torch.full((len(first) * n_points,), nobody, device=first.device)
     keeper.index_fill_(0, base + stands, -1)
-    booked, asking = stands.clone(), torch.arange(nobody, device=first.device)
+    booked = stands.clone()
+    asking = torch.arange(nobody, device=first.device)
     while len(asking):
-        candidate, own = asked.index_select(0, asking), stands.index_select(0, asking)
+        candidate = asked.index_select(0, asking)
+        own = stands.index_select(0, asking)
         point = points.index_select(0, candidate).long()
         flies = (distances.index_select(0, candidate) <= reach.index_select(0, asking)) & (
             point != own
         )
         booked.index_copy_(0, asking, torch.where(flies, point, own))
-        asking, point = asking[flies], point[flies]
+        asking = asking[flies]
+        point = point[flies]
         wanted = base.index_select(0, asking) + point
         before = keeper.index_select(0, wanted)
         keeper.scatter_reduce_(0, wanted, asking, "amin")

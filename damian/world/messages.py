@@ -177,5 +177,7 @@ _VARIABLE = [name for name, column in zip(_HINTS, _COLUMNS, strict=True) if colu
 
 def _variable(widths: Widths) -> list[int]:
     """Numbers of columns of the other fields, but those of the stops."""
-    n, m, t = widths.sources, widths.requests, widths.truths
+    n = widths.sources
+    m = widths.requests
+    t = widths.truths
     return [n, 2 * n, t, 2 * t, 3 * m, m, min(m, 1), widths.readings]

@@ -54,10 +54,8 @@ class Detours(NamedTuple):
         return self._along(self.row(origin, goal), origin, goal, points)
 
     def _along(self, row: Tensor, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
-        first, last = (
-            gather_rows(points, origin).unsqueeze(-2),
-            gather_rows(points, goal).unsqueeze(-2),
-        )
+        first = gather_rows(points, origin).unsqueeze(-2)
+        last = gather_rows(points, goal).unsqueeze(-2)
         corners = gather_rows(self.corners, row)
         return torch.cat([first, torch.where(corners.isnan(), last, corners), last], -2)
 
@@ -78,7 +76,8 @@ def detours(
 
     Only pairs are looked at that are at most ``longest`` [m] apart.
     """
-    most, found = max(map(len, points)), []
+    most = max(map(len, points))
+    found = []
     for region, (polygon, places) in enumerate(zip(polygons, points, strict=True)):
         if shapely.convex_hull(polygon).area - polygon.area <= _CONVEX * polygon.area:
             continue
@@ -91,7 +90,8 @@ def detours(
             found.append((blocked + region * most, *_shortest(polygon, places, blocked)))
     if not found:
         return None
-    widest, n_points = max(corners.shape[1] for _, corners, _ in found), most * len(points)
+    widest = max(corners.shape[1] for _, corners, _ in found)
+    n_points = most * len(points)
     padded = [
         np.pad(each, ((0, 0), (0, widest - each.shape[1]), (0, 0)), constant_values=np.nan)
         for _, each, _ in found
@@ -127,12 +127,15 @@ def _shortest(
     straight[one, other] = np.linalg.norm(places[one] - places[other], axis=1)
     graph = csr_array((straight[one, other], (one, other)), shape=(len(places),) * 2)
     along, before = dijkstra(graph, indices=np.arange(len(corners)), return_predecessors=True)
-    first, length = np.zeros(len(pairs), int), np.full(len(pairs), np.inf)
+    first = np.zeros(len(pairs), int)
+    length = np.full(len(pairs), np.inf)
     for corner in range(len(corners)):
         by = straight[corner, origin] + along[corner, goal]
-        first, length = np.where(by < length, corner, first), np.minimum(by, length)
+        first = np.where(by < length, corner, first)
+        length = np.minimum(by, length)
     # Each path is followed from its goal back to its first corner.
-    path, here = [], np.where(np.isfinite(length), goal, first)
+    path = []
+    here = np.where(np.isfinite(length), goal, first)
     while ((here := np.where(here == first, first, before[first, here])) != first).any():
         path.append(np.where(here == first, -1, here))
     passed = np.stack([np.where(np.isfinite(length), first, -1), *path[::-1]], 1)

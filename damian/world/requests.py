@@ -20,7 +20,8 @@ from damian.world.regions.region import Region
 
 _PLACES = 4096
 """Places of each region where requests appear, drawn once."""
-_APPEARS, _PLACE = counter_rng.number_of("request appears"), counter_rng.number_of("request place")
+_APPEARS = counter_rng.number_of("request appears")
+_PLACE = counter_rng.number_of("request place")
 
 
 class Arrivals(NamedTuple):

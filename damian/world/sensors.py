@@ -28,7 +28,8 @@ class Sensor(NamedTuple):
 
     def read(self, state: State, world: Any) -> Tensor:
         """The values as columns, [B, N, width] float32."""
-        values, shape = self.compute(state, world), (*state.track.shape, self.width)
+        values = self.compute(state, world)
+        shape = (*state.track.shape, self.width)
         same = values.shape == shape or (self.width == 1 and values.shape == shape[:-1])
         problem = f"is not {[*shape]}, of its worlds, UAVs and width: return or declare another one"
         checks.require(same, f"sensor {self.name}: shape", [*values.shape], problem)
@@ -82,7 +83,8 @@ def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
     name."""
     found: dict[str, Sensor] = {}
     for number, each in enumerate(written):
-        key, entry = f"sensors[{number}]", each if isinstance(each, Mapping) else {"sensor": each}
+        key = f"sensors[{number}]"
+        entry = each if isinstance(each, Mapping) else {"sensor": each}
         path, declared, parameters = SENSORS.read(entry, key, "sensor")
         name = name_of(parameters, declared.name, key)
         check_parameters(declared.compute, parameters, path, key)

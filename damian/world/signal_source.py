@@ -19,7 +19,8 @@ from damian.world.regions.polygon import sample_interior
 _Polygon = shapely.Polygon | shapely.MultiPolygon
 
 _TINY = 1e-9
-_FULL_DISC_ROUNDS, _ROUNDS = 256, 320
+_FULL_DISC_ROUNDS = 256
+_ROUNDS = 320
 
 
 class Walk(NamedTuple):
@@ -93,7 +94,8 @@ def draw_walks(
         hotspots[:, 0] = start
     if config.motion == "dynamic":
         return _timed_walk(*_draw_stops(polygon, hotspots, config, rng), config, rng)
-    zeros, ones = torch.zeros(n_walks, 1), torch.ones(n_walks, 1)
+    zeros = torch.zeros(n_walks, 1)
+    ones = torch.ones(n_walks, 1)
     stop = torch.as_tensor(hotspots, dtype=torch.float32)
     return Walk(stop, zeros, zeros + math.inf, ones, ones, ones.bool())
 
@@ -105,12 +107,16 @@ def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
     A source whose walk is over stays at its last stop, or ``loops``, if ``draw_walks`` has drawn it
     so.
     """
-    last, end = walk.stop.shape[-2] - 1, walk.depart[..., -1].to(time.dtype)
-    finished, tour = time >= end, torch.zeros_like(time)
+    last = walk.stop.shape[-2] - 1
+    end = walk.depart[..., -1].to(time.dtype)
+    finished = time >= end
+    tour = torch.zeros_like(time)
     if loops:
-        tour, finished = (time / end).floor(), torch.zeros_like(finished)
+        tour = (time / end).floor()
+        finished = torch.zeros_like(finished)
         time = time - tour * end
-    tour, time = tour.long(), time.to(walk.depart.dtype)
+    tour = tour.long()
+    time = time.to(walk.depart.dtype)
     if last == 0:
         return Located(walk.stop[..., 0, :], tour, tour, finished)
     stop = (walk.arrive[..., 1:] <= time.unsqueeze(-1)).sum(-1)
@@ -153,7 +159,8 @@ def _draw_stops(
     Returns the places [W, K, 2] m, which stops are hotspots [W, K], and the number of real stops
     [W].
     """
-    n_walks, inner = len(hotspots), _inner_points(polygon, hotspots, config, rng)
+    n_walks = len(hotspots)
+    inner = _inner_points(polygon, hotspots, config, rng)
     grid = np.concatenate([hotspots[:, :, None], inner], axis=2)  # [W, H, 1 + max_stops, 2]
     n_inner = rng.integers(config.min_stops, config.max_stops, hotspots.shape[:2], endpoint=True)
     column = np.broadcast_to(np.arange(grid.shape[2]), grid.shape[:3]).reshape(n_walks, -1)
@@ -172,13 +179,12 @@ def _inner_points(
     # Points outside after the first rounds are drawn from ever smaller discs, so that this ends.
     radii = config.local_distance / 2.0 ** np.maximum(np.arange(_ROUNDS) - _FULL_DISC_ROUNDS, 0)
     points = np.repeat(hotspots[:, :, None], config.max_stops, axis=2)
-    flat, centre = points.reshape(-1, 2), points.reshape(-1, 2).copy()
+    flat = points.reshape(-1, 2)
+    centre = points.reshape(-1, 2).copy()
     missing = np.arange(len(flat))
     for radius in radii:
-        distance, angle = (
-            radius * np.sqrt(rng.random(len(missing))),
-            2 * math.pi * rng.random(len(missing)),
-        )
+        distance = radius * np.sqrt(rng.random(len(missing)))
+        angle = 2 * math.pi * rng.random(len(missing))
         drawn = centre[missing] + distance[:, None] * np.stack(
             [np.sin(angle), np.cos(angle)], axis=1
         )
@@ -198,7 +204,8 @@ def _timed_walk(
     rng: np.random.Generator,
 ) -> Walk:
     """Add waiting times, legs and emission to the stops."""
-    shape, loops = hotspot.shape, config.after_walk == "loop"
+    shape = hotspot.shape
+    loops = config.after_walk == "loop"
     per_stop = config.emission == "per_stop"
     wait = rng.uniform(config.min_wait, config.max_wait, shape)
     emits = rng.random(shape) < (config.emission_probability if per_stop else 1.0)
@@ -207,7 +214,8 @@ def _timed_walk(
         place, hotspot, wait, emits = (
             np.concatenate([each, each[:, -1:]], axis=1) for each in drawn
         )
-    last, column = (n - 1)[:, None], np.arange(hotspot.shape[1])
+    last = (n - 1)[:, None]
+    column = np.arange(hotspot.shape[1])
     padded = column > last
     after = np.zeros_like(last) if loops else last
     place = np.where(padded[..., None], np.take_along_axis(place, after[..., None], axis=1), place)

@@ -24,7 +24,8 @@ from damian.world.signal_source import Walk, draw_walks, drawn_radius, footprint
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import MOTION_MODELS
 
-_REPORT, _SOURCE = counter_rng.number_of("report"), counter_rng.number_of("source")
+_REPORT = counter_rng.number_of("report")
+_SOURCE = counter_rng.number_of("source")
 
 
 class Simulation:
@@ -32,7 +33,8 @@ class Simulation:
 
     def __init__(self, config: WorldConfig, dt: float, stops: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        self.config, self.dt = config, dt
+        self.config = config
+        self.dt = dt
         self.sensors = sensors_of(config.sensors)
         self.sources = config.source.all
         self.reach = torch.tensor([footprint_radius(source) for source in self.sources])
@@ -43,7 +45,8 @@ class Simulation:
         n_sources = len(self.sources)
         n_truths = n_sources if config.tells_truth else 0
         self.widths = Widths(n_sources, n_readings, config.requests.slots, n_truths)
-        regions, longest = regions_of(config.region, rng), max(config.actions.distances)
+        regions = regions_of(config.region, rng)
+        longest = max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         region, start, self.walks = _draw_initial_conditions(config, self.airspace, rng)
@@ -96,7 +99,8 @@ class Simulation:
 
     def next_episode(self, worlds: PackedState) -> PackedState:
         """Begin a new episode in all of the given worlds."""
-        seed, episode = worlds.integers[:, SEED], worlds.integers[:, EPISODE] + 1
+        seed = worlds.integers[:, SEED]
+        episode = worlds.integers[:, EPISODE] + 1
         condition = counter_rng.bits(seed, episode) % len(self.initial.initial_condition)
         kept = torch.stack([seed, episode, condition], 1)  # the first three columns
         condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
@@ -233,7 +237,8 @@ class Simulation:
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
         """What each UAV reports of each source; some in reach miss it, some out of reach raise an
         alarm."""
-        values, drawn = self.vehicles.values, state.drawn
+        values = self.vehicles.values
+        drawn = state.drawn
         miss, alarm = (values.get(f"source.{name}", drawn) for name in ("miss", "false_alarm"))
         if not (self.unsure or isinstance(miss, Tensor) or isinstance(alarm, Tensor)):
             return in_reach
@@ -248,7 +253,8 @@ class Simulation:
         self, state: State, in_reach: Tensor, now: Tensor
     ) -> tuple[Tensor, Tensor]:
         """When and where each UAV truly was in reach of each source last, if messages tell that."""
-        time, place = state.sent.true_time, state.sent.true_position
+        time = state.sent.true_time
+        place = state.sent.true_position
         if not self.widths.truths:
             return time, place
         here = state.position[..., None, :2]
@@ -272,7 +278,8 @@ class Simulation:
         self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
     ) -> tuple[State, Tensor, Tensor]:
         """Let requests appear, and the UAVs that land serve some, as in ``Messages``."""
-        served, serves = state.sent.served, state.sent.serves
+        served = state.sent.served
+        serves = state.sent.serves
         if not self.widths.requests:
             return state, served, serves
         counters = state.seed, state.episode, state.steps, state.region
@@ -286,7 +293,8 @@ class Simulation:
 
     def _heard(self, state: State, on_ground: Tensor) -> Tensor:
         """The latest request of each slot that each UAV knows, [B, N, M, 3]."""
-        requests, reach = state.requests.unsqueeze(-3), self.config.requests.range
+        requests = state.requests.unsqueeze(-3)
+        reach = self.config.requests.range
         if reach is None:  # everybody knows of all
             return requests.expand(-1, on_ground.shape[-1], -1, -1)
         ways = requests[..., :2] - state.position[..., None, :2]
@@ -312,7 +320,8 @@ class Simulation:
         actions = self.config.actions
         if actions.kind == "discrete":
             length = self.candidates.distance  # if this point is out of reach, the UAV holds
-            length, longest = length.where(length > 0, torch.inf).amin(-1), torch.inf
+            length = length.where(length > 0, torch.inf).amin(-1)
+            longest = torch.inf
         else:  # a landing point is nearest beyond half of the way to it
             length = torch.cat([_nearest_other(points) for points in self.airspace.points])
             longest = 2 * self.candidates.max_distance
@@ -356,13 +365,15 @@ class Simulation:
 
     def _source_now(self, state: State, number: int) -> tuple[Tensor, Tensor, Tensor]:
         """The same of one source, [B, 2] and [B]."""
-        config, seed = self.sources[number], state.seed
+        config = self.sources[number]
+        seed = state.seed
         if number:
             source = torch.full_like(seed, _SOURCE)
             seed = counter_rng.bits64(seed, source, torch.full_like(seed, number))
         emits = torch.ones_like(state.source_over)
         if config.motion == "static":
-            place, over = state.source[:, number], torch.zeros_like(state.source_over)
+            place = state.source[:, number]
+            over = torch.zeros_like(state.source_over)
         else:
             walk = tree_map(
                 lambda t: t.index_select(0, state.initial_condition), self.walks[number]
@@ -433,11 +444,10 @@ def _draw_initial_conditions(
     Returns the index of the region, [Q], the landing point of each UAV within it, [Q, N], and the
     walk of each source over at most S stops, [Q, S].
     """
-    per_region, sources = (
-        config.region.initial_conditions // len(airspace.regions),
-        config.source.all,
-    )
-    walks, starts = [[] for _ in sources], []
+    per_region = config.region.initial_conditions // len(airspace.regions)
+    sources = config.source.all
+    walks = [[] for _ in sources]
+    starts = []
     for index, region in enumerate(airspace.regions):
         for source, drawn in zip(sources, walks, strict=True):
             place = source.position
@@ -456,7 +466,8 @@ def _joined(walks: list[Walk]) -> Walk:
 
 def _pad(walk: Walk, stops: int) -> Walk:
     """Pad walks to the given number of stops; the source never reaches the padded ones."""
-    last, index = walk.arrive.shape[1] - 1, torch.arange(stops)
+    last = walk.arrive.shape[1] - 1
+    index = torch.arange(stops)
     padded = tree_map(lambda field: field[:, index.clamp(max=last)], walk)
     return padded._replace(arrive=padded.arrive.masked_fill(index > last, torch.inf))
 
@@ -466,7 +477,8 @@ def _draw_starts(
 ) -> Tensor:
     """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for
     each."""
-    given, together = config.region.start_positions, config.region.start_together
+    given = config.region.start_positions
+    together = config.region.start_together
     n_points = int(airspace.n_points[region])
     if given is None and together:
         return torch.as_tensor(rng.integers(n_points, size=(n, 1))).repeat(1, config.agents)
@@ -487,7 +499,8 @@ def _draw_starts(
 def _nearest_other(points: Tensor) -> Tensor:
     """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for
     padded ones."""
-    distance, real = torch.full((len(points),), torch.inf), points.isfinite().all(-1)
+    distance = torch.full((len(points),), torch.inf)
+    real = points.isfinite().all(-1)
     places = np.asarray(shapely.points(points[real].double().numpy()))
     options = {"exclusive": True, "return_distance": True, "all_matches": False}
     (index, _), found = map(

@@ -88,11 +88,13 @@ class Truth(NamedTuple):
     def unpack(cls, rows: Tensor, widths: Widths = ONE_SOURCE, n_drawn: int = 0) -> "Truth":
         """The truth in rows [*, 4 N + 3 K + 3 M + D], with K sources and M requests as messages
         have."""
-        k, m = widths.sources, widths.requests
+        k = widths.sources
+        m = widths.requests
         n = (rows.shape[-1] - 3 * k - 3 * m - n_drawn) // 4
         parts = rows.split([3 * n, n, k, 2 * k, 3 * m, n_drawn], -1)
         position, battery, emits, source, requests, drawn = parts
-        place, at = position.unflatten(-1, (n, 3)), source.unflatten(-1, (k, 2))
+        place = position.unflatten(-1, (n, 3))
+        at = source.unflatten(-1, (k, 2))
         return cls(place, battery, emits > 0, at, requests.unflatten(-1, (m, 3)), drawn)
 
 

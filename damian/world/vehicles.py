@@ -46,9 +46,13 @@ class MotionModel(ABC):
     level."""
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
-        self.motion, self.battery, self.dt = config.motion, config.battery, dt
-        self.values, self.is_windy = values_of(config), config.is_windy
-        self.airspace, self.points = airspace, airspace.points.flatten(0, 1)
+        self.motion = config.motion
+        self.battery = config.battery
+        self.dt = dt
+        self.values = values_of(config)
+        self.is_windy = config.is_windy
+        self.airspace = airspace
+        self.points = airspace.points.flatten(0, 1)
         levels = flight_levels(config.motion, config.agents, shared=self.instant)
         if not self.instant:
             check_levels(levels, airspace)
@@ -104,7 +108,8 @@ class MotionModel(ABC):
         """Longest cruise that each battery allows [m], [B, N]; 0: it allows only holding."""
         if not self.battery.enabled:
             return torch.full_like(state.battery, checks.METRES)
-        battery, vertical = battery_of(self.values, state.drawn), self.vertical(state)
+        battery = battery_of(self.values, state.drawn)
+        vertical = self.vertical(state)
         return cruise_range(state.battery - vertical_drain(2 * vertical, battery), battery).clamp(
             min=0
         )
@@ -220,7 +225,8 @@ class PolynomialFlight(MotionModel):
 
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)
-        elapsed, times = state.elapsed.double() * self.dt, (state.vertical, state.cruise)
+        elapsed = state.elapsed.double() * self.dt
+        times = (state.vertical, state.cruise)
         way = self.airspace.way(state.origin, state.goal)
         position, crossed = poses(way, self.levels, elapsed, *times, self.motion.degree)
         state = state._replace(position=position)

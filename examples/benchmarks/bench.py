@@ -45,9 +45,12 @@ from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 
-RIVAL_TASKS, RIVAL_LIMIT = ("discovery", "navigation", "simple_spread"), 100
-JAXMARL, JAXMARL_PYTHON = "JaxMARL simple_spread, one graph", Path("build/jaxmarl-venv/bin/python")
-BARE, WHOLE = "bare", "whole chain"
+RIVAL_TASKS = ("discovery", "navigation", "simple_spread")
+RIVAL_LIMIT = 100
+JAXMARL = "JaxMARL simple_spread, one graph"
+JAXMARL_PYTHON = Path("build/jaxmarl-venv/bin/python")
+BARE = "bare"
+WHOLE = "whole chain"
 NO_BELIEF = "no belief"
 
 TABLE_2 = [
@@ -289,7 +292,8 @@ def graphs_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
     """Call the compiled graph of a step with the same actions again and again, without any
     TensorDict."""
     memories, entries = env._step_inputs(env._fused(), env.rand_action(following))
-    step, worlds = env._compiled_fn("step_and_reset_fn", *entries), env.uav_env.worlds
+    step = env._compiled_fn("step_and_reset_fn", *entries)
+    worlds = env.uav_env.worlds
     with torch.no_grad():
         for _ in range(steps):
             worlds, memories, _, _ = step(worlds, memories, entries)
@@ -444,7 +448,8 @@ def measure(names: Sequence[str]) -> None:
     """Measure the parts of these names, print their tables, and write them to runs/bench.md."""
     torch.set_num_threads(1)
     Path("runs").mkdir(exist_ok=True)
-    presets, sizes = scenarios(), Sizes()
+    presets = scenarios()
+    sizes = Sizes()
     report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
     parts = {
         "rivals": lambda: comparison(presets, sizes),

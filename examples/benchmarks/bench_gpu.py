@@ -38,7 +38,8 @@ MODES = {"CUDA graph": True, "compiled": False}
 RIVALS = {"simple_spread": 1 << 20, "navigation": 1 << 20, "discovery": 1 << 16}
 """Tasks of VMAS, and the most worlds that are measured: with more, discovery takes half a second a
 step."""
-STEPS, REPEATS = 20, 3
+STEPS = 20
+REPEATS = 3
 
 
 def make(kind: str, worlds: int, device: str) -> DelayedEnv:
@@ -54,7 +55,8 @@ def differences(
 ) -> tuple[str, ...]:
     """Share of the numbers that differ from the CPU's, and the largest difference, after the same
     actions."""
-    ours, theirs = make(kind, worlds, "cpu"), make(kind, worlds, device)
+    ours = make(kind, worlds, "cpu")
+    theirs = make(kind, worlds, device)
     if mode != "eager":
         theirs.compile()
     ours.set_seed(0), theirs.set_seed(0)
@@ -65,15 +67,16 @@ def differences(
         lambda td: td.set(("agents", "action"), next(actions).to(device)),
         break_when_any_done=False,
     )
-    n, n_different, largest = 0, 0, 0.0
+    n = 0
+    n_different = 0
+    largest = 0.0
     for key, value in rollout["next"].items(True, True):
-        a, b = value.double(), again["next", key].cpu().double()
+        a = value.double()
+        b = again["next", key].cpu().double()
         apart = (a - b).abs().nan_to_num() / (1 + a.abs().nan_to_num(posinf=0))
-        n, n_different, largest = (
-            n + apart.numel(),
-            n_different + int((apart > 1e-4).sum()),
-            max(largest, float(apart.max())),
-        )
+        n = n + apart.numel()
+        n_different = n_different + int((apart > 1e-4).sum())
+        largest = max(largest, float(apart.max()))
     return f"{kind}, {mode}", f"{n_different / n:.2e}", f"{largest:.1e}"
 
 
@@ -140,7 +143,9 @@ def trained(worlds: int, device: str) -> tuple[str, ...]:
     """A row: iterations of ``damian train`` with the words of the README, compiled."""
     words = ["scenario=delaybench/crowded", "delay.obs=1..7", "aware=timeline", "compile=true"]
     config = composed_config(*words, f"worlds={worlds}", f"device={device}")
-    frames, iterations, begin = worlds * config.update_steps, damian(config), time.perf_counter()
+    frames = worlds * config.update_steps
+    iterations = damian(config)
+    begin = time.perf_counter()
     next(iterations)
     first = f"training, first update {time.perf_counter() - begin:.0f} s"
     return first, f"{worlds:,}", "-", per_second(iterations.__next__, frames, device)
@@ -149,7 +154,8 @@ def trained(worlds: int, device: str) -> tuple[str, ...]:
 def jobs(options: Namespace) -> Iterator[tuple[str, int, Callable[[], tuple[str, ...]]]]:
     """What makes each row, the most important first: its name, its number of worlds, and a
     function."""
-    device, modes = options.device, list(MODES)[options.device == "cpu" :]
+    device = options.device
+    modes = list(MODES)[options.device == "cpu" :]
     kinds: list[Callable[[int, str], dict[str, Callable[[], EnvBase]]]]
     kinds = [
         partial(environments, modes[0]),
@@ -172,7 +178,8 @@ def jobs(options: Namespace) -> Iterator[tuple[str, int, Callable[[], tuple[str,
 
 def measure(options: Namespace) -> Iterator[str]:
     """The tables, one after the other."""
-    device, until = options.device, time.monotonic() + 60 * options.minutes
+    device = options.device
+    until = time.monotonic() + 60 * options.minutes
     name = (
         torch.cuda.get_device_name()
         if device != "cpu"

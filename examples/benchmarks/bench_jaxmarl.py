@@ -20,7 +20,8 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 import jax
 import jaxmarl
 
-STEPS, REPEATS = 50, 7
+STEPS = 50
+REPEATS = 7
 
 
 def milliseconds(worlds: int) -> float:

@@ -63,7 +63,8 @@ def rollout_times(
         repeats: number of measured rollouts.
         groups: numbers of worlds that begin their episodes at the same time.
     """
-    chunks, first = {}, {}
+    chunks = {}
+    first = {}
     for name, env in tqdm(envs.items(), "warming up", leave=False):
         begin = time.perf_counter()
         following = staggered(env, groups)

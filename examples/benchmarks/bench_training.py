@@ -54,11 +54,10 @@ RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
 """Is one value computed for all agents, as with our ``model.shared_value``?"""
 WIDTHS = {"2 x 64": [64, 64], "2 x 256": [256, 256]}
 """Layer widths of all networks, by name."""
-UNDELAYED, AWARE = (
-    "scenario=paper/usecase2",
-    "scenario=paper/usecase2 delay=paper aware=backupdate+history",
-)
-COMPILED, SHARED = "compile=true", "compile=true model.shared_value=true"
+UNDELAYED = "scenario=paper/usecase2"
+AWARE = "scenario=paper/usecase2 delay=paper aware=backupdate+history"
+COMPILED = "compile=true"
+SHARED = "compile=true model.shared_value=true"
 METHODS = (
     UNDELAYED,
     f"{UNDELAYED} {COMPILED}",
@@ -138,7 +137,8 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
 
 def damian_batches(config: TrainConfig) -> Iterator[tuple[Seconds, TensorDictBase]]:
     """Train as ``damian train`` does; yields the times and the steps of each iteration."""
-    env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
+    env = learning_env(config)
+    clock = SystemClock(config.clock, config.update_steps)
     learner = cast(Mappo, make_learner(config, env, replay_buffer(config, env)))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
     batches = ticks(collector, clock, env.server)
@@ -158,7 +158,8 @@ def damian_batches(config: TrainConfig) -> Iterator[tuple[Seconds, TensorDictBas
 
 def products(config: TrainConfig) -> Iterator[Seconds]:
     """Multiply what the layers of an update multiply, forwards and backwards, and nothing else."""
-    env, learner = learning_env(config), cast(MappoConfig, config.learner)
+    env = learning_env(config)
+    learner = cast(MappoConfig, config.learner)
     networks = cast(Mappo, make_learner(config, env, replay_buffer(config, env)))
     n = config.worlds * config.update_steps * config.agents // learner.minibatches
     layers = [
@@ -194,11 +195,11 @@ def mappo_batches(
 ) -> Iterator[tuple[Seconds, TensorDictBase]]:
     """Train with TorchRL's MAPPO, buffer and collector; yields the times and the steps of each
     iteration."""
-    worlds, steps, learner = config.worlds, config.update_steps, cast(MappoConfig, config.learner)
-    network, observed = (
-        agent_network(env, config.agents, config.model.hidden, 1, together),
-        OBSERVED,
-    )
+    worlds = config.worlds
+    steps = config.update_steps
+    learner = cast(MappoConfig, config.learner)
+    network = agent_network(env, config.agents, config.model.hidden, 1, together)
+    observed = OBSERVED
     critic = TensorDictModule(network, in_keys=[observed], out_keys=[("agents", "state_value")])
     loss = MAPPOLoss(
         actor, critic, clip_epsilon=learner.clip_epsilon, entropy_coeff=learner.entropy_coeff
@@ -210,7 +211,8 @@ def mappo_batches(
     loss.make_value_estimator(ValueEstimators.MAGAE, gamma=learner.gamma, lmbda=learner.lmbda)
     optimizer = torch.optim.Adam(loss.parameters(), lr=learner.lr)
     collector = Collector(env, actor, frames_per_batch=worlds * steps, total_frames=-1)
-    storage, size = LazyTensorStorage(worlds * steps), worlds * steps // learner.minibatches
+    storage = LazyTensorStorage(worlds * steps)
+    size = worlds * steps // learner.minibatches
     memory = TensorDictReplayBuffer(
         storage=storage, sampler=SamplerWithoutReplacement(), batch_size=size
     )
@@ -271,10 +273,8 @@ OURS = {"damian train": "compile=false", "damian train, compiled": "compile=true
 def discrete_actor(env: EnvBase, config: TrainConfig) -> ProbabilisticActor:
     """A policy with discrete actions of each agent, from its own observation."""
     n_out = config.actions.n_actions
-    network, logits = (
-        agent_network(env, config.agents, config.model.hidden, n_out, False),
-        ("agents", "logits"),
-    )
+    network = agent_network(env, config.agents, config.model.hidden, n_out, False)
+    logits = ("agents", "logits")
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=[OBSERVED], out_keys=[logits]),
         in_keys={"logits": logits},
@@ -294,7 +294,10 @@ class Meter:
     """
 
     def __init__(self, goal: float, frames: int) -> None:
-        self.goal, self.frames, self.steps, self.begin = goal, frames, 0, time.process_time()
+        self.goal = goal
+        self.frames = frames
+        self.steps = 0
+        self.begin = time.process_time()
 
     def after(self, batch: TensorDictBase) -> tuple[float, int] | None:
         """Processor time and steps if the training has ended with this batch, else None."""
@@ -317,11 +320,13 @@ def to_a_return(goal: float, seeds: int, frames: int) -> str:
     for seed in tqdm(range(seeds), "seeds"):
         for name, words in OURS.items():
             torch.manual_seed(seed)
-            config, meter = composed_config(TASK, words, f"seed={seed}"), Meter(goal, frames)
+            config = composed_config(TASK, words, f"seed={seed}")
+            meter = Meter(goal, frames)
             found[name].append(until(damian_batches(config), meter))
         config = composed_config(TASK, f"seed={seed}")
         torch.manual_seed(seed)
-        meter, env = Meter(goal, frames), learning_env(config)
+        meter = Meter(goal, frames)
+        env = learning_env(config)
         rival = mappo_batches(config, env, discrete_actor(env, config), True)
         found["TorchRL's MAPPO, the same environment"].append(until(rival, meter))
         if importlib.util.find_spec("benchmarl"):

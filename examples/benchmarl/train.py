@@ -86,7 +86,8 @@ def algorithm_config(name: str) -> AlgorithmConfig:
 def experiment_config(args: argparse.Namespace) -> ExperimentConfig:
     """BenchMARL's own settings, but for the size of a short run on one core."""
     config = ExperimentConfig.get_from_yaml()
-    config.max_n_frames, config.save_folder = args.frames, str(args.folder)
+    config.max_n_frames = args.frames
+    config.save_folder = str(args.folder)
     config.prefer_continuous_actions = args.continuous
     config.lr, config.gamma = 1e-3, 0.9  # those of delaybench with DAMIAN's own learners
     config.on_policy_n_envs_per_worker = config.off_policy_n_envs_per_worker = WORLDS
@@ -94,8 +95,10 @@ def experiment_config(args: argparse.Namespace) -> ExperimentConfig:
     config.on_policy_collected_frames_per_batch = config.off_policy_collected_frames_per_batch = (
         batch
     )
-    config.on_policy_n_minibatch_iters, config.on_policy_minibatch_size = 10, 400
-    config.off_policy_n_optimizer_steps, config.off_policy_train_batch_size = 100, 256
+    config.on_policy_n_minibatch_iters = 10
+    config.on_policy_minibatch_size = 400
+    config.off_policy_n_optimizer_steps = 100
+    config.off_policy_train_batch_size = 256
     config.off_policy_memory_size = 200_000
     config.evaluation = config.render = config.create_json = False
     config.loggers = ["csv"]
@@ -129,7 +132,8 @@ def main() -> None:
     args = arguments()
     torch.set_num_threads(1)
     args.folder.mkdir(parents=True, exist_ok=True)
-    model, config = MlpConfig.get_from_yaml(), experiment_config(args)
+    model = MlpConfig.get_from_yaml()
+    config = experiment_config(args)
     model.num_cells = [64, 64]
     try:
         task = make_task(args)

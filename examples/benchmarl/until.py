@@ -41,20 +41,23 @@ def until(
     """Train with the settings of ``config``, which is made of ``words``, until ``after`` ends
     it."""
     ours = cast(mappo.MappoConfig, config.learner)
-    batch, options = config.worlds * config.update_steps, ExperimentConfig.get_from_yaml()
-    options.on_policy_n_envs_per_worker, options.on_policy_collected_frames_per_batch = (
-        config.worlds,
-        batch,
-    )
+    batch = config.worlds * config.update_steps
+    options = ExperimentConfig.get_from_yaml()
+    options.on_policy_n_envs_per_worker = config.worlds
+    options.on_policy_collected_frames_per_batch = batch
     options.on_policy_minibatch_size = batch // ours.minibatches
     options.on_policy_n_minibatch_iters = ours.epochs
-    options.lr, options.gamma, options.clip_grad_val = ours.lr, ours.gamma, ours.max_grad_norm
+    options.lr = ours.lr
+    options.gamma = ours.gamma
+    options.clip_grad_val = ours.max_grad_norm
     options.prefer_continuous_actions = options.evaluation = options.render = (
         options.create_json
     ) = False
     options.loggers = []
-    algorithm, model = MappoConfig.get_from_yaml(), MlpConfig.get_from_yaml()
-    algorithm.entropy_coef, algorithm.clip_epsilon = ours.entropy_coeff, ours.clip_epsilon
+    algorithm = MappoConfig.get_from_yaml()
+    model = MlpConfig.get_from_yaml()
+    algorithm.entropy_coef = ours.entropy_coeff
+    algorithm.clip_epsilon = ours.clip_epsilon
     algorithm.lmbda = ours.lmbda
     model.num_cells = list(config.model.hidden)
     task = UavTask("until", {"overrides": list(words)})

@@ -40,7 +40,8 @@ class DelayedVmasTask(VmasClass):
         checks.one_of("scenario", name.lower(), names)
         task = VmasTask[name.upper()]
         super().__init__(task.name, config or task.get_from_yaml().config)
-        self.delay, self.history = delay, history
+        self.delay = delay
+        self.history = history
 
     def get_env_transforms(self, env: EnvBase) -> list[Transform]:
         action = env.full_action_spec_unbatched[keys.ACTION]

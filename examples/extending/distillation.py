@@ -61,7 +61,8 @@ class Distillation:
     them."""
 
     def __init__(self, env: EnvBase, config: DistillationConfig, setup: LearningSetup) -> None:
-        self.config, self.teacher = config, load_teacher(config.teacher, env)
+        self.config = config
+        self.teacher = load_teacher(config.teacher, env)
         self.actor = config.make_actor(env, setup.model)
         self.optimizer = torch.optim.Adam(self.actor.parameters(), lr=config.lr)
 
@@ -109,10 +110,8 @@ def load_teacher(folder: str, env: EnvBase) -> Any:
         not config.make_delays().obs.late, key, folder, "was trained with delayed messages"
     )
     world = make_env(config, 1, device=env.device)
-    spec, wanted = (
-        env.full_action_spec_unbatched[keys.ACTION],
-        world.full_action_spec_unbatched[keys.ACTION],
-    )
+    spec = env.full_action_spec_unbatched[keys.ACTION]
+    wanted = world.full_action_spec_unbatched[keys.ACTION]
     should = "chooses from other actions, or from continuous ones"
     checks.require(getattr(spec, "n", 0) == getattr(wanted, "n", None), key, folder, should)
     n_seen = world.observation_spec[keys.OBSERVATION].shape[-1]

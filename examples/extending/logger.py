@@ -17,7 +17,10 @@ class Progress:
     """Writes every tenth mean return, as a share of the goal, to ``progress.txt``."""
 
     def __init__(self, folder: Path, *, every: int = 10, goal: float = 1.0) -> None:
-        self.file, self.every, self.goal, self.seen = folder / "progress.txt", every, goal, 0
+        self.file = folder / "progress.txt"
+        self.every = every
+        self.goal = goal
+        self.seen = 0
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
         if name != "train/hindsight_return":

@@ -28,7 +28,8 @@ class WindyFlight(PolynomialFlight):
         options = config.motion.options or {}
         for name in options:
             checks.one_of("motion.options", name, ["wind", "bearing"])
-        speed, bearing = options.get("wind", 3.0), math.radians(options.get("bearing", 270.0))
+        speed = options.get("wind", 3.0)
+        bearing = math.radians(options.get("bearing", 270.0))
         checks.in_range("motion.options.wind", speed, 0.0, 0.9 * config.motion.max_speed, "m/s")
         # The wind blows from its bearing, clockwise from north.
         self.wind = -speed * torch.tensor([math.sin(bearing), math.cos(bearing)])

@@ -67,7 +67,8 @@ class PredictiveMappoConfig(MappoConfig):
 
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
-        model, constant_delay = setup.model, setup.action_delay is not None
+        model = setup.model
+        constant_delay = setup.action_delay is not None
         should = (
             "needs backupdate=true and a message delay (delay.obs): it predicts what arrives late"
         )
@@ -159,7 +160,8 @@ class PredictiveMappo(Mappo):
     def last_steps(self) -> Tensor:
         """The last step of each UAV's action in each stored step, as in ``ends_of_actions``,
         [T, B, N]."""
-        steps, rows = self.storage.steps, self.storage.latest()
+        steps = self.storage.steps
+        rows = self.storage.latest()
         ready, reset = (
             cast(Tensor, steps[key])[rows] for key in (next_key(keys.READY), keys.RESET_AFTER)
         )
@@ -173,12 +175,11 @@ class PredictiveMappo(Mappo):
         these actions had ended, [K, N, G]; and whether the UAV could choose, has completed its
         action, and its last message has arrived by now, [K, N, 1] bool.
         """
-        steps, rows, n_samples = (
-            self.storage.steps,
-            self.storage.latest(),
-            self.config.prediction_batch,
-        )
-        n_rows, device = len(rows), rows.device
+        steps = self.storage.steps
+        rows = self.storage.latest()
+        n_samples = self.config.prediction_batch
+        n_rows = len(rows)
+        device = rows.device
         since = torch.randint(n_rows, (n_samples,), device=device)
         world = torch.randint(self.setup.worlds, (n_samples,), device=device)
         first = n_rows - 1 - since
@@ -233,7 +234,9 @@ class MessageEncoder(nn.Module):
         device: torch.device | None = None,
     ) -> None:
         super().__init__()
-        self.n_message, self.heads, self.width = n_columns - 1, heads, width
+        self.n_message = n_columns - 1
+        self.heads = heads
+        self.width = width
         n_known = n_features + self.n_message
         n_embedded = 2 * self.n_message + FLAGS
         self.embed = nn.Sequential(nn.Linear(n_embedded, width, device=device), nn.ReLU())
@@ -261,7 +264,8 @@ class MessageEncoder(nn.Module):
         history = with_age(
             history if history.dim() > observation.dim() + 1 else history.unsqueeze(-3)
         )
-        message, known = history[..., : self.n_message], history[..., self.n_message]
+        message = history[..., : self.n_message]
+        known = history[..., self.n_message]
         newest = known.argmax(-1, keepdim=True).unsqueeze(-1)  # the first of the known ones
         reference = message.gather(-2, newest.expand(*newest.shape[:-1], self.n_message))
         relative = (message - reference) * known.unsqueeze(-1)
@@ -322,7 +326,8 @@ class BeliefHead(TensorDictModuleBase):
         device: torch.device | None = None,
     ) -> None:
         super().__init__()
-        self.encoder, self.n_actions = encoder, n_actions
+        self.encoder = encoder
+        self.n_actions = n_actions
         self.codes = nn.Parameter(0.5 * torch.randn((n_actions or 0) + 1, n_code, device=device))
         self.predictor = nn.Linear(n_encoding, n_targets, device=device)
         norm = PopArtValueNorm(shape=n_targets, beta=FORGETTING, epsilon=1e-16, device=device)
@@ -335,7 +340,8 @@ class BeliefHead(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if recurrent_mode():
             return tensordict
-        observation, history = tensordict[keys.OBSERVATION], tensordict[keys.TIMELINE]
+        observation = tensordict[keys.OBSERVATION]
+        history = tensordict[keys.TIMELINE]
         codes = self.codes.expand(*observation.shape[:-1], -1, -1)
         encodings = self.encoder(observation, history, codes)
         tensordict.set(ENCODING, encodings[..., 0, :])
@@ -356,7 +362,8 @@ class Preference(nn.Module):
 
     def __init__(self, network: nn.Module, n_targets: int, device: torch.device | None) -> None:
         super().__init__()
-        self.network, self.weight = network, nn.Parameter(torch.zeros(n_targets, device=device))
+        self.network = network
+        self.weight = nn.Parameter(torch.zeros(n_targets, device=device))
 
     def forward(self, observation: Tensor, encoding: Tensor, prediction: Tensor) -> Tensor:
         """Logits [*, A] from observations [*, F], encodings [*, H] and predictions [*, A G]."""
@@ -371,7 +378,8 @@ class NormalPolicy(nn.Module):
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.network, self.normal = network, NormalParamExtractor()
+        self.network = network
+        self.normal = NormalParamExtractor()
 
     def forward(self, observation: Tensor, encoding: Tensor) -> tuple[Tensor, Tensor]:
         """Means and scales from observations [*, F] and encodings [*, H]."""
@@ -382,20 +390,17 @@ def make_belief_actor(
     env: EnvBase, config: ModelConfig, heads: int, width: int
 ) -> ProbabilisticActor:
     """Make the policy from observations and histories to ``("agents", "action")``."""
-    known, device = env.observation_spec.keys(True, True), env.device
+    known = env.observation_spec.keys(True, True)
+    device = env.device
     should = (
         "reads no messages: set delay.messages, or add damian.ObservationTimeline to the "
         "environment"
     )
     checks.require(keys.TIMELINE in known, "learner", "this one", should)
-    observation, history = (
-        env.observation_spec[keys.OBSERVATION],
-        env.observation_spec[keys.TIMELINE],
-    )
-    n_targets, n_encoding = (
-        env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1],
-        config.hidden[-1],
-    )
+    observation = env.observation_spec[keys.OBSERVATION]
+    history = env.observation_spec[keys.TIMELINE]
+    n_targets = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1]
+    n_encoding = config.hidden[-1]
 
     def network(n_out: int, *out_keys: NestedKey) -> TensorDictSequential:
         discrete = len(out_keys) == 1
@@ -421,7 +426,8 @@ def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
     ``ready`` [T, ...] and ``reset`` tell whether the UAV could choose, and the episode was reset,
     after each step; an action is executed ``delay`` steps later.
     """
-    ends, n_steps = next_true(ready | reset), len(ready)
+    ends = next_true(ready | reset)
+    n_steps = len(ready)
     executed = torch.arange(n_steps, device=ready.device) + delay
     ends = ends[executed.clamp(max=n_steps - 1)]
     prevented = next_true(reset.expand_as(ready)) < expand_mask(executed, ready)

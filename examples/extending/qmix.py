@@ -32,7 +32,9 @@ from damian.keys import next_key
 from damian.models.distribution import with_distribution
 from damian.models.mlp import make_mlp
 
-VALUES, CHOSEN, JOINT = (keys.AGENTS, "action_value"), (keys.AGENTS, "chosen_action_value"), "joint"
+VALUES = (keys.AGENTS, "action_value")
+CHOSEN = (keys.AGENTS, "chosen_action_value")
+JOINT = "joint"
 
 
 @dataclass
@@ -83,7 +85,8 @@ class EpsilonGreedy(nn.Module):
 
     def __init__(self, network: nn.Module, epsilon: float) -> None:
         super().__init__()
-        self.network, device = network, next(network.parameters()).device
+        self.network = network
+        device = next(network.parameters()).device
         self.epsilon, self.learnt = (
             nn.Buffer(torch.tensor(n, device=device)) for n in (epsilon, 0)
         )
@@ -101,13 +104,17 @@ class Qmix:
     buffer."""
 
     def __init__(self, env: EnvBase, config: QmixConfig, setup: LearningSetup, buffer: Any) -> None:
-        self.config, self.setup, self.buffer = config, setup, buffer
+        self.config = config
+        self.setup = setup
+        self.buffer = buffer
         self.actor = config.make_actor(env, setup.model)
         self.chooser = self.actor[0].module
         n_agents, n_columns = env.observation_spec[setup.critic_key].shape[-2:]
-        mixer, read = VDNMixer(n_agents, env.device), [CHOSEN]
+        mixer = VDNMixer(n_agents, env.device)
+        read = [CHOSEN]
         if config.mixer == "qmix":
-            mixer, read = QMixer((n_agents * n_columns,), 32, n_agents, env.device), [CHOSEN, JOINT]
+            mixer = QMixer((n_agents * n_columns,), 32, n_agents, env.device)
+            read = [CHOSEN, JOINT]
         values = TensorDictModule(self.chooser.network, [keys.OBSERVATION], [VALUES])
         best = QValueModule("categorical", VALUES, keys.ACTION_MASK, [keys.ACTION, VALUES, CHOSEN])
         team = TensorDictModule(mixer, read, ["chosen_action_value"])
@@ -124,7 +131,8 @@ class Qmix:
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         self.buffer.extend(batch.exclude("collector", keys.LOGITS, keys.ACTION_LOG_PROB))
-        order, loss = self.buffer.storage.latest(), torch.tensor(math.nan)
+        order = self.buffer.storage.latest()
+        loss = torch.tensor(math.nan)
         settled = order[: len(order) - self.setup.longest_delay * self.setup.backupdate]
         for _ in range(self.config.updates if len(settled) else 0):
             world = torch.randint(self.setup.worlds, (self.config.batch_size,))
@@ -136,7 +144,9 @@ class Qmix:
             self.optimizer.step()
             self.targets.step()
         self.chooser.learnt += batch.numel()  # environment steps, over all worlds
-        first, last, annealed = self.config.epsilon, self.config.epsilon_end, self.config.annealed
+        first = self.config.epsilon
+        last = self.config.epsilon_end
+        annealed = self.config.annealed
         share = min(self.chooser.learnt.item() / max(int(annealed * self.setup.frames), 1), 1.0)
         self.chooser.epsilon.fill_(first + (last - first) * share)
         return {"loss": loss.item(), "epsilon": self.chooser.epsilon.item()}
@@ -150,7 +160,8 @@ class Qmix:
             ]  # not after an end that was known only later
         team = steps.select(keys.OBSERVATION, next_key(keys.OBSERVATION), *map(next_key, keys.ENDS))
         for now, found in ((team, steps), (team["next"], steps["next"])):
-            legal, ready = found[keys.ACTION_MASK], found[keys.READY].unsqueeze(-1)
+            legal = found[keys.ACTION_MASK]
+            ready = found[keys.READY].unsqueeze(-1)
             now[keys.ACTION_MASK] = legal.where(
                 ready, torch.arange(legal.shape[-1], device=legal.device) == 0
             )

@@ -35,7 +35,8 @@ def heard(v: FeatureCache) -> Tensor:
     vertex distance of the region; whether it spots the source; the age of the message, over ten
     seconds; and 1.
     """
-    messages, own = v.messages, v.wanted(v.messages.target)
+    messages = v.messages
+    own = v.wanted(v.messages.target)
     landed = gather_rows(v.context.points, v.trail)  # [*, N, window, 2]
     places = torch.cat([messages.target.unsqueeze(-2), landed], -2)
     ways = places.unsqueeze(-4) - own[..., :, None, None, :]
@@ -85,7 +86,8 @@ class Attention(nn.Module):
         """The mean of the encoded rows of a block, weighed by how well they match a query,
         [*, width]."""
         rows = self.rows[i].of(observation).flatten(observation.dim())  # [*, R, K]
-        encoded, query = self.encode[i](rows), self.query[i](rest).unsqueeze(-1)
+        encoded = self.encode[i](rows)
+        query = self.query[i](rest).unsqueeze(-1)
         match = encoded @ query / encoded.shape[-1] ** 0.5  # [*, R, 1]
         exists = (rows != 0).any(-1, keepdim=True)
         weight = match.masked_fill(~exists, -1e4).softmax(-2) * exists

@@ -72,7 +72,9 @@ class SimpleSpread(EnvBase):
         self, worlds: int, agents: int = 3, local_ratio: float = 0.5, registered: bool = False
     ) -> None:
         super().__init__(batch_size=torch.Size([worlds]))
-        self.n_agents, self.local_ratio, self.registered = agents, local_ratio, registered
+        self.n_agents = agents
+        self.local_ratio = local_ratio
+        self.registered = registered
         self.directions = torch.tensor(DIRECTIONS)
         places = torch.arange(agents)
         self.others = places.expand(agents, -1)[places != places.unsqueeze(-1)].view(agents, -1)
@@ -87,7 +89,8 @@ class SimpleSpread(EnvBase):
         self._make_specs(worlds, agents)
 
     def _make_specs(self, worlds: int, n: int) -> None:
-        group, batch = torch.Size([worlds, n]), torch.Size([worlds])
+        group = torch.Size([worlds, n])
+        batch = torch.Size([worlds])
 
         def composite(entries: dict[str, Any], rows: torch.Size = batch) -> Composite:
             return Composite(entries, shape=rows)
@@ -95,7 +98,8 @@ class SimpleSpread(EnvBase):
         def numbers(width: int, rows: torch.Size = group) -> Unbounded:
             return Unbounded(torch.Size((*rows, width)))
 
-        seen, width = self._seen().flatten(1, 2).shape[:2], self._observation().shape[-1]
+        seen = self._seen().flatten(1, 2).shape[:2]
+        width = self._observation().shape[-1]
         outputs = composite(
             {"observation": numbers(width), "kinematics": numbers(4), "position": numbers(2)}, group
         )
@@ -114,7 +118,8 @@ class SimpleSpread(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones_like(self.steps, dtype=torch.bool)
-        new, world = self._drawn(), mask.view(-1, 1, 1)
+        new = self._drawn()
+        world = mask.view(-1, 1, 1)
         self.position = torch.where(world, new[0], self.position)
         self.landmarks = torch.where(world, new[1], self.landmarks)
         self.velocity = self.velocity.masked_fill(world, 0.0)
@@ -171,7 +176,8 @@ class SimpleSpread(EnvBase):
         return torch.cat([known, known.new_zeros(*known.shape[:-1], 2 * (self.n_agents - 1))], -1)
 
     def _outputs(self) -> TensorDictBase:
-        shape, seen = self.agents.shape[:2], self._seen()
+        shape = self.agents.shape[:2]
+        seen = self._seen()
         over = self.steps >= HORIZON
         ends = {
             keys.DONE: over,
@@ -203,7 +209,8 @@ class SimpleTag(SimpleSpread):
     """Radius of a landmark, which nothing passes."""
 
     def _drawn(self) -> tuple[Tensor, ...]:
-        shapes, most = (self.position.shape, self.landmarks.shape), (1.0, 0.9)
+        shapes = (self.position.shape, self.landmarks.shape)
+        most = (1.0, 0.9)
         drawn = (torch.rand(shape, generator=self.generator) for shape in shapes)
         return tuple(size * (2 * new - 1) for new, size in zip(drawn, most, strict=True))
 
@@ -225,7 +232,8 @@ class SimpleTag(SimpleSpread):
         return 10.0 * (way < self.size[0] + self.size[-1]).sum(-1, keepdim=True).expand_as(way)
 
     def _seen(self) -> Tensor:
-        own, prey = self.agents.unsqueeze(2), self.position[:, None, -1:]
+        own = self.agents.unsqueeze(2)
+        prey = self.position[:, None, -1:]
         after = prey + self.velocity[:, None, -1:]
         return torch.cat([super()._seen(), prey - own, after - own], 2)
 
@@ -243,7 +251,8 @@ def contact_forces(position: Tensor, size: Tensor) -> Tensor:
     way = position.unsqueeze(-2) - position.unsqueeze(
         -3
     )  # from the others to each body, [B, M, M, 2]
-    distance, touching = way.norm(dim=-1, keepdim=True), (size.unsqueeze(-1) + size).unsqueeze(-1)
+    distance = way.norm(dim=-1, keepdim=True)
+    touching = (size.unsqueeze(-1) + size).unsqueeze(-1)
     overlap = CONTACT_MARGIN * softplus((touching - distance) / CONTACT_MARGIN)
     return CONTACT_FORCE * (way / distance.clamp(min=1e-12) * overlap).sum(-2)
 
@@ -264,7 +273,9 @@ class Receiver(Transform):
 
     def __init__(self, longest: int, ages: bool, registered: bool) -> None:
         super().__init__()
-        self.longest, self.ages, self.registered = longest, ages, registered
+        self.longest = longest
+        self.ages = ages
+        self.registered = registered
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.update(self._written(next_tensordict))

@@ -190,12 +190,14 @@ def make_learner(env: TransformedEnv, method: Method, longest: int) -> Mappo:
 
 def train(method: Method, seed: int, args: Namespace, bar: tqdm) -> nn.Module:
     """Train for at least ``args.frames`` environment steps; returns the policy."""
-    frames, longest = args.frames, args.delay[1]
+    frames = args.frames
+    longest = args.delay[1]
     env = make_env(
         method, WORLDS, tuple(args.delay) if method.delayed else NONE, longest, args.game
     )
     set_seed(env, seed)
-    learner, done = make_learner(env, method, longest), 0
+    learner = make_learner(env, method, longest)
+    done = 0
     collector = Collector(
         env,
         learner.actor,
@@ -260,7 +262,8 @@ def table(results: Results, args: Namespace) -> str:
             rows.writerows(
                 [method, delay, seed, f"{found:.2f}"] for delay, found in returns.items()
             )
-    trained, flown = named(args.delay), list(next(iter(results.values())))
+    trained = named(args.delay)
+    flown = list(next(iter(results.values())))
 
     def mean(method: str, delay: str) -> float:
         return statistics.mean(results[method, seed][delay] for seed in args.seeds)
@@ -271,7 +274,8 @@ def table(results: Results, args: Namespace) -> str:
         cells = [f"{statistics.mean(x):.1f} ({min(x):.1f}, {max(x):.1f})" for x in found]
         recovered = ""
         if method not in ("undelayed", "random") and "undelayed" in args.methods:
-            base, best = mean("undelayed", trained), mean("undelayed", "0")
+            base = mean("undelayed", trained)
+            best = mean("undelayed", "0")
             recovered = f"{(mean(method, trained) - base) / (best - base):.2f}"
         lines.append([method, *cells, recovered])
     if args.game == "spread":

@@ -55,8 +55,10 @@ def delay_trajectories(
                 "but stored steps show what followed: use it where the steps are collected"
             )
     playback = _Playback(data, _read_action_specs(data, leaves, action_spec))
-    env, starts = TransformedEnv(playback, transform.clone()), _find_starts(data)
-    now, steps = env.reset(), []
+    env = TransformedEnv(playback, transform.clone())
+    starts = _find_starts(data)
+    now = env.reset()
+    steps = []
     for time, any_starts in enumerate(starts.reshape(-1, starts.shape[-1]).any(0).tolist()):
         if time and any_starts:
             now = env.reset(now.set("_reset", starts[..., time].unsqueeze(-1)))
@@ -73,8 +75,10 @@ class _Playback(EnvBase):
 
     def __init__(self, data: TensorDictBase, action_spec: Composite) -> None:
         super().__init__(device=data.device, batch_size=data.batch_size[:-1])
-        self._steps, self._time = data.unbind(-1), 0
-        first, after = self._steps[0], self._steps[0]["next"]
+        self._steps = data.unbind(-1)
+        self._time = 0
+        first = self._steps[0]
+        after = self._steps[0]["next"]
         self._outputs = _output_keys(first)
         ends = [key for key in _leaves(after) if last_part(key) in ENDS]
         self._inputs = [
@@ -107,12 +111,14 @@ class _Playback(EnvBase):
 
 def _find_starts(data: TensorDictBase) -> Tensor:
     """Mask of the first steps of episodes, [*, T] bool."""
-    before, after = cast(TensorDictBase, data[..., :-1]), cast(TensorDictBase, data[..., 1:])
+    before = cast(TensorDictBase, data[..., :-1])
+    after = cast(TensorDictBase, data[..., 1:])
     starts = _any(before, before.get(("next", "done")))
     if _TRAJECTORY in _leaves(data):
         starts = starts | _any(after, after.get(_TRAJECTORY) != before.get(_TRAJECTORY))
     for key in _output_keys(data):
-        new, expected = after.get(key), before.get("next").get(key)
+        new = after.get(key)
+        expected = before.get("next").get(key)
         starts = starts | _any(after, ~torch.isclose(new, expected, rtol=0, atol=0, equal_nan=True))
     first = torch.ones(*data.batch_size[:-1], 1, dtype=torch.bool, device=starts.device)
     return torch.cat([first, starts], -1)
@@ -140,7 +146,8 @@ def _read_action_specs(
 ) -> Composite:
     """Specs of the actions of one step of the data, from those of an environment of any number of
     worlds."""
-    step, n_batch = data.exclude("next").unbind(-1)[0], data.dim() - 1
+    step = data.exclude("next").unbind(-1)[0]
+    n_batch = data.dim() - 1
     keys = [
         transform.action_key for transform in transforms if isinstance(transform, ActionTransform)
     ]

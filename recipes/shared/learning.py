@@ -76,7 +76,8 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
 def require_delayed_talk(config: TrainConfig, env: DelayedEnv, learner: Learner) -> None:
     """Refuse an actor by which UAVs read at once in each other's rows what these know late or
     never."""
-    own, links = config.observation.own and env.delays.obs.late, config.links.kind
+    own = config.observation.own and env.delays.obs.late
+    links = config.links.kind
     if config.learner.talks or not (own or links != "server"):
         return
     known = "observation.own=true" if own else f"links={links}"

@@ -99,7 +99,8 @@ class Run:
         torch.set_num_threads(1)
         keep_freed_memory()
         seed_generators(self.config.seed)
-        config, folder = self.config, self.folder
+        config = self.config
+        folder = self.folder
         if config.region.zones and config.motion.kind == "instant":
             print(f"note: {CROSSES_ZONES}")
         with locked(folder, key):
@@ -118,7 +119,8 @@ class Run:
 def start(work: Work, given: DictConfig, program: str = "train") -> None:
     """Do the work of a program with what Hydra has composed, in the folder that Hydra has made."""
     running = HydraConfig.get()
-    folder, words = short(Path(running.runtime.output_dir)), [*running.overrides.task]
+    folder = short(Path(running.runtime.output_dir))
+    words = [*running.overrides.task]
     of_sweep = running.mode is RunMode.MULTIRUN
     if of_sweep:
         not_linked(folder, below=short(Path(running.sweep.dir).absolute()))
@@ -263,10 +265,8 @@ COMMON = {each.name for each in fields(TrainConfig)}
 
 def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> TrainConfig:
     """The settings of a run to resume; only ``frames`` and ``episodes`` may change."""
-    allowed, stored = (
-        ("resume", "frames", "episodes", "trust"),
-        read_record(folder).get(OVERRIDES) or (),
-    )
+    allowed = ("resume", "frames", "episodes", "trust")
+    stored = read_record(folder).get(OVERRIDES) or ()
     if refused := [word for word in words if key_of(word) not in allowed and word not in stored]:
         problem = (
             "a resumed run keeps its configuration; only frames= and episodes= may change; "
@@ -308,7 +308,8 @@ def reach(key: str, program: str) -> set[str]:
 
     A scenario says nothing of the networks: they are those of the policy.
     """
-    known, found = known_settings(program), {key} & known_settings(program).keys()
+    known = known_settings(program)
+    found = {key} & known_settings(program).keys()
     for written, chosen in options_in(key):
         found |= {
             each for each, setting in known.items() if not setting.is_section and has(written, each)
@@ -321,10 +322,12 @@ def reach(key: str, program: str) -> set[str]:
 
 def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
     """Check that a policy has the same observations, actions and layers in another scenario."""
-    new, old = _shape(config), _shape(stored)
+    new = _shape(config)
+    old = _shape(stored)
     for key, value in new.items():
         if value != old[key]:
-            trained, asked = show(old[key]), show(value)
+            trained = show(old[key])
+            asked = show(value)
             raise InputError(
                 f"{key}: the policy was trained with {trained}, so it cannot fly with {asked}"
             )
@@ -332,14 +335,17 @@ def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
 
 def any_number_of_uavs(config: TrainConfig) -> bool:
     """Do the layers of a policy's networks have the same sizes for any number of UAVs?"""
-    observation, both = config.observation, config.learner.actor_follows_critic
+    observation = config.observation
+    both = config.learner.actor_follows_critic
     same = "agent_distances" not in (observation.critic if both else observation.actor)
     return same and config.model.shared
 
 
 def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
-    observation, learner, settings = config.observation, config.learner, dict(leaves(config))
+    observation = config.observation
+    learner = config.learner
+    settings = dict(leaves(config))
     own_actor = type(learner).make_actor is not LearnerConfig.make_actor
     sees_all = learner.actor_follows_critic or not observation.ctde
     discrete = config.actions.kind == "discrete"

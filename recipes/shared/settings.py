@@ -73,7 +73,8 @@ def check_learning(config: TrainConfig) -> None:
     delays = check_components(config)
     config.learner.check(learning_setup(config, delays))
     _check_backupdate(config, delays.obs.late)
-    messages, name = config.delay.messages, config.learner.name
+    messages = config.delay.messages
+    name = config.learner.name
     problem = f"is not read by learner={name}, whose reads have no timeline: leave it out"
     checks.require(
         not messages or "timeline" in config.learner.reads, "delay.messages", messages, problem

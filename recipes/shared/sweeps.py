@@ -40,7 +40,8 @@ from .runs import JOB, OVERRIDES, SEED, Run, errors_kept_in
 
 LOG = "log.txt"
 """Output of a run of a comparison."""
-ROWS, POINTS = "results.csv", "curves.csv"
+ROWS = "results.csv"
+POINTS = "curves.csv"
 MARKDOWN, FIGURE = "table.md", "figure.png"
 """What follows from the rows."""
 
@@ -142,7 +143,8 @@ def report(folder: Path) -> str:
         [str(run.relative_to(folder)), json.loads(read_text(run / FAILED))["error"]]
         for run in failed
     ]
-    parts, rows = [], pd.DataFrame(errors, columns=["folder", "error"])
+    parts = []
+    rows = pd.DataFrame(errors, columns=["folder", "error"])
     if any(folder.rglob(RESULTS)) or not failed:
         groups, finished = sweep_rows(folder)
         lines = means(finished, groups)
@@ -204,7 +206,8 @@ def names_of(run: Run) -> dict[str, Any]:
 
 
 def _of_run(run: Run, methods: Mapping[str, Method]) -> Results:
-    names, metrics = names_of(run), read_metrics(run.folder)
+    names = names_of(run)
+    metrics = read_metrics(run.folder)
     of_run = {
         "regime": regime(methods, names["method"]),
         "frames": metrics["frames"].max() if len(metrics) else 0.0,

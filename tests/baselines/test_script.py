@@ -59,7 +59,8 @@ def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
     if worlds.scenario.actions.kind == "discrete":
         distance, heading = action_table(worlds.scenario.actions)[action].unbind(-1)
     else:
-        distance, heading = action[:, 0] * 300.0, action[:, 1] * 2 * torch.pi
+        distance = action[:, 0] * 300.0
+        heading = action[:, 1] * 2 * torch.pi
     target = sent_messages(td).position[0] + displacement(distance, heading)
     points = worlds.simulation.airspace.points[0]
     return points[torch.cdist(target, points).argmin(-1)]
@@ -113,9 +114,11 @@ def test_without_a_reward_for_the_source_no_uav_flies_to_it(sections, seeks):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
     env = field(source=walking(emission="per_step", emission_probability=0.7))
-    policy, radius = Seeker(env.uav_env), env.uav_env.simulation.radius
+    policy = Seeker(env.uav_env)
+    radius = env.uav_env.simulation.radius
     torch.manual_seed(seed)
-    places, times = 400 * torch.rand(2, 2, 3, 2), 8.0 + torch.randint(2, (2, 3))
+    places = 400 * torch.rand(2, 2, 3, 2)
+    times = 8.0 + torch.randint(2, (2, 3))
     detected = torch.minimum(torch.tensor([-1.0, 0.0, 5.0, 9.0])[torch.randint(4, (2, 3))], times)
     held = sent_messages(env.reset())._replace(
         time=times, position=places[0], spotted=detected == times
@@ -166,14 +169,17 @@ def test_uavs_choose_one_after_the_other_where_their_footprints_hold_most_new_gr
         delay=DelayConfig(obs=obs),
     )
     env = make_env(scenario, 8, extras=["message"])
-    policy, radius = Coverer(env.uav_env), env.uav_env.simulation.radius
+    policy = Coverer(env.uav_env)
+    radius = env.uav_env.simulation.radius
     td = env.rollout(6, random_policy(env))["next"][:, -1]
-    sent, legal = sent_messages(td), td["agents", "action_mask"]
+    sent = sent_messages(td)
+    legal = td["agents", "action_mask"]
     held = env.uav_env.server.messages(td[keys.RECEIVED]) if obs else sent
     chosen = script_policy(env)(td)["agents", "action"]
     for world in range(8):
         region = int(held.trail[world, 0, 0]) // policy.points.shape[1]
-        points, claimed = policy.points[region], []
+        points = policy.points[region]
+        claimed = []
         for uav in range(3):
             for known in (sent, held):
                 latest = [points[p] for p in known.trail[world, uav, :-1] % len(points)]
@@ -240,7 +246,8 @@ def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_othe
 
 def test_the_policy_reads_received_messages_and_not_sent_ones():
     env = field(delay=DelayConfig(obs=3))
-    td, policy = detection(env, [200.0, 200.0]), script_policy(env)
+    td = detection(env, [200.0, 200.0])
+    policy = script_policy(env)
     without_detection = policy(env.reset())["agents", "action"]
     assert torch.equal(policy(td.clone())["agents", "action"], without_detection)
     td["agents", "received"] = td["agents", "message"]

@@ -37,7 +37,8 @@ def believing(own: bool = False, **changed) -> DelayedEnv:
 @pytest.mark.parametrize("own", [False, True])
 def test_all_uavs_fly_to_where_they_detect_the_source(own):
     env = believing(own=own)
-    td, centres = env.reset(), env.server.grid.centres
+    td = env.reset()
+    centres = env.server.grid.centres
     cell = (
         (centres - torch.tensor([50.0, 50.0])).norm(dim=-1).argmin()
     )  # the source certainly is there

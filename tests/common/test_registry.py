@@ -43,7 +43,8 @@ def test_your_own_component_is_found_by_its_path_in_the_current_folder(tmp_path,
 
 def test_a_module_that_was_loaded_again_gives_its_new_component(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    registry, file = greetings(), tmp_path / "changing_words.py"
+    registry = greetings()
+    file = tmp_path / "changing_words.py"
     for word in ("good day", "good night"):
         file.write_text(f"def formal():\n    return '{word}'.lower()  # {'longer' * len(word)}\n")
         importlib.reload(importlib.import_module("changing_words"))

@@ -34,7 +34,9 @@ def test_all_methods_share_their_resamples():
 
 def exact_interval(values: list[float], weights: list[float]) -> tuple[float, float]:
     """The 95 % percentile interval of a discrete distribution with these values and weights."""
-    total, low, high = 0.0, math.nan, math.nan
+    total = 0.0
+    low = math.nan
+    high = math.nan
     for value, weight in sorted(zip(values, weights, strict=True)):
         total += weight
         low = value if math.isnan(low) and total >= 0.025 else low

@@ -7,9 +7,11 @@ import pytest
 
 from damian.delays.clocks import are_right, in_order, note_on
 
-N, START = 400, 1.77e9
+N = 400
+START = 1.77e9
 TIMES = START + np.arange(N)
-HALF, LATER = np.arange(N) < N // 2, np.arange(N) >= N // 2
+HALF = np.arange(N) < N // 2
+LATER = np.arange(N) >= N // 2
 LEVEL = np.full(N, 0.4)
 UNIFORM = np.random.default_rng(0).uniform(0, 4, N)
 HELD = np.where(np.arange(N) % 100 < 30, 6.0, 0.4)

@@ -90,7 +90,8 @@ BURST = Burst(enter=0.05, leave=0.2, good=0, bad=5, bad_loss=0.0)
 
 def test_a_channel_changes_state_with_its_probabilities_so_that_a_burst_lasts_1_over_leave_steps():
     bad = sample(BURST.sampler()) == 5
-    before, after = bad[:-1], bad[1:]
+    before = bad[:-1]
+    after = bad[1:]
     for changed, chance in ((after[~before], 0.05), (~after[before], 0.2)):
         found, n = share(changed)
         assert within(found, chance, math.sqrt(chance * (1 - chance) / n))
@@ -101,7 +102,8 @@ def test_a_channel_changes_state_with_its_probabilities_so_that_a_burst_lasts_1_
 
 def test_losses_of_the_channel_state_and_general_losses_combine():
     law = Burst(enter=0.5, leave=0.5, good=1, bad=PAPER, good_loss=0.1, bad_loss=0.5)
-    sampler, kept = law.sampler(loss=0.2), 0.5 * 0.8
+    sampler = law.sampler(loss=0.2)
+    kept = 0.5 * 0.8
     chances = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys(
         (4, 5, 6, 7), 0.0375 * 0.5 * kept
     )

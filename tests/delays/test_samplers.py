@@ -41,7 +41,8 @@ class Doubling(Sampler):
 
 def test_links_keep_the_states_of_all_samplers_floats_or_not():
     samplers = [Doubling(), Recorded([3, 1, 0, 2]), Lag(Uniform(0, 3), "episode").sampler()]
-    index, streams = torch.tensor([0, 1, 2, 0]), counter_rng.world_seeds(5, 4 * 30)
+    index = torch.tensor([0, 1, 2, 0])
+    streams = counter_rng.world_seeds(5, 4 * 30)
     found = drawn(LinkSampler(samplers, index, torch.zeros(4)), streams, 9)
     for k, sampler in enumerate(samplers):
         link = index.repeat(30) == k
@@ -91,7 +92,8 @@ def at_distance(
     law: Distance, distance: float, loss: float = 0.0, dt: float = 1.0, **entries
 ) -> Tensor:
     """Delays of messages sent at this distance east of the origin [M], -1 for a lost one."""
-    streams, clock = counter_rng.world_seeds(3, SENDERS), torch.tensor(1)
+    streams = counter_rng.world_seeds(3, SENDERS)
+    clock = torch.tensor(1)
     place = torch.tensor([[distance, 0.0]]).expand(SENDERS, 2)
     context = context_of(counter_rng.uniform(streams, clock), dt, position=place, **entries)
     sampler = law.sampler(dt, loss)

@@ -85,7 +85,8 @@ CHANGES = {
 @pytest.mark.parametrize("make", [make_env, UavEnv])
 def test_an_environment_keeps_the_settings_with_which_it_was_made(make, change):
     scenario = square(delay=DelayConfig(obs=TableSampler([[0.0, 1.0]])))
-    changed, untouched = make(scenario, 2, 1), make(deepcopy(scenario), 2, 1)
+    changed = make(scenario, 2, 1)
+    untouched = make(deepcopy(scenario), 2, 1)
     CHANGES[change](scenario)
     actions = choices(untouched, 8)
     assert all_same(play(changed, actions), play(untouched, actions))
@@ -97,5 +98,6 @@ def test_a_learner_keeps_the_settings_with_which_it_was_made():
     config = TrainConfig(**vars(square()), learner=MappoConfig(steps=5), worlds=2)
     env = learning_env(config)
     learner = make_learner(config, env, None)
-    config.learner.epochs, config.model.hidden = 40, []
+    config.learner.epochs = 40
+    config.model.hidden = []
     assert (learner.config.epochs, learner.setup.model.hidden) == (4, [256, 256])

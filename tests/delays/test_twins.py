@@ -63,13 +63,16 @@ class LagSender:
     """Delays of one sender's messages by a law ``Lag``."""
 
     def __init__(self, lag: Lag, stream: int, loss: float) -> None:
-        self.stream, self.lag, self.loss = torch.tensor(stream), lag, loss
+        self.stream = torch.tensor(stream)
+        self.lag = lag
+        self.loss = loss
         self.period = {"episode": math.inf, "8s": 4}.get(str(lag.update_period), lag.update_period)
         self.begin()
 
     def begin(self) -> None:
         """Begin an episode."""
-        self.held, self.update_at = None, 0
+        self.held = None
+        self.update_at = 0
 
     def bits(self, *counters: int) -> int:
         return int(counter_rng.bits(self.stream, *map(torch.tensor, counters)))
@@ -97,7 +100,10 @@ class CrowdSender(LagSender):
     steps."""
 
     def __init__(self, agent: int, stream: int, loss: float = 0.0, first: int = 1) -> None:
-        self.agent, self.stream, self.loss, self.first = agent, torch.tensor(stream), loss, first
+        self.agent = agent
+        self.stream = torch.tensor(stream)
+        self.loss = loss
+        self.first = first
         self.begin()
 
     def begin(self) -> None:
@@ -113,14 +119,17 @@ class RouteSender(LagSender):
     """Delays of one sender's messages by the law ``Route`` of docs/extending.md."""
 
     def __init__(self, law: Any, stream: int, loss: float) -> None:
-        self.law, self.stream, self.loss = law, torch.tensor(stream), loss
+        self.law = law
+        self.stream = torch.tensor(stream)
+        self.loss = loss
         self.delay = self.bits() % (law.longest + 1)
 
     def begin(self) -> None:
         """The walk goes on."""
 
     def send(self, now: int, value: float, n_sending: int) -> int | None:
-        draw, half = self.share(now), self.law.change / 2
+        draw = self.share(now)
+        half = self.law.change / 2
         self.delay = min(max(self.delay + (draw < half) - (draw >= 1 - half), 0), self.law.longest)
         return None if self.share(now, 0) < self.loss else self.delay
 
@@ -140,7 +149,8 @@ class TableSender(LagSender):
 
 def senders(transform: Any, law: Any, loss: float = 0.0, first: int = 1) -> list[LagSender]:
     """A sender for each row, with the random stream of the transform."""
-    streams, sampler = transform.memory["streams"], transform.sampler
+    streams = transform.memory["streams"]
+    sampler = transform.sampler
     own = {Lag: LagSender, Route: RouteSender, Crowd: CrowdSender}.get(type(law))
     if own is None:
         return [TableSender(d, sampler.lost) for d in drawn(sampler, streams, STEPS).T.tolist()]
@@ -167,22 +177,22 @@ def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sen
         law, [OBSERVATION], [("agents", "seen")], **further, **options(law)
     )
     outputs = play(delayed(transform), choices())
-    observed, message_sent = (
-        column(outputs, *OBSERVATION),
-        column(outputs, "agents", "message_sent"),
-    )
+    observed = column(outputs, *OBSERVATION)
+    message_sent = column(outputs, "agents", "message_sent")
     found = {key: column(outputs, "agents", key) for key in ("seen", "age", "delay")}
     done = column(outputs, "done")
     for sender, (w, n) in zip(senders(transform, law, loss), ROWS, strict=True):
         receiver = Receiver(order)
         receiver.begin(0, observed[0][w][n])
         for now in range(1, STEPS + 1):
-            at, reset = 2 * now - 1, 2 * now
+            at = 2 * now - 1
+            reset = 2 * now
             n_sending = sum(message_sent[at][w]) if sent_key else N_AGENTS
             delay = sender.send(now, observed[at][w][n][4], n_sending)
             delay = delay if sent_key is None or message_sent[at][w][n] else None
             receiver.step(now, observed[at][w][n], delay)
-            held, told = receiver.holds, -1 if delay is None else delay
+            held = receiver.holds
+            told = -1 if delay is None else delay
             assert [found[key][at][w][n] for key in found] == [
                 held.content,
                 [now - held.sent],
@@ -200,12 +210,15 @@ def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sen
 
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
 def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key):
-    chosen, default = choices(), 5
+    chosen = choices()
+    default = 5
     further = {"sent_key": sent_key, "valid_key": "action_valid", "default": default, "loss": loss}
     transform = ActionDelay(law, ACTION, **further, **options(law))
     outputs = play(delayed(transform), chosen)
-    seen, ready = before(outputs, *OBSERVATION), before(outputs, "agents", "ready")
-    observed, done = after(outputs, *OBSERVATION), after(outputs, "done")
+    seen = before(outputs, *OBSERVATION)
+    ready = before(outputs, "agents", "ready")
+    observed = after(outputs, *OBSERVATION)
+    done = after(outputs, "done")
     for sender, (w, n) in zip(senders(transform, law, loss, first=0), ROWS, strict=True):
         receiver = Receiver("generation")
         receiver.begin(0, default)
@@ -227,21 +240,21 @@ def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
         law, REWARD, delay_key="reward_delay", earned_key="earned", **options(law)
     )
     outputs = play(delayed(transform), choices())
-    seen, received, done = (
-        after(outputs, *OBSERVATION),
-        after(outputs, *REWARD),
-        after(outputs, "done"),
-    )
+    seen = after(outputs, *OBSERVATION)
+    received = after(outputs, *REWARD)
+    done = after(outputs, "done")
     reported, known = (after(outputs, "agents", name) for name in ("reward_delay", "earned"))
     assert known == earned
     assert received == after(
         play(delayed(RewardDelay(law, REWARD, **options(law))), choices()), *REWARD
     )
     for sender, (w, n) in zip(senders(transform, law), ROWS, strict=True):
-        purse, in_transit = Purse(), 0.0
+        purse = Purse()
+        in_transit = 0.0
         for t in range(STEPS):
             delay = sender.send(t + 1, seen[t][w][n][4], N_AGENTS) or 0
-            reward, ended = earned[t][w][n][0], done[t][w][0]
+            reward = earned[t][w][n][0]
+            ended = done[t][w][0]
             assert reported[t][w][n] == [delay]
             assert received[t][w][n][0] == purse.step(t, reward, delay, ended)
             in_transit += reward - received[t][w][n][0]
@@ -252,13 +265,16 @@ def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
 
 def test_in_a_scenario_a_law_reads_the_true_position_at_the_instant_of_sending():
     env = make_env(everything("polynomial", delay=DelayConfig(obs=Crowd())), 4, extras=["message"])
-    td, numbers = env.reset(), set()
+    td = env.reset()
+    numbers = set()
     stream = next(stream for name, stream in env.state_dict().items() if name.endswith("streams"))
     people = [CrowdSender(row % 3, each) for row, each in enumerate(stream.tolist())]
     for now, action in enumerate(uav_choices(env, 25), 1):
         stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
-        found, truth = stepped["next"], stepped["next", "agents", "position"]
-        ended, state = found["done"].view(-1), env.uav_env.state
+        found = stepped["next"]
+        truth = stepped["next", "agents", "position"]
+        ended = found["done"].view(-1)
+        state = env.uav_env.state
         place = state.position[..., :2] + env.uav_env.simulation.airspace.offset[
             state.region
         ].unsqueeze(1)

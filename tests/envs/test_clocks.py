@@ -18,7 +18,8 @@ from damian.recipes.shared.learning import learning_env, spotting, ticks
 from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
 
-SPOTTED, NOT_SPOTTED = torch.tensor([[False, True]]), torch.tensor([[False, False]])
+SPOTTED = torch.tensor([[False, True]])
+NOT_SPOTTED = torch.tensor([[False, False]])
 WORLDS = 4
 
 
@@ -95,11 +96,13 @@ def config(clock: ClockConfig, level_db: float) -> TrainConfig:
 def batches(config: TrainConfig, n_steps: int, period: int) -> list[tuple[int, TensorDictBase]]:
     """Batches of ``n_steps`` steps or more in all, each with the system clock's period at that
     time."""
-    env, clock = learning_env(config), SystemClock(config.clock, period)
+    env = learning_env(config)
+    clock = SystemClock(config.clock, period)
     frames = WORLDS * clock.unit
     collector = Collector(env, random_policy(env), frames_per_batch=frames, total_frames=-1)
     torch.manual_seed(3)
-    collected, current = [], clock.period
+    collected = []
+    current = clock.period
     for batch in ticks(collector, clock, env.server):
         collected.append((current, batch))
         current = clock.period
@@ -118,7 +121,8 @@ CLOCKS = {
 @pytest.mark.parametrize("kind", CLOCKS)
 def test_a_batch_has_one_period_of_steps_and_no_step_is_lost_or_doubled(kind):
     setting = config(CLOCKS[kind], level_db=138.0)
-    collected, server = batches(setting, 80, 5), learning_env(setting).server
+    collected = batches(setting, 80, 5)
+    server = learning_env(setting).server
     assert [batch.shape for _, batch in collected] == [(WORLDS, period) for period, _ in collected]
     changes = {b - a for (a, _), (b, _) in itertools.pairwise(collected)}
     assert (changes == {0}) if kind == "fixed" else (min(changes) < 0 < max(changes))

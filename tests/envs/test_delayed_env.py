@@ -55,10 +55,8 @@ def all_transforms(scenario: ScenarioConfig, n_worlds: int) -> DelayedEnv:
 def check_equals_undelayed(env: EnvBase, scenario: ScenarioConfig, n_steps: int = 25) -> None:
     """Everything that the environment without transforms outputs is output, bit for bit."""
     undelayed = UavEnv(scenario, env.batch_size[0])
-    expected, outputs = (
-        play(undelayed, choices(undelayed, n_steps)),
-        play(env, choices(undelayed, n_steps)),
-    )
+    expected = play(undelayed, choices(undelayed, n_steps))
+    outputs = play(env, choices(undelayed, n_steps))
     assert all_same(
         [td.select(*expected[1].keys(True, True), strict=False) for td in outputs], expected
     )
@@ -104,7 +102,9 @@ class FalsifyMessage(Transform):
 
     def __init__(self, world: int, agent: int, step: int) -> None:
         super().__init__()
-        self.sender, self.step_to_change, self.steps = (world, agent), step, 0
+        self.sender = (world, agent)
+        self.step_to_change = step
+        self.steps = 0
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self.steps += 1
@@ -158,7 +158,8 @@ def test_a_message_has_no_effect_before_it_arrives(obs, order):
 @every_delay
 @both_motions
 def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
-    scenario, seeds = everything(motion, **DELAYS[delays]), torch.tensor([11, 5])
+    scenario = everything(motion, **DELAYS[delays])
+    seeds = torch.tensor([11, 5])
     env = delayed(scenario, 2)
     env.seed_worlds(seeds)
     actions = choices(env, 15)
@@ -180,7 +181,8 @@ def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
     scenario = everything(motion, **DELAYS[delays] | {"episode": KEEPS_GOING})
 
     def rollout(mask: Sequence[bool]) -> list[TensorDictBase]:
-        env, outputs = delayed(scenario), []
+        env = delayed(scenario)
+        outputs = []
         td = env.reset()
         for t, action in enumerate(choices(env, 12)):
             stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
@@ -190,11 +192,9 @@ def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
             outputs += [stepped["next"].clone(), td.clone()]
         return outputs
 
-    some, every, none = (
-        rollout([True, False, False, True]),
-        rollout([True] * 4),
-        rollout([False] * 4),
-    )
+    some = rollout([True, False, False, True])
+    every = rollout([True] * 4)
+    none = rollout([False] * 4)
     for worlds, expected in (([1, 2], none), ([0, 3], every)):
         for w in worlds:
             assert all_same([td[w] for td in some], [td[w] for td in expected])
@@ -253,7 +253,8 @@ def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None
     one_by_one.append_transform(StepCounter())
     env.append_transform(EpisodeTotals())  # both in one
     actions = choices(one_by_one, 18)
-    expected, found = steps_of(one_by_one, actions), steps_of(env, actions)
+    expected = steps_of(one_by_one, actions)
+    found = steps_of(env, actions)
     assert any(td["next", "done"].any() and not td["next", "done"].all() for td in expected[::2])
     assert all_same(expected, found)
 
@@ -261,7 +262,8 @@ def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None
 def steps_of(env: EnvBase, actions: list[torch.Tensor]) -> list[TensorDictBase]:
     """What each step returns, and that with which the next one begins, without what a policy has
     written."""
-    following, shown = env.reset(), []
+    following = env.reset()
+    shown = []
     for t, action in enumerate(actions):
         if t == 3:  # from here on the episode of one world ends at another time than the others
             following = env.reset(following.set("_reset", torch.arange(4).view(4, 1) == 1)).exclude(

@@ -81,7 +81,8 @@ class Watched(TorchDispatchMode):
         raise NotImplementedError
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name, kwargs = func.overloadpacket.__name__, kwargs or {}
+        name = func.overloadpacket.__name__
+        kwargs = kwargs or {}
         if func.namespace == "damian":
             with self:
                 return OPDEFS[f"damian::{name}"]._init_fn(*args, **kwargs)
@@ -138,7 +139,8 @@ def inputs(scenario: ScenarioConfig) -> Inputs:
     shown = play(env, choices(env, 3))
     stateful, others = env._split_transforms()
     assert not others
-    memories, entries = [], {("agents", "action"): choices(env, 1)[0]}
+    memories = []
+    entries = {("agents", "action"): choices(env, 1)[0]}
     for transform in stateful:
         memories.append(transform.memory)
         entries |= {key: shown[-1][key] for key in transform.action_keys if key not in entries}
@@ -178,14 +180,16 @@ def test_no_step_and_no_reset_waits_for_the_device(scenario, no_data):
 @every_scenario
 def test_a_step_and_a_reset_touch_no_tensor_of_another_device(scenario, no_data):
     env, worlds, memories, entries, mask = inputs(scenario)
-    uav_env, meta = env.uav_env, torch.device("meta")
+    uav_env = env.uav_env
+    meta = torch.device("meta")
     uav_env.simulation.to(meta)
     uav_env.server.to(meta)
     uav_env._reset_outputs = {key: table.to(meta) for key, table in uav_env._reset_outputs.items()}
     for module in env.transform.modules():
         if isinstance(module, StatefulTransform):
             module.to(meta)
-    worlds, mask = tree_map(lambda table: table.to(meta), worlds), mask.to(meta)
+    worlds = tree_map(lambda table: table.to(meta), worlds)
+    mask = mask.to(meta)
     moved = [
         {name: value.to(meta) for name, value in each.items()} for each in [*memories, entries]
     ]
@@ -198,7 +202,8 @@ def test_steps_replayed_as_a_graph_equal_steps(name, no_data, monkeypatch):
     monkeypatch.setattr(compiling, "compiled", lambda function, **options: function)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Recording)
     monkeypatch.setattr(torch.cuda, "graph", lambda graph: graph)
-    plain, env = delayed(SCENARIOS[name]), delayed(SCENARIOS[name])
+    plain = delayed(SCENARIOS[name])
+    env = delayed(SCENARIOS[name])
     object.__setattr__(env, "_compiled", compiling.CompiledMethods({}, cuda_graph=True))
     assert all_same(play(plain, choices(plain, 30)), play(env, choices(plain, 30)))
     assert any(function._calls > 3 for function in env._compiled._graphs.values())

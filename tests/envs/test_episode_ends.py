@@ -75,7 +75,8 @@ def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_co
 
 
 def test_the_battery_drain_of_a_flight_does_not_depend_on_the_length_of_a_step():
-    drained, cost = [], None
+    drained = []
+    cost = None
     for period in ("1s", "0.5s", "0.25s"):
         battery = BatteryConfig(enabled=True, capacity_kwh=0.1, charging_points=FAR)
         env = fresh(

@@ -60,7 +60,8 @@ class Step(NamedTuple):
     def reset_came_last(self, uav: int) -> bool:
         """Whether the UAV's message of the reset was late, and arrived after its other messages so
         far."""
-        now, first = self.number - 1, self.run["reset_arrives_at"][uav]
+        now = self.number - 1
+        first = self.run["reset_arrives_at"][uav]
         others = [
             arrival[uav] for arrival in self.run["arrives_at"][: self.number] if arrival[uav] <= now
         ]
@@ -83,7 +84,8 @@ def sent_messages(case: int, run: dict[str, Any]) -> Messages:
     position = torch.tensor([start, *run["positions"]])
     spotted = torch.tensor([[0] * len(start), *run["spotting_true"]]).bool()
     time = torch.full(spotted.shape, -1.0)
-    place, told = torch.zeros_like(position), (-1.0, [0.0, 0.0])
+    place = torch.zeros_like(position)
+    told = (-1.0, [0.0, 0.0])
     for step, uav in itertools.product(range(1, len(time)), range(len(start))):
         own = (time[step - 1, uav].item(), place[step - 1, uav].tolist())
         newest = max(own, told, key=lambda detection: detection[0])
@@ -108,8 +110,10 @@ def received_messages(case: int, run: dict[str, Any]) -> Messages:
     """What the server holds after each step of a run, [T, N]: messages arrive as recorded."""
     first, *sent = sent_messages(case, run).pack()
     arrivals = ContextSampler(lambda context: context.entries["late"], LONGEST, loses=False)
-    line, none = DelayLine(arrivals, "arrival"), torch.zeros(len(first), dtype=torch.long)
-    memory, held = line.init_memory([first], none), []
+    line = DelayLine(arrivals, "arrival")
+    none = torch.zeros(len(first), dtype=torch.long)
+    memory = line.init_memory([first], none)
+    held = []
     for t, message in enumerate(sent):
         late = {"late": torch.tensor(run["arrives_at"][t]) - t}
         context = MessageContext(none, none, none, none, none, 1.0, late)

@@ -86,7 +86,8 @@ def test_on_board_each_uav_computes_what_the_server_would_from_the_messages_that
     links = LinkConfig("matrix", delay=LATE, loss=0.2)
     env = make_env(everything(motion, delay=delay, links=links), 4, seed=2, extras=EXTRAS)
     env.transform[-1].dropped_keys = []
-    n_old, steps = 0, torch.zeros(4, dtype=torch.long)
+    n_old = 0
+    steps = torch.zeros(4, dtype=torch.long)
     td = env.reset()
     for action in choices(env, 20):
         after, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))

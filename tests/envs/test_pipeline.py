@@ -20,7 +20,8 @@ from damian.world.messages import Messages
 
 def test_the_action_history_holds_the_chosen_displacements_east_and_north():
     scenario = square(delay=DelayConfig(act=2, history=2), episode=KEEPS_GOING)
-    env, undelayed = delayed(scenario), UavEnv(square(), 4)
+    env = delayed(scenario)
+    undelayed = UavEnv(square(), 4)
     actions = choices(env, 6)
     distance, heading = action_table(scenario.actions).unbind(-1)
     displacements = torch.stack([distance * heading.sin(), distance * heading.cos()], -1)
@@ -38,8 +39,11 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
     delay = DelayConfig(obs=obs, history=3)
     motion = replace(FLYING, sensing_time=4.0)
     env = delayed(square(motion=motion, delay=delay, episode=KEEPS_GOING), 16)
-    codes, points = action_codes(env.scenario.actions), env.uav_env.simulation.points
-    td, known, unknown = env.reset(), 0, 0
+    codes = action_codes(env.scenario.actions)
+    points = env.uav_env.simulation.points
+    td = env.reset()
+    known = 0
+    unknown = 0
     latest, chosen_at = torch.zeros(2, 16, 3, dtype=torch.long)
     for step, action in enumerate(choices(env, 60)):
         latest = torch.where(td[READY], action, latest)
@@ -51,7 +55,8 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
         heard = (held.position == points[state.goal]).all(-1) & (held.time > chosen_at)
         shown = (td[OBSERVATION][..., -2:] == codes[latest]).all(-1)
         assert (shown == ~heard)[flew].all()
-        known, unknown = known + int((flew & heard).sum()), unknown + int((flew & ~heard).sum())
+        known = known + int((flew & heard).sum())
+        unknown = unknown + int((flew & ~heard).sum())
     assert min(known, unknown) > 100
 
 
@@ -68,10 +73,12 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
 def test_an_action_chosen_while_not_ready_is_never_executed(act, motion, agents):
     delay = DelayConfig(obs=1, act=act, history=2)
     scenario = everything(motion, delay=delay, clock=ClockConfig(agents=agents))
-    rollouts, n_ignored = [], 0
+    rollouts = []
+    n_ignored = 0
     for changed in (False, True):
         env = delayed(scenario)
-        td, outputs = env.reset(), []
+        td = env.reset()
+        outputs = []
         for action, other in zip(choices(env, 15), choices(env, 16)[1:], strict=True):
             n_ignored += (~td[READY]).sum().item()
             chosen = torch.where(td[READY] | (not changed), action, other)

@@ -28,10 +28,8 @@ def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioCo
 
 def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
     """The first output, and those after each of the same random actions."""
-    env, generator = (
-        make_env(scenario, 4, seed=1, extras=["message"]),
-        torch.Generator().manual_seed(0),
-    )
+    env = make_env(scenario, 4, seed=1, extras=["message"])
+    generator = torch.Generator().manual_seed(0)
     outputs = play(env, [random_actions(env.uav_env, generator) for _ in range(n_steps)])
     return [outputs[0], *outputs[1::2]]
 
@@ -39,10 +37,8 @@ def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
 @both_motions
 def test_a_reward_term_reads_features_of_any_width_and_range(motion):
     for output in fly(sensing(motion))[1:]:
-        felt, widest = (
-            output["agents", "observation"][..., 1:3],
-            output["agents", "global_observation"][..., 0],
-        )
+        felt = output["agents", "observation"][..., 1:3]
+        widest = output["agents", "global_observation"][..., 0]
         assert output["agents", "reward"].squeeze(-1).equal(felt.sum(-1) + widest)
 
 

@@ -32,7 +32,8 @@ def built(delays: str, motion: str, n_worlds: int = 4) -> DelayedEnv:
 @some("paper")
 def test_an_environment_sent_to_a_worker_process_shares_no_memory(delays):
     env, alone = (delayed(everything(**DELAYS[delays])) for _ in range(2))
-    actions, outputs = choices(env, 12), []
+    actions = choices(env, 12)
+    outputs = []
     for each in (env, alone):
         td = each.reset()
         for step, action in enumerate(actions):
@@ -48,7 +49,8 @@ def test_an_environment_sent_to_a_worker_process_shares_no_memory(delays):
 @some("everything")
 @both_motions
 def test_an_equal_environment_that_loads_a_state_goes_on_in_the_same_way(delays, motion):
-    env, twin = built(delays, motion), built(delays, motion)
+    env = built(delays, motion)
+    twin = built(delays, motion)
     twin.set_seed(5)
     step = env.rollout(9, break_when_any_done=False)[:, -1]["next"].exclude("reward")
     state = saved_and_loaded(env.state_dict())

@@ -34,7 +34,8 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
     )
     scenario = everything(motion, delay=delay)
     skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
-    td, other = skipping.reset(), steady.reset()
+    td = skipping.reset()
+    other = steady.reset()
     generator = torch.Generator().manual_seed(0)
     for _ in range(6):
         action = random_actions(steady.base_env, generator)

@@ -51,7 +51,8 @@ def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_t
     env = UavEnv(everything(actions=ActionConfig(kind="discrete")), 4, 0)
     actor = example.QmixConfig(epsilon=0.4).make_actor(env, MlpConfig(hidden=[8]))
     seen = env.reset().select(keys.OBSERVATION, keys.ACTION_MASK)
-    legal, values = seen[keys.ACTION_MASK], actor[0].module.network(seen[keys.OBSERVATION])
+    legal = seen[keys.ACTION_MASK]
+    values = actor[0].module.network(seen[keys.OBSERVATION])
     best = values.masked_fill(~legal, -torch.inf).argmax(-1)
     assert legal.sum(-1).min() < legal.shape[-1]
     expected = 0.4 * legal / legal.sum(-1, keepdim=True)
@@ -85,7 +86,8 @@ def test_a_team_step_has_the_mean_reward_all_critic_inputs_and_one_action_in_fli
     for k in range(len(team)):
         for found, source in ((team[k], steps[k]), (team[k]["next"], steps[k]["next"])):
             for i in range(env.scenario.agents):
-                mask, ready = source[keys.ACTION_MASK][i], bool(source[keys.READY][i])
+                mask = source[keys.ACTION_MASK][i]
+                ready = bool(source[keys.READY][i])
                 only = torch.arange(len(mask)) == 0
                 assert found[keys.ACTION_MASK][i].equal(mask if ready else only)
             assert found["joint"].equal(torch.cat([*source[keys.GLOBAL_OBSERVATION]]))

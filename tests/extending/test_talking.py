@@ -38,7 +38,8 @@ def test_what_a_uav_hears_equals_a_plain_loop_over_the_others(example, agents):
     env = make(agents)
     env.transform[-1].dropped_keys = []
     steps = env.rollout(9)
-    server, points = env.uav_env.server, env.uav_env.simulation.points
+    server = env.uav_env.server
+    points = env.uav_env.simulation.points
     half = env.uav_env.simulation.airspace.scale[0] / 2
     seen = steps["next"][keys.OBSERVATION][..., :-1].unflatten(-1, (agents - 1, WIDTH))
     for world in range(2):
@@ -61,7 +62,8 @@ def test_attention_takes_the_others_in_any_order_and_number_and_reads_their_ages
     three, five = (make_actor(make(n), model) for n in (3, 5))
     five.load_state_dict(three.state_dict())
     n_actions = make(5).full_action_spec_unbatched[keys.ACTION].n
-    heard, own = torch.randn(4, 5, 4, WIDTH), torch.rand(4, 5, 1)
+    heard = torch.randn(4, 5, 4, WIDTH)
+    own = torch.rand(4, 5, 1)
 
     def logits(rows):
         seen = {keys.OBSERVATION: torch.cat([rows.flatten(-2), own], -1)}
@@ -82,7 +84,8 @@ def test_who_talks_is_trained_and_flown_in_another_number(run):
         assert float(next(csv.DictReader(file))["return"]) >= 0
 
 
-ROWS, OWN = "learner=extensions:RowsConfig", "observation.own=true"
+ROWS = "learner=extensions:RowsConfig"
+OWN = "observation.own=true"
 
 
 @pytest.mark.parametrize(

@@ -153,9 +153,11 @@ def test_history_timeline_and_rewards_are_those_of_the_transforms(
     inner = gymnasium.make(name, max_episode_steps=25)
     inner.reset(seed=5)
     env = DelayWrapper(inner, observation, action, reward, history=3, timeline=7)
-    rng, ends = np.random.default_rng(0), 0
+    rng = np.random.default_rng(0)
+    ends = 0
     for _ in range(2):
-        now, done = reference.reset(), False
+        now = reference.reset()
+        done = False
         told, info = env.reset()
         while not done:
             assert env.observation_space.contains(told)
@@ -181,11 +183,14 @@ def test_history_timeline_and_rewards_are_those_of_the_transforms(
 
 
 def test_every_reward_is_received_once_and_the_info_tells_when_it_was_earned():
-    plain, steps = gymnasium.make("Pendulum-v1", max_episode_steps=40), 40
+    plain = gymnasium.make("Pendulum-v1", max_episode_steps=40)
+    steps = 40
     env = DelayWrapper(gymnasium.make("Pendulum-v1", max_episode_steps=40), reward=Uniform(0, 30))
     plain.reset(seed=3)
     env.reset(seed=3)
-    earned, found, together = [], {}, 0
+    earned = []
+    found = {}
+    together = 0
     for step in range(steps):
         action = plain.action_space.sample()
         earned.append(plain.step(action)[1])
@@ -202,10 +207,8 @@ def test_every_reward_is_received_once_and_the_info_tells_when_it_was_earned():
 @pytest.mark.parametrize("late", [0, torch.zeros_like], ids=["0", "a function that returns 0"])
 def test_without_delay_all_is_as_without_the_wrapper(late):
     law = late if late == 0 else lambda message: torch.zeros_like(message.time)
-    plain, env = (
-        gymnasium.make("Pendulum-v1"),
-        DelayWrapper(gymnasium.make("Pendulum-v1"), law, law, law),
-    )
+    plain = gymnasium.make("Pendulum-v1")
+    env = DelayWrapper(gymnasium.make("Pendulum-v1"), law, law, law)
     assert env.observation_space == plain.observation_space
     assert np.array_equal(plain.reset(seed=1)[0], env.reset(seed=1)[0])
     for _ in range(20):
@@ -229,7 +232,8 @@ def test_the_parts_of_an_observation_have_laws_of_their_own():
         assert info["age"] == {"place": min(now, 2), "word": now - word}
         assert told["age"].tolist() == [*info["age"].values()]
         for k in range(6):
-            place, word = told["timeline"][k, :3].tolist(), told["timeline"][k, 3:]
+            place = told["timeline"][k, :3].tolist()
+            word = told["timeline"][k, 3:]
             assert place == ([now - k, now - k, 1] if 2 <= k <= now or k == now else [0, 0, 0])
             known = k <= now and arrives[now - k] <= now
             assert word[-1] == known
@@ -252,10 +256,13 @@ class Overwrites(gymnasium.Env):
     """Counts its steps in arrays that it keeps and returns, and writes over the actions that it
     executes."""
 
-    action_space, observation_space = LINE, Dict({"gps": LINE, "camera": LINE})
+    action_space = LINE
+    observation_space = Dict({"gps": LINE, "camera": LINE})
 
     def __init__(self):
-        self.count, self.paid, self.executed = np.zeros(1, np.float32), np.zeros(()), []
+        self.count = np.zeros(1, np.float32)
+        self.paid = np.zeros(())
+        self.executed = []
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -314,10 +321,12 @@ def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
     }
     if kind == "agent":
         inner = OneOverwrites()
-        env, inner = DelayParallelWrapper(inner, **late | {"default": {"a": default}}), inner.inner
+        env = DelayParallelWrapper(inner, **late | {"default": {"a": default}})
+        inner = inner.inner
     elif kind == "vector":
         vector = SyncVectorEnv([Overwrites] * 2, copy=False)
-        env, inner = DelayVectorWrapper(KeepsInfos(vector), **late), vector.envs[1]
+        env = DelayVectorWrapper(KeepsInfos(vector), **late)
+        inner = vector.envs[1]
     else:
         inner = Overwrites()
         env = DelayWrapper(
@@ -338,7 +347,8 @@ def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
         rows.append((copy.deepcopy(told), float(np.max(reward)), info))
     last = (1,) if kind == "vector" else ()  # the last world
     seen, rewards, infos = zip(*rows, strict=True)
-    held, now = [0, 0, 1, 2, 3, 4], [1, 2, 3, 4, 5, 6]
+    held = [0, 0, 1, 2, 3, 4]
+    now = [1, 2, 3, 4, 5, 6]
     assert [each["camera"][last].item() for each in seen] == held
     assert [each["gps"][last].item() for each in seen] == (now if kind == "in parts" else held)
     assert seen[-1]["timeline"][last][2:, -2 if kind == "in parts" else 0].tolist() == [4, 3]
@@ -499,8 +509,10 @@ class Relay(ParallelEnv):
     """
 
     def __init__(self, again=None, tells=True, names="abc"):
-        self.again, self.tells = again, tells
-        self.metadata, self.possible_agents = {"name": "relay"}, [*names]
+        self.again = again
+        self.tells = tells
+        self.metadata = {"name": "relay"}
+        self.possible_agents = [*names]
         self.observation_spaces = dict.fromkeys(
             self.possible_agents, Box(-99.0, 99.0, (2,), np.float32)
         )
@@ -513,7 +525,8 @@ class Relay(ParallelEnv):
         return self.action_spaces[agent]
 
     def reset(self, seed=None, options=None):
-        self.t, self.agents = 0, ["a", "b"]
+        self.t = 0
+        self.agents = ["a", "b"]
         infos = {agent: {"t": 0} for agent in self.agents}
         return {agent: np.zeros(2, np.float32) for agent in self.agents}, infos
 
@@ -618,7 +631,8 @@ def test_who_comes_again_begins_anew_in_the_transforms_too(again):
     relay = PettingZooWrapper(inner, use_mask=True, done_on_any=False, group_map=groups)
     reference = TransformedEnv(relay, delays)
     env = DelayParallelWrapper(env, LOSSY, 1, by_time, history=3, timeline=5)
-    now, earned = reference.reset(), dict.fromkeys("ab", 0.0)
+    now = reference.reset()
+    earned = dict.fromkeys("ab", 0.0)
     env.reset()
     while env.agents:
         chosen = env.unwrapped.t + 1
@@ -641,7 +655,8 @@ def test_who_comes_again_begins_anew_in_the_transforms_too(again):
 
 
 def test_only_those_who_are_there_send():
-    env, ages = DelayParallelWrapper(Relay(), lambda message: message.n_sending), []
+    env = DelayParallelWrapper(Relay(), lambda message: message.n_sending)
+    ages = []
     env.reset()
     while env.agents:
         ages.append(env.step(dict.fromkeys(env.agents, 0))[-1]["a"]["age"])
@@ -650,7 +665,8 @@ def test_only_those_who_are_there_send():
 
 
 def test_agents_draw_different_delays_which_follow_from_the_seed():
-    env, found = DelayParallelWrapper(Relay(), Uniform(0, 4), loss={"b": 1.0}), []
+    env = DelayParallelWrapper(Relay(), Uniform(0, 4), loss={"b": 1.0})
+    found = []
     for seed in (0, 1, 0):
         env.reset(seed=seed)
         ages = []

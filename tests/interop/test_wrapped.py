@@ -55,7 +55,8 @@ def test_gymnasiums_environment_is_pettingzoos_of_one_uav():
     scenario = compose_scenario(
         "scenario=tracking", "agents=1", "delay=paper", "episode.max_steps=12"
     )
-    env, other = UavGymEnv(scenario, seed=3), UavParallelEnv(scenario, seed=3)
+    env = UavGymEnv(scenario, seed=3)
+    other = UavParallelEnv(scenario, seed=3)
     (observation, info), (observations, _) = env.reset(seed=7), other.reset(seed=7)
     told = [0.0, False, False]
     while not any(told[1:]):
@@ -74,7 +75,8 @@ def test_gymnasiums_environment_is_pettingzoos_of_one_uav():
 
 def test_pettingzoos_environment_does_what_torchrls_does():
     scenario = compose_scenario("delay=paper", "episode.max_steps=8")
-    env, reference = UavParallelEnv(scenario, seed=3), make_env(scenario, 1, seed=3)
+    env = UavParallelEnv(scenario, seed=3)
+    reference = make_env(scenario, 1, seed=3)
     reference.seed_worlds(torch.tensor([5]))
     now = reference.reset()
     observations, infos = env.reset(seed=5)

@@ -21,7 +21,8 @@ from damian.models.config import MlpConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.server.termination import EpisodeConfig
 
-SMALL, LONGEST = MlpConfig(hidden=[16]), 5
+SMALL = MlpConfig(hidden=[16])
+LONGEST = 5
 
 
 def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase, TensorDictBase]:
@@ -38,7 +39,8 @@ def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase
     learner = config.make(env, setup, ReplayBuffer(storage=storage))
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         flight = env.rollout(steps, learner.actor, break_when_any_done=False)
-    drawn, update = [], learner.update
+    drawn = []
+    update = learner.update
 
     def recording(batch: TensorDictBase) -> TensorDictBase:
         drawn.append(batch.clone())
@@ -64,12 +66,14 @@ def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_fr
 ):
     _, flight, drawn = learnt(kind)
     found = rows(drawn["agents"], drawn["next", "agents"], "global_observation")
-    expected, late = [], []
+    expected = []
+    late = []
     for world in range(4):
         for step in range(40 - LONGEST):  # the messages of later ones may still be on their way
             for agent in range(3):
                 place = world, step, agent
-                before, after = flight["agents"][place], flight["next", "agents"][place]
+                before = flight["agents"][place]
+                after = flight["next", "agents"][place]
                 twin = [
                     torch.cat(
                         [each["observation"], each["privileged_observation"][:-2]]

@@ -62,7 +62,8 @@ def collect(motion: str, kind: str):
         reward=RewardConfig(spotted=1.0, source_distance=1.0),
     )
     env = UavEnv(config, 8)
-    actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
+    actor = make_actor(env, SMALL)
+    critic = make_critic(env, SMALL)
     batch = env.rollout(24, actor, break_when_any_done=False)
     batch["next", "terminated"][::2] = batch["next", "done"][::2]
     return batch, critic
@@ -75,14 +76,17 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
     add_advantages(batch, critic, config)
     value, reward = (batch[key].squeeze(-1) for key in (("agents", "state_value"), REWARD))
     next_value = batch["next", "agents", "state_value"].squeeze(-1)
-    ready, next_ready = batch["agents", "ready"], batch["next", "agents", "ready"]
+    ready = batch["agents", "ready"]
+    next_ready = batch["next", "agents", "ready"]
     compared = 0
     for world, uav in itertools.product(range(8), range(3)):
         estimate = 0.0  # of the decision after this one
         for t in reversed(range(24)):
             if not ready[world, t, uav]:
                 continue
-            earned, discount, last = 0.0, 1.0, t
+            earned = 0.0
+            discount = 1.0
+            last = t
             while True:  # until the next decision, or the end of the episode or of the batch
                 earned += discount * reward[world, last, uav].item()
                 discount *= 0.9
@@ -125,7 +129,8 @@ def collect_delayed(kind: str) -> tuple[Mappo, TensorDictBase]:
 @both_kinds
 def test_with_backupdating_the_first_importance_ratios_are_one_as_actor_observations_stay(kind):
     learner, batch = collect_delayed(kind)
-    corrected, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
+    corrected = learner.backupdated_batch(batch)
+    behaviour = batch["agents", "action_log_prob"]
     assert corrected["agents", "observation"].equal(batch["agents", "observation"])
     assert corrected["agents", "action_log_prob"].equal(behaviour)
     assert corrected["agents", "backupdated"].any()
@@ -143,7 +148,8 @@ def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():
     assert learnt.shape[1] == len(flight[0]) - 5  # the first batch is shorter
     settled = flight[:, :25]
     assert learnt["agents", "action"].equal(settled["agents", "action"])
-    sent, steps = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
+    sent = settled["next", "agents", "message"]
+    steps = settled["next", "step_count"].squeeze(-1)
     truth = server(Messages.unpack(sent), steps)
     assert learnt["next", "agents", "global_observation"].equal(truth.global_observation)
     assert not learnt["next", "agents", "global_observation"].equal(

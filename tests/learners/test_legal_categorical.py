@@ -86,7 +86,8 @@ def test_however_low_the_logits_are_draws_are_legal_and_entropies_finite(low):
 
 @pytest.mark.parametrize("n_legal", [1, 2, 7])
 def test_the_ends_of_the_unit_interval_draw_legal_actions(monkeypatch, n_legal):
-    logits, mask = torch.randn(1000, 7), torch.zeros(1000, 7).bool()
+    logits = torch.randn(1000, 7)
+    mask = torch.zeros(1000, 7).bool()
     first = torch.randint(8 - n_legal, (1000, 1))
     mask.scatter_(-1, first + torch.arange(n_legal), True)
     distribution = LegalCategorical(logits, mask)

@@ -94,7 +94,8 @@ def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
         value_target=keys.VALUE_TARGET,
         sample_log_prob=keys.ACTION_LOG_PROB,
     )
-    terms, ready = loss(batch.copy()), batch[keys.READY]
+    terms = loss(batch.copy())
+    ready = batch[keys.READY]
     decided = [
         terms[name].view_as(ready)[ready].mean() for name in ("loss_objective", "loss_entropy")
     ]
@@ -103,7 +104,8 @@ def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
 
 def losses_of(learner: Mappo, batch: TensorDictBase, config: MappoConfig | None = None) -> Tensor:
     """The terms of our loss on all steps of a batch [B, T]."""
-    entries, config = loss_entries(learner, batch), config or learner.config
+    entries = loss_entries(learner, batch)
+    config = config or learner.config
     return mappo_losses(entries, learner.actor, learner.critic, config)[0]
 
 

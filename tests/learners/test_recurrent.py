@@ -68,7 +68,8 @@ def test_hidden_states_are_carried_from_step_to_step_and_start_from_zeros(kind, 
     assert begins.equal(collected["step_count"].squeeze(-1) == 0)
     assert begins[:, 1:].any()
     assert not begins[:, [7, 14]].all()  # some hidden states are carried from one batch to the next
-    before, after = collected[HIDDEN_BEFORE], collected[HIDDEN]
+    before = collected[HIDDEN_BEFORE]
+    after = collected[HIDDEN]
     assert (before[begins] == 0).all()
     assert before[:, 1:][~begins[:, 1:]].equal(after[:, :-1][~begins[:, 1:]])
     assert (after != before).any(-1).all()
@@ -91,7 +92,8 @@ def test_a_batch_from_the_replay_buffer_keeps_its_first_hidden_state(settle):
     buffer = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, recompute, longest=5))
     learner = Mappo(env, MappoConfig(), learning(GRU, settle), buffer)
     parts = [*batches(env, learner.actor, 10, 3)]
-    flight, begin = torch.cat(parts, 1), 0
+    flight = torch.cat(parts, 1)
+    begin = 0
     for batch in parts:
         corrected = learner.backupdated_batch(batch)
         flown = flight[:, begin : begin + corrected.shape[1]]
@@ -106,10 +108,8 @@ def test_a_batch_from_the_replay_buffer_keeps_its_first_hidden_state(settle):
 
 def test_gradients_reach_back_to_the_beginning_of_the_episode_and_no_further():
     gru = make_actor(delayed_env(), GRU).module[0][0]
-    features, begins = (
-        torch.rand(2, 6, 3, 16, requires_grad=True),
-        torch.zeros(2, 6, 1, dtype=torch.bool),
-    )
+    features = torch.rand(2, 6, 3, 16, requires_grad=True)
+    begins = torch.zeros(2, 6, 1, dtype=torch.bool)
     begins[0, 2] = True  # in one of two worlds
     gru.replay(features, torch.rand(2, 3, 8), begins)[:, -1].sum().backward()
     has_gradient = (features.grad != 0).any(-1).all(-1)

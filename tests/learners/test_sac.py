@@ -59,7 +59,8 @@ def test_the_target_entropy_of_continuous_actions_is_minus_one_for_each_on_an_in
 def test_the_discrete_losses_and_their_gradients_are_torchrls(mask):
     env = UavEnv(everything("polynomial", actions=ActionConfig(kind="discrete", mask=mask)), 8)
     learner = recording_learner(env, lr=0.1)  # so that actor, critics and targets differ
-    batch, loss = learner.drawn[0], learner.loss
+    batch = learner.drawn[0]
+    loss = learner.loss
     assert ("agents", "action_mask") not in batch.keys(True) or not batch[
         "agents", "action_mask"
     ].all()
@@ -100,13 +101,16 @@ def decision(
 
     None if the UAV was not ready, or if the outcome is not known by the last step.
     """
-    agents, next_agents, ends = flight["agents"], flight["next", "agents"], flight["next"]
+    agents = flight["agents"]
+    next_agents = flight["next", "agents"]
+    ends = flight["next"]
     if not agents["ready"][world, begin, agent]:
         return None
     earned = 0.0
     for t in range(begin, last + 1):
         earned += 0.8 ** (t - begin) * next_agents["reward"][world, t, agent]
-        ready, over = next_agents["ready"][world, t, agent], ends["done"][world, t]
+        ready = next_agents["ready"][world, t, agent]
+        over = ends["done"][world, t]
         if ready | over:
             break
     else:
@@ -164,10 +168,8 @@ def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_ho
 
 def test_steps_after_an_end_that_was_known_only_later_are_not_learnt_from():
     env = UavEnv(everything("instant", kind="discrete"), 4)
-    config, buffer = (
-        SacConfig(updates=1, batch_size=200, warm_up=0),
-        ReplayBuffer(storage=TimeStorage(200)),
-    )
+    config = SacConfig(updates=1, batch_size=200, warm_up=0)
+    buffer = ReplayBuffer(storage=TimeStorage(200))
     learner = RecordingSac(env, config, learning(SMALL), buffer)
     flight = fly(env, learner.actor, 12)
     flight["valid"] = torch.zeros(4, 12, 1, dtype=torch.bool)

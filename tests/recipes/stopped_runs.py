@@ -148,7 +148,8 @@ def check_equal(whole: Path, other: Path) -> None:
     """Check that two runs have the same metrics, results, checkpoints and files, bit for bit."""
     for name in ("metrics.csv", "result.csv"):
         assert (other / name).read_bytes() == (whole / name).read_bytes(), name
-    one, two = stored(whole), stored(other)
+    one = stored(whole)
+    two = stored(other)
     assert one.keys() == two.keys()
     differ = [
         name for name in one if not torch.equal(one[name].nan_to_num(9), two[name].nan_to_num(9))

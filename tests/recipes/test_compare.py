@@ -176,7 +176,8 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
 @pytest.mark.slow
 def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
     words = [*ONE, "seeds=1", "methods=[undelayed,naive]", listed(*SMALL, "frames=64")]
-    folder, kept = compare(*words), tmp_path / "kept"
+    folder = compare(*words)
+    kept = tmp_path / "kept"
     kept.mkdir()
     for name in ("results.csv", "curves.csv"):
         (kept / name).write_bytes((folder / name).read_bytes())
@@ -190,7 +191,8 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
         "random",
         "script",
     }
-    late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
+    late = ["experiment.first_seed=9", *stored]
+    problem = "experiment: no run of it is finished in"
     check_refused(lambda: compare(*words, *late), problem, capsys)
 
 

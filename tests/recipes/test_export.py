@@ -24,7 +24,8 @@ given = {name: value.numpy() for name, value in inputs.items()}
 torch.save([torch.as_tensor(each) for each in session.run(None, given)], "onnx.pt")
 """
 
-HISTORY, GRU = ["delay.history=2"], ["model=gru"]
+HISTORY = ["delay.history=2"]
+GRU = ["model=gru"]
 CONTINUOUS = ["learner=sac", "actions=continuous", "learner.warm_up=8", "learner.batch_size=8"]
 BELIEF = ["observation.belief=[belief_gain]", "model.skip=true"]
 BELIEF += ["observation.global_features=[agent_distances]"]  # for three UAVs alone

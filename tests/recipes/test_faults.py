@@ -85,7 +85,8 @@ def test_freed_memory_is_used_again():
 
 
 def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatch):
-    learn, calls = Mappo.learn, []
+    learn = Mappo.learn
+    calls = []
 
     def diverge(learner: Mappo, batch) -> dict[str, float]:
         calls.append(1)

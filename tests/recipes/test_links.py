@@ -98,7 +98,8 @@ def begin(state: Path | None) -> Path:
 def finished(door: str) -> tuple[Path, list[str]]:
     """A door's folder after a run without links, and what was written below it."""
     global _written  # noqa: PLW0603
-    kept, told = Path("finished", door), Path("finished", f"{door}.txt")
+    kept = Path("finished", door)
+    told = Path("finished", f"{door}.txt")
     if not kept.exists():
         before, words = DOORS[door]
         if "checkpoint=finished/train" in words:

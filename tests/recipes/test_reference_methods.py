@@ -44,7 +44,8 @@ LATE = {
 
 def rollout_of(scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS) -> list[TensorDictBase]:
     """Outputs of the environment for random actions, which are the same at each call."""
-    env, generator = make_env(scenario, 4, extras=extras), torch.Generator().manual_seed(3)
+    env = make_env(scenario, 4, extras=extras)
+    generator = torch.Generator().manual_seed(3)
     return play(env, [random_actions(env.uav_env, generator) for _ in range(20)])
 
 

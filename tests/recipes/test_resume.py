@@ -89,7 +89,8 @@ LEARNERS = {"mappo": ["delay.obs=2", "aware=backupdate"], "sac": [*SAC, "delay.o
 STOPPED = (0, 130, 143, -signal.SIGTERM, -signal.SIGKILL)
 """Exit codes of a run that has ended, or that a signal has stopped before, in or after its
 training."""
-STOPS, STOPS_PER_RUN = 20, 5
+STOPS = 20
+STOPS_PER_RUN = 5
 
 
 def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int]) -> int:
@@ -124,7 +125,8 @@ def check_stopped_runs(words: list[str], whole: Path, stop: Callable[[list[str]]
     "number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name
 )
 def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, number):
-    words, moments = [*SMALL, *LEARNERS[learner]], random.Random(f"{learner} {number}")
+    words = [*SMALL, *LEARNERS[learner]]
+    moments = random.Random(f"{learner} {number}")
     begin = time.monotonic()
     whole = run(*words, folder="whole")
     longest = time.monotonic() - begin
@@ -141,7 +143,8 @@ def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, numb
 @pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_a_run_killed_in_the_middle_of_writing_loses_nothing(run, learner):
-    words, moments = [*SMALL, *LEARNERS[learner]], random.Random(learner)
+    words = [*SMALL, *LEARNERS[learner]]
+    moments = random.Random(learner)
 
     def stop(words: list[str]) -> int:
         return ended(forked(words, lambda: kill_at_write(moments.randrange(40))))

@@ -32,7 +32,8 @@ def folder(tmp_path, monkeypatch):
         "delay.obs={law: uniform, low: 1, high: 7}",
         "aware=timeline",
     ]
-    config, rows = settings(*words), []
+    config = settings(*words)
+    rows = []
     for seed in range(8, 13):
         run = tmp_path / "runs" / "crowded" / "1-7" / "mine" / f"seed_{seed}"
         run.mkdir(parents=True)

@@ -107,7 +107,8 @@ def test_of_many_runs_one_that_fails_is_kept_and_the_others_go_on(tmp_path):
             raise InputError("frames: of the user's own code")
         (folder / "result.csv").touch()
 
-    config, names = cli.settings("agents=1"), ["first", "wrong", "last"]
+    config = cli.settings("agents=1")
+    names = ["first", "wrong", "last"]
     runs = [Run(work, config, tmp_path / name) for name in names]
     runs.append(Run(work, config, tmp_path / "later", needs=tmp_path / "wrong", stage=1))
     assert [run.folder.name for run in perform_all(runs, 1)] == ["wrong", "later"]
@@ -192,7 +193,8 @@ def test_a_sweep_evaluates_runs_of_other_folders_as_they_are_now(sweep):
 
 def test_names_of_folders_are_short_and_can_be_typed():
     law = "delay.obs={law:lag,lag:{law:uniform,low:0,high:6},update_period:20,stagger:true,shared:true}"
-    sweep, words = ["seed=0,1", law, "scenario=a/b,c"], ["seed=0", law, "scenario=a/b"]
+    sweep = ["seed=0,1", law, "scenario=a/b,c"]
+    words = ["seed=0", law, "scenario=a/b"]
     assert cli._run_name(sweep, words) == "seed-0_scenario-a-b"
     assert cli._run_name([f"{law},0"], [law]) != cli._run_name(
         [f"{law},0"], [law.replace("20", "21")]

@@ -113,15 +113,15 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
 
 
 def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, capsys):
-    same, other = run(*TINY, folder="same"), run(*TINY, "seed=1", folder="other")
-    before, record = (same / "metrics.csv").read_text(), json.loads((same / "run.json").read_text())
+    same = run(*TINY, folder="same")
+    other = run(*TINY, "seed=1", folder="other")
+    before = (same / "metrics.csv").read_text()
+    record = json.loads((same / "run.json").read_text())
     assert (trained / "metrics.csv").read_text() == before
     assert (other / "metrics.csv").read_text() != before
     check_refused(lambda: run(*TINY, "seed=2", folder="same"), "same holds a run already", capsys)
-    fewer, made = (
-        (f"resume={same}", "frames=100"),
-        "frames: 100 is fewer than the 256 that the run has made",
-    )
+    fewer = (f"resume={same}", "frames=100")
+    made = "frames: 100 is fewer than the 256 that the run has made"
     check_refused(lambda: run(*fewer, folder="second"), made, capsys)
     run(f"resume={same}", "frames=250", folder="second")
     assert (same / "metrics.csv").read_text() == before, "nothing was left to train"
@@ -151,17 +151,16 @@ def test_evaluations_on_the_way_are_seen_beside_the_training_and_change_nothing(
         "eval_deterministic",
     }
     assert {"train/perceived_return", "train/steps_per_second", "eval/age", "eval/late"} <= {*tags}
-    points, result = (
-        events.Scalars("eval/return"),
-        (folder / "result.csv").read_text().splitlines()[3],
-    )
+    points = events.Scalars("eval/return")
+    result = (folder / "result.csv").read_text().splitlines()[3]
     assert [point.step for point in points] == [128, 256, 256]
     assert points[-1].value == pytest.approx(float(result.split(",")[4]))
 
 
 def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run, trained):
     still = run(f"checkpoint={trained}", "learner.lr=1e-9", "seed=1", folder="still")
-    kept, before = weights(still, "actor", "critic"), weights(trained, "actor", "critic")
+    kept = weights(still, "actor", "critic")
+    before = weights(trained, "actor", "critic")
     assert {name.partition(".")[0] for name in kept} == {"actor", "critic"}
     assert all(torch.allclose(kept[name], before[name], atol=1e-6) for name in kept)
     assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # frames count from 0 again
@@ -183,7 +182,8 @@ def test_every_policy_is_evaluated_in_the_same_episodes(run):
 
 @pytest.mark.parametrize("case", [1, 2])
 def test_the_use_case_scenarios_have_the_settings_of_the_reference_data(case):
-    config, golden = composed_config(f"scenario=paper/usecase{case}"), usecase(case)
+    config = composed_config(f"scenario=paper/usecase{case}")
+    golden = usecase(case)
     assert (config.agents, config.actions.distances) == (golden.agents, golden.actions.distances)
     assert {h % 360 for h in config.actions.headings} == {h % 360 for h in golden.actions.headings}
     for key in ("vertices", "start_positions", "lattice_step", "lattice_angle"):

@@ -36,7 +36,10 @@ from damian.transforms import (
     set_seed,
 )
 
-LONGEST, WORLDS, AGENTS, LIMIT = 5, 3, 2, 12
+LONGEST = 5
+WORLDS = 3
+AGENTS = 2
+LIMIT = 12
 GAMMA = 0.7
 GROUPS = [(), ("agents",)]
 ENDS = ("done", "terminated", "truncated")
@@ -67,8 +70,10 @@ class Remote(EnvBase):
 
     def __init__(self, group: tuple[str, ...]) -> None:
         super().__init__(batch_size=[WORLDS])
-        self.group, self.shape_of_rows = group, (WORLDS, *[AGENTS] * bool(group))
-        self.n_sent, self.elapsed = 0, torch.zeros(WORLDS, 1, dtype=torch.long)
+        self.group = group
+        self.shape_of_rows = (WORLDS, *[AGENTS] * bool(group))
+        self.n_sent = 0
+        self.elapsed = torch.zeros(WORLDS, 1, dtype=torch.long)
 
         def spec(width: int) -> Composite | Unbounded:
             return Unbounded((*self.shape_of_rows, width))
@@ -192,11 +197,17 @@ class Twin:
     def __init__(
         self, steps: TensorDictBase, world: int, group: tuple[str, ...], case: Case
     ) -> None:
-        self.steps, self.group, self.T, self.case = steps[:, world], group, len(steps), case
+        self.steps = steps[:, world]
+        self.group = group
+        self.T = len(steps)
+        self.case = case
         self.senders = [(i,) for i in range(AGENTS)] if group else [()]
         self.start = [t - int(self.steps["step_count"][t]) for t in range(self.T)]
         self.newest = [[self._newest(t, row) for row in self.senders] for t in range(self.T)]
-        self.terminated, self.truncated, self.valid, over = [], [], [], False
+        self.terminated = []
+        self.truncated = []
+        self.valid = []
+        over = False
         for t in range(self.T):
             over = over and t != self.start[t]
             self.valid.append(not over)
@@ -217,7 +228,8 @@ class Twin:
         return max(arrived, default=self.start[t] - 1)
 
     def message(self, t: int, row: tuple[int, ...]) -> list[float]:
-        g, name = self.newest[t][self.senders.index(row)], key(self.group, "message")
+        g = self.newest[t][self.senders.index(row)]
+        name = key(self.group, "message")
         at_reset = g < self.start[t]
         found = (
             self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
@@ -262,7 +274,9 @@ class Twin:
 
 
 def random_case(rng: random.Random) -> Case:
-    latest, window, period = rng.choice([None, 0, 2, LONGEST]), rng.randint(1, 4), rng.randint(1, 5)
+    latest = rng.choice([None, 0, 2, LONGEST])
+    window = rng.randint(1, 4)
+    period = rng.randint(1, 5)
     return Case(
         latest, window, period, rng.choice([0.0, 0.4]), rng.choice(["generation", "arrival"])
     )
@@ -271,7 +285,8 @@ def random_case(rng: random.Random) -> Case:
 def storage_of(env: TransformedEnv, group: tuple[str, ...], n_steps: int) -> BackupdateStorage:
     """A storage of ``n_steps`` steps, with the corrections that follow from the environment."""
     recomputed = [key(group, name) for name in ("observation", "reward")]
-    corrections, hindsight = corrections_of(env.transform, recomputed), key(group, "hindsight")
+    corrections = corrections_of(env.transform, recomputed)
+    hindsight = key(group, "hindsight")
     storage = make_storage(group, corrections=corrections, hindsight_key=hindsight)
     storage.max_size = n_steps * WORLDS
     return storage
@@ -283,14 +298,16 @@ def storage_of(env: TransformedEnv, group: tuple[str, ...], n_steps: int) -> Bac
 def test_stored_steps_become_what_a_slow_twin_says(group, seed):
     rng = random.Random(seed)
     for _ in range(3):
-        case, part = random_case(rng), rng.choice([4, 10, 20])
+        case = random_case(rng)
+        part = rng.choice([4, 10, 20])
         env = make_env(group, case)
         collected = rollout(env, 40)
         capacity = (
             part + 2 * LONGEST + case.window - 1 + case.period - 1
         )  # the least, so that the ring wraps
         after = stored(storage_of(env, group, min(capacity, 40)), collected, 40 // part)
-        steps, n_older = collected.transpose(0, 1), 40 - len(after)
+        steps = collected.transpose(0, 1)
+        n_older = 40 - len(after)
         for name in ("message", "received", "delay", "age"):  # what was known at the time stays
             known = next_key(key(group, name))
             assert after[known].equal(steps[known][n_older:])
@@ -309,7 +326,8 @@ def test_stored_steps_become_what_a_slow_twin_says(group, seed):
 
 def check_step(after: TensorDictBase, at: tuple[int, ...], twin: Twin, t: int, row: tuple) -> None:
     """Compare what is stored of a step with the twin."""
-    observation, reward = key(twin.group, "observation"), key(twin.group, "reward")
+    observation = key(twin.group, "observation")
+    reward = key(twin.group, "reward")
     assert after[next_key(key(twin.group, "hindsight"))][at].tolist() == twin.message(t, row)
     assert after[next_key(reward)][at].item() == pytest.approx(twin.summed(t, row)), (twin.case, t)
     assert after[next_key(observation)][at].tolist() == pytest.approx(twin.held(t, row)), (
@@ -408,7 +426,8 @@ def test_backupdated_counts_the_rewards_that_late_messages_have_changed_and_not_
     collected = rollout(make_env(group, Case(order=order)), 60)
     collected[reward] = recompute(collected, collected[received])[reward]
     storage = make_storage(group, recompute, hindsight_key=key(group, "hindsight"))
-    buffer, known = ReplayBuffer(storage=storage), collected[reward].transpose(0, 1).clone()
+    buffer = ReplayBuffer(storage=storage)
+    known = collected[reward].transpose(0, 1).clone()
     changed = torch.zeros_like(known, dtype=torch.bool)
     for end in range(5, 65, 5):
         buffer.extend(collected[:, end - 5 : end])

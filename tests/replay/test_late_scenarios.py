@@ -24,7 +24,9 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import MotionConfig, RequestConfig, SourceConfig
 
-STEPS, WORLDS, LONGEST = 40, 4, 5
+STEPS = 40
+WORLDS = 4
+LONGEST = 5
 LATE = {"law": "uniform", "low": 0, "high": LONGEST}
 SUMMED = {"reward_window": 3, "reward_discount": 0.7}
 ENDS = ["success", "done", "terminated", "truncated"]
@@ -38,7 +40,9 @@ def training_env(scenario: ScenarioConfig, n_worlds: int = WORLDS) -> DelayedEnv
 
 def fly(env: DelayedEnv, n_steps: int = STEPS) -> TensorDictBase:
     """Steps [T, B] with random actions, the same at each call."""
-    generator, steps, td = torch.Generator().manual_seed(5), [], env.reset()
+    generator = torch.Generator().manual_seed(5)
+    steps = []
+    td = env.reset()
     for _ in range(n_steps):
         action = random_actions(env.base_env, generator)
         after, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
@@ -69,7 +73,8 @@ def backupdated(
     """Such steps as collected, and as corrected by all that has arrived after the last one,
     [T, B]."""
     env = training_env(scenario, n_worlds)
-    buffer, late = buffer_of(env, corrected), fly(env, n_steps)
+    buffer = buffer_of(env, corrected)
+    late = fly(env, n_steps)
     for steps in late.split(8):
         buffer.extend(steps.transpose(0, 1))
     return late, in_order(buffer)
@@ -138,7 +143,8 @@ FLYING = {
 @pytest.mark.sample(3)
 @pytest.mark.parametrize("name", CASES)
 def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(name):
-    case, motion = CASES[name], "polynomial" if name in FLYING else "instant"
+    case = CASES[name]
+    motion = "polynomial" if name in FLYING else "instant"
     scenario = everything(motion, episode=EpisodeConfig(max_steps=9), **case)
     on_time = replace(scenario, delay=replace(scenario.delay, obs=0, rew=0, order="generation"))
     late_messages = scenario.make_delays().obs.late
@@ -169,7 +175,8 @@ def test_in_hindsight_requests_are_known_at_once_and_paid_once_where_the_message
     delayed = replace(scenario, delay=DelayConfig(obs=LATE, loss=loss))
     rollouts = (*backupdated(delayed, ["reward", "critic"], 16), fly(training_env(scenario, 16)))
     late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
-    reward, critic = next_key(keys.REWARD), next_key(keys.GLOBAL_OBSERVATION)
+    reward = next_key(keys.REWARD)
+    critic = next_key(keys.GLOBAL_OBSERVATION)
     arrived = late[next_key(keys.DELAY)] >= 0
     lost = true[next_key(keys.MESSAGE_SENT)].unsqueeze(-1) & ~arrived
     assert found[reward].equal(true[reward] * ~lost)
@@ -225,5 +232,6 @@ def test_a_saved_storage_continues_in_the_same_way():
     assert other.storage.latest().equal(one.storage.latest())
     for buffer in (one, other):
         buffer.extend(late[25:].transpose(0, 1))
-    original, loaded = in_order(one), in_order(other)
+    original = in_order(one)
+    loaded = in_order(other)
     assert all(original[key].equal(loaded[key]) for key in original.keys(True, True))

@@ -36,7 +36,8 @@ def test_the_programs_learn_the_same_rewards_from_flights_in_any_order_of_arriva
         backupdate=True,
     )
     env = learning_env(config)
-    buffer, flight = replay_buffer(config, env), env.rollout(100, break_when_any_done=False)
+    buffer = replay_buffer(config, env)
+    flight = env.rollout(100, break_when_any_done=False)
     assert buffer is not None
     for part in flight.split(5, 1):
         buffer.extend(part)

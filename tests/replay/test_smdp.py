@@ -8,13 +8,16 @@ from tensordict import TensorDict
 
 from damian.replay.smdp import find_decisions, transitions
 
-T, B, N = 12, 5, 3
+T = 12
+B = 5
+N = 3
 
 
 def flags(seed: int):
     """Random ``ready``, ``ready_next``, ``done`` and ``terminated`` that a rollout could have."""
     torch.manual_seed(seed)
-    after, done = torch.rand(T, B, N) < 0.4, torch.rand(T, B) < 0.1
+    after = torch.rand(T, B, N) < 0.4
+    done = torch.rand(T, B) < 0.1
     ready = torch.cat([torch.ones(1, B, N, dtype=torch.bool), after[:-1]])
     ready[1:] |= done[:-1].unsqueeze(-1)  # after a reset every UAV is ready
     return ready, after, done, done & (torch.rand(T, B) < 0.5)
@@ -53,10 +56,12 @@ def random_steps(seed: int) -> TensorDict:
 
 
 def test_a_transition_has_the_observations_before_and_after_it_and_its_discounted_reward():
-    steps, order = random_steps(0), torch.arange(4, T + 4) % T
+    steps = random_steps(0)
+    order = torch.arange(4, T + 4) % T
     decisions = find_decisions(*flags(0))
     batch = transitions(steps, order, decisions, 0.9, ["observation"])
-    before, after = steps[order], steps["next"][order]
+    before = steps[order]
+    after = steps["next"][order]
     for k, (begin, world, agent, end) in enumerate(
         zip(*(part.tolist() for part in decisions), strict=True)
     ):

@@ -71,7 +71,8 @@ POOLED = ("age", "late", "lost")
 def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
     """Ages of the messages held [steps], and whether each message sent is late or lost, in an
     episode."""
-    agents, delays = world["next", "agents"], {"age": [], "late": [], "lost": []}
+    agents = world["next", "agents"]
+    delays = {"age": [], "late": [], "lost": []}
     for i in range(agents["message_sent"].shape[-1]):
         arrivals = {
             0: 0
@@ -102,7 +103,8 @@ def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[
         next_step = world["next"][t - 1]
         row["perceived_return"] += next_step["agents", "reward"].mean().item()
         row["perceived_success_rate"] |= next_step["success"].item()
-        truth, steps = Messages.unpack(next_step["agents", "message"][None]), torch.tensor([t])
+        truth = Messages.unpack(next_step["agents", "message"][None])
+        steps = torch.tensor([t])
         if not truly_over:
             row["return"] += server(truth, steps).reward.mean().item()
         if truth.spotted.sum() >= needed and not truly_over:
@@ -165,7 +167,8 @@ def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_o
         joint_spotting(motion, DelayConfig(), **sections), 24, seed=2, extras=["message"]
     )
     same = env.rollout(HORIZON, again, break_when_any_done=False)
-    late, on_time = evaluation(flight, server), evaluation(same, env.server)
+    late = evaluation(flight, server)
+    on_time = evaluation(same, env.server)
     assert (
         on_time["return"] == on_time["perceived_return"] == pytest.approx(late["return"], rel=1e-6)
     )
@@ -190,7 +193,9 @@ def training_batch() -> TensorDictBase:
 
 def ended_episodes(world: TensorDictBase) -> list[dict[str, float]]:
     """Return, success and steps of each ended episode of a world [T]."""
-    total, steps, ended = 0.0, 0, []
+    total = 0.0
+    steps = 0
+    ended = []
     for step in world["next"]:
         total += step["agents", "reward"].mean().item()
         steps += 1
@@ -198,7 +203,8 @@ def ended_episodes(world: TensorDictBase) -> list[dict[str, float]]:
             ended.append(
                 dict(zip(EpisodeLog.NAMES, (total, float(step["success"]), steps), strict=True))
             )
-            total, steps = 0.0, 0
+            total = 0.0
+            steps = 0
     return ended
 
 
@@ -208,7 +214,8 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
     monkeypatch.setattr(EpisodeLog, "EPISODES", 3 * len(batch := training_batch()))
     log = EpisodeLog(len(batch))
     for part in batch.split(3, 1):  # in some parts no episode ends
-        state, log = log.state_dict(), EpisodeLog(len(batch))
+        state = log.state_dict()
+        log = EpisodeLog(len(batch))
         log.load_state_dict(state)
         log.add(part)
     ended = [ended_episodes(world) for world in batch]
@@ -222,10 +229,8 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
         )
     assert {row["perceived_success_rate"] for world in latest for row in world} == {0.0, 1.0}
 
-    log, shortest = (
-        EpisodeLog(len(batch)),
-        min(int(world["next", "done"].int().argmax()) for world in batch),
-    )
+    log = EpisodeLog(len(batch))
+    shortest = min(int(world["next", "done"].int().argmax()) for world in batch)
     log.add(batch[:, : shortest + 1])
     assert log.finished > 0
     assert all(math.isnan(mean) for mean in log.means().values())
@@ -243,19 +248,24 @@ def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_no
     def make() -> HindsightReturns:
         return HindsightReturns(BackupdateStorage(72, server_recompute(server, ["reward"]), 4), 2)
 
-    measured, found = make(), []
+    measured = make()
+    found = []
     for part in data.split([13, 1, 2, 28], 1):
-        state, measured = measured.state_dict(), make()
+        state = measured.state_dict()
+        measured = make()
         measured.load_state_dict(plain(state))
         ended = measured.add(part)
         found.append(ended)
-    found, steps = torch.cat(found, 1), data["next"]
+    found = torch.cat(found, 1)
+    steps = data["next"]
     assert found.shape == (2, 44 - 4)
     for world in range(2):
-        total, newest = 0.0, data[keys.MESSAGE][world, 0].clone()
+        total = 0.0
+        newest = data[keys.MESSAGE][world, 0].clone()
         for t in range(found.shape[1]):
             if t and steps[keys.DONE][world, t - 1]:
-                total, newest = 0.0, data[keys.MESSAGE][world, t].clone()
+                total = 0.0
+                newest = data[keys.MESSAGE][world, t].clone()
             arrives = steps[keys.DELAY][world, t, :, 0] >= 0
             newest[arrives] = steps[keys.MESSAGE][world, t][arrives]
             messages = server.messages(newest.unsqueeze(0))

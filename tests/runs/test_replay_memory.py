@@ -10,7 +10,9 @@ from damian.replay.time_storage import TimeStorage
 from damian.runs.checkpoint import plain
 from damian.runs.replay_memory import ReplayMemory
 
-WORLDS, ROWS, LONGEST = 2, 20, 3
+WORLDS = 2
+ROWS = 20
+LONGEST = 3
 
 
 def make_buffer() -> ReplayBuffer:
@@ -28,8 +30,10 @@ def batch(begin: int, n_rows: int) -> TensorDict:
 @pytest.mark.parametrize("sizes", [[1, 2, 3], [5] * 9, [3, 20, 20, 20, 2]])
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_loaded_memory_equals_the_stored_one(tmp_path, sizes, every):
-    buffer, n_rows = make_buffer(), 0
-    memory, files = ReplayMemory(buffer, tmp_path / "replay"), {}
+    buffer = make_buffer()
+    n_rows = 0
+    memory = ReplayMemory(buffer, tmp_path / "replay")
+    files = {}
     for i, size in enumerate(sizes):
         if n_rows:  # late messages change the latest rows
             steps = buffer.storage.steps

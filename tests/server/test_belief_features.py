@@ -38,8 +38,10 @@ def flown():
         each=[{}, {"level_db": 136.0, "emission": "constant"}],
     )
     env = UavEnv(replace(believing(), source=sources), messages_only=True)
-    simulation, server = env.simulation, env.server
-    messages, steps = simulation.initial.sent, simulation.initial.steps
+    simulation = env.simulation
+    server = env.server
+    messages = simulation.initial.sent
+    steps = simulation.initial.steps
     torch.manual_seed(0)
     possible = server.grid.prior[places(server.grid, server.region_of(messages), None)] > 0
     weight = torch.rand(possible.shape).square() * possible
@@ -49,16 +51,19 @@ def flown():
 
 def test_gain_is_the_chance_of_detecting_the_source_where_an_action_leads(flown):
     simulation, server, messages, features, belief = flown
-    candidates, n_actions = simulation.candidates, simulation.config.actions.n_actions
+    candidates = simulation.candidates
+    n_actions = simulation.config.actions.n_actions
     for world, uav in ((0, 0), (3, 1), (7, 2)):
         region = int(server.region_of(messages)[world])
         standing = int(messages.trail[world, uav, 0])
         for action in (0, 5, n_actions - 1):
             others = {int(each) for i, each in enumerate(messages.trail[world, :, 0]) if i != uav}
-            first, base = standing * n_actions + action, region * simulation.airspace.max_points
+            first = standing * n_actions + action
+            base = region * simulation.airspace.max_points
             nearest, second = candidates.ranking.point[first, :2].tolist()
             point = second if base + nearest in others else nearest
-            flat, missed = region * simulation.airspace.max_points + point, 1.0
+            flat = region * simulation.airspace.max_points + point
+            missed = 1.0
             for source in range(2):
                 place = region + len(server.grid.prior) // 2 * source
                 at = standing + len(simulation.points) * source
@@ -80,7 +85,8 @@ def test_moments_are_mean_spread_and_entropy(flown):
     simulation, server, messages, features, belief = flown
     for world, uav, source in ((0, 0, 0), (5, 2, 0), (5, 2, 1)):
         scale = float(simulation.airspace.scale[server.region_of(messages)[world]])
-        chance, cells = belief[world, source].tolist(), server.grid.centres.tolist()
+        chance = belief[world, source].tolist()
+        cells = server.grid.centres.tolist()
         east, north = (
             sum(p * cell[i] for p, cell in zip(chance, cells, strict=True)) for i in (0, 1)
         )
@@ -116,7 +122,8 @@ def test_a_uavs_own_features_are_those_of_its_own_belief():
     env = make_env(believing(own=True, delay=believing().delay), 3, extras=["message"])
     td = env.rollout(5)[:, -1]["next"]
     server = env.server
-    messages, steps = server.messages(td["agents", "message"]), torch.full((3,), 5)
+    messages = server.messages(td["agents", "message"])
+    steps = torch.full((3,), 5)
     for uav in range(env.uav_env.n_agents):
         features = server.features(messages, steps, ALL, belief=td["agents", "belief"][:, uav])
         own = torch.cat([features[name][:, uav].flatten(1) for name in ALL], -1)

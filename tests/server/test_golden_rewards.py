@@ -40,7 +40,8 @@ def reason_for_other_feature(
     name: str, transition: Transition, uav: int, value: float
 ) -> str | None:
     """Why a feature differs from the original's; None if it does not."""
-    estimate, place = transition.after["server"]["est_pos"], transition.after["positions"][uav]
+    estimate = transition.after["server"]["est_pos"]
+    place = transition.after["positions"][uav]
     if name == "coverage":
         return COVERS_NOTHING
     if name == "source_time" and uav > 0 and 0 < value < 1:
@@ -99,7 +100,8 @@ def reason_for_other_term(name: str, value: float, motions: int) -> str | None:
     ],
 )
 def test_recorded_features_give_the_recorded_reward_terms(case, compared, reasons):
-    records, golden = recorded(case, PERSISTENT), GOLDEN[case]["scenario"]
+    records = recorded(case, PERSISTENT)
+    golden = GOLDEN[case]["scenario"]
     _, _, counters = server_inputs(case, records)
     observed = [{FEATURES[k]: v for k, v in m.after["obs_named"].items()} for m in records]
     names = [name for name in observed[0] if name != "agent_distances"]

@@ -39,7 +39,8 @@ def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
         detected_time=draw(-10, 20, 2).round().clamp(min=-1),
         detected_position=draw(-100, 100, 2, 2),
     )
-    server, steps = env.server, torch.tensor([20, 30, 40])
+    server = env.server
+    steps = torch.tensor([20, 30, 40])
     found = server.observe_each(known, steps)
     for i in range(n_agents):
         one = tree_map(lambda field, i=i: field[:, i], known)

@@ -66,7 +66,8 @@ def status_of(spots, empty=False, steps=5, over=False, **ends):
     """Success, terminated and truncated of one world in which the UAVs spot the source or not."""
     (_, uavs), *_ = random_worlds(0, len(spots), 0.0, 0.0)
     for uav, flag in zip(uavs, spots, strict=True):
-        uav.spots, uav.empty = flag, empty
+        uav.spots = flag
+        uav.empty = empty
     messages, _ = messages_of([(float(steps), uavs)])
     config = EpisodeConfig(**ends)
     ended = status(messages, torch.tensor([steps]), torch.tensor([over]), 1.0, config)

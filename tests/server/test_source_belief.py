@@ -65,7 +65,9 @@ def test_reports_of_a_source_that_stays_have_the_probabilities_of_all_cases(miss
     for row in range(0, half, 17):
         for cell in range(0, grid.prior.shape[1], 5):
             share = math.exp(float(plain.log_reports[row // 2 * 2 + 1, cell]))
-            now, both, before = 0.0, 0.0, 0.0
+            now = 0.0
+            both = 0.0
+            before = 0.0
             for covered, weight in ((True, share), (False, 1 - share)):
                 heard = 1 - miss if covered else alarm
                 fits = (
@@ -73,7 +75,8 @@ def test_reports_of_a_source_that_stays_have_the_probabilities_of_all_cases(miss
                 )  # while it emits; before, it may have been silent
                 quiet = alarm if row % 2 else 1 - alarm
                 earlier = emission * fits + (1 - emission) * quiet
-                now, before = now + weight * fits, before + weight * earlier
+                now = now + weight * fits
+                before = before + weight * earlier
                 both += weight * fits * earlier
             assert grid.log_reports[row, cell].exp().item() == pytest.approx(now, rel=1e-4)
             assert grid.log_reports[row + half, cell].exp().item() == pytest.approx(
@@ -88,7 +91,9 @@ class Flight:
     """Random reports with random delays, in worlds that begin new episodes and pause at random."""
 
     def __init__(self, grid: SourceGrid, n_worlds: int, own: bool, seed: int = 0) -> None:
-        self.grid, self.rng, self.n_agents = grid, np.random.default_rng(seed), 3
+        self.grid = grid
+        self.rng = np.random.default_rng(seed)
+        self.n_agents = 3
         self.window = empty_window(grid, LONGEST, n_worlds, self.n_agents, own)
         self.region = self.draw(len(grid.prior), n_worlds)
         self.steps: list[list] = [[] for _ in range(n_worlds)]
@@ -114,7 +119,8 @@ class Flight:
             self.steps[world] = []
 
     def step(self, stepped: Tensor) -> None:
-        rows, delay = self.rows(), self.draw(LONGEST + 2, *self.first.shape) - 1
+        rows = self.rows()
+        delay = self.draw(LONGEST + 2, *self.first.shape) - 1
         slot, *_ = _advance(*_parts(self.grid, self.window), rows, delay, self.region, stepped)
         self.window = self.window._replace(slot=slot)
         for world in stepped.nonzero().squeeze(-1).tolist():

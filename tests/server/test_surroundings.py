@@ -21,9 +21,11 @@ REST = ["coverage_map", "place", "time_left", "number"]
 def twin(env, messages, region, now, i):
     """The observation of UAV ``i`` of one world, by name, from the messages [N] that are known."""
     simulation = env.uav_env.simulation
-    points, radius = simulation.points, simulation.radius
+    points = simulation.points
+    radius = simulation.radius
     scale = simulation.airspace.scale[region].item()
-    target, place = messages.target.tolist(), messages.position.tolist()
+    target = messages.target.tolist()
+    place = messages.position.tolist()
     ways = []
     for j in range(len(target)):
         if j != i:
@@ -35,7 +37,8 @@ def twin(env, messages, region, now, i):
     landed = [
         (points[p].tolist(), k) for trail in messages.trail for k, p in enumerate(trail.tolist())
     ]
-    here, n = points[messages.trail[i, 0]].tolist(), messages.trail.shape[-1]
+    here = points[messages.trail[i, 0]].tolist()
+    n = messages.trail.shape[-1]
     new = []
     for ring in RINGS:
         for sector in range(SECTORS):
@@ -71,7 +74,8 @@ def check_others(rows, ways):
 @pytest.mark.parametrize(("agents", "motion"), [(1, "instant"), (3, "instant"), (7, "polynomial")])
 @pytest.mark.parametrize("own", [False, True])
 def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
-    local, shared = ["place", "time_left", "number"], ["others", "coverage_map"]
+    local = ["place", "time_left", "number"]
+    shared = ["others", "coverage_map"]
     scenario = ScenarioConfig(
         agents=agents,
         observation=ObservationConfig(local, shared, own=own, window=3),
@@ -81,7 +85,8 @@ def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
     )
     env = make_env(scenario, 3, seed=agents, extras=["message"])
     steps = env.rollout(12, break_when_any_done=False)
-    received, sent = steps["next"][keys.RECEIVED], steps["next"][keys.MESSAGE]
+    received = steps["next"][keys.RECEIVED]
+    sent = steps["next"][keys.MESSAGE]
     observed = steps["next"][keys.OBSERVATION]
     server = env.uav_env.server
     for world in range(len(steps)):

@@ -14,7 +14,8 @@ from damian.server.config import ObservationConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.config import RegionConfig
 
-SLOTS, AGENTS = 4, 3
+SLOTS = 4
+AGENTS = 3
 UNIFORM = {"law": "uniform", "low": 0, "high": 6}
 CASES = {
     "no delay": {},
@@ -47,13 +48,16 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
     env.transform[-1].dropped_keys = []
     torch.manual_seed(0)
     steps = env.rollout(25, break_when_any_done=False)
-    server, after, seen = env.server, steps["next"], 0
+    server = env.server
+    after = steps["next"]
+    seen = 0
     delay = after.get(keys.LINK_DELAY if name == "links" else keys.DELAY, None)
     delay = torch.zeros(4, 25, AGENTS, 1) if delay is None else delay
     if name != "links":  # by receiver and sender
         delay = delay.transpose(-1, -2).repeat(1, 1, AGENTS, 1)
         delay = delay.masked_fill(torch.eye(AGENTS, dtype=torch.bool) & own, 0)
-    sent, first = server.messages(after[keys.MESSAGE]), server.messages(steps[keys.MESSAGE])
+    sent = server.messages(after[keys.MESSAGE])
+    first = server.messages(steps[keys.MESSAGE])
     half = server.scales(sent) / 2
     observed = env.layout["observation"]["timeline"].of(after[keys.OBSERVATION]).flatten(-2)
     for world, t, i in itertools.product(range(4), range(25), range(AGENTS)):
@@ -63,7 +67,8 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
             first.position[world, begin],
             *sent.position[world, begin : t + 1],
         ]  # in this episode
-        now, targets = len(places) - 1, []
+        now = len(places) - 1
+        targets = []
         rows = torch.zeros(AGENTS, SLOTS + 1, 3)
         for j in range(AGENTS):
             arrived = [0]  # the message of the reset

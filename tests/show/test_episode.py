@@ -77,7 +77,8 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
         episode.save(tmp_path / "episode.json")
         again = Episode.load(tmp_path / "episode.json")
         for name in COLUMNS:
-            one, other = getattr(episode, name), getattr(again, name)
+            one = getattr(episode, name)
+            other = getattr(again, name)
             if one is None:
                 assert other is None
                 continue

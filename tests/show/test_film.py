@@ -76,12 +76,14 @@ def test_of_many_uavs_only_those_to_tell_apart_have_names_colours_and_rows(view,
 
 def test_uavs_have_their_colours_in_a_gif_too(tmp_path):
     rng = np.random.default_rng(0)
-    places, cells = rng.uniform(-180, 180, (20, 3)) * [1, 1, 0], rng.uniform(-190, 190, (64, 2))
+    places = rng.uniform(-180, 180, (20, 3)) * [1, 1, 0]
+    cells = rng.uniform(-190, 190, (64, 2))
     belief = np.tile(10 ** rng.uniform(-4, -1, 64), (1, 1, 1))
     film = crowd(0, position=places[None], cells=cells, belief=belief)
     save_film(film, tmp_path / "film.gif")
     with Image.open(tmp_path / "film.gif") as picture:
-        shown, drawn = np.asarray(picture.convert("RGB"), int), Film(film).frame(0)
+        shown = np.asarray(picture.convert("RGB"), int)
+        drawn = Film(film).frame(0)
     for colour in COLOURS[:3]:
         found = (drawn == np.round(np.multiply(to_rgb(colour), 255))).all(-1)
         assert found.any()

@@ -43,7 +43,8 @@ def local(feature: dict, origin: tuple[float, float]) -> np.ndarray:
 
 
 def test_an_episode_is_valid_and_lies_where_it_was_flown(episode):
-    collection, kinds = feature_collection(episode, 7), defaultdict(list)
+    collection = feature_collection(episode, 7)
+    kinds = defaultdict(list)
     FeatureCollection.model_validate(collection)
     for feature in collection["features"]:
         kinds[feature["properties"]["kind"]].append(feature)

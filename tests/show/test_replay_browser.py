@@ -23,7 +23,8 @@ from damian.show.replay_page import save_page
 
 pytestmark = pytest.mark.browser
 WEBGL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-LAST, LATE = 20, 4
+LAST = 20
+LATE = 4
 ROUND = 0.056
 """Largest error of a number of one decimal made of one with five significant digits, below
 1,000."""
@@ -199,7 +200,8 @@ def test_the_slider_the_keys_and_a_click_in_a_chart_go_to_an_instant(opened):
 def test_a_click_on_a_uav_or_on_its_number_dims_the_others(opened):
     with opened(flight(position=np.tile([[-100.0, 100, 0], [0, 0, 0]], (4, 1, 1)))) as page:
         dim = "return document.querySelector('.numbers tbody th').style.getPropertyValue('--uav')"
-        before, button = page.run(dim), page.all(".numbers tbody button")[1]
+        before = page.run(dim)
+        button = page.all(".numbers tbody button")[1]
         for press in (page.one("canvas.map").click, lambda: button.send_keys(" ")):
             press()
             page.settle()

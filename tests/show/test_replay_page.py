@@ -18,7 +18,9 @@ class Parts(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.found, self.comments, self.tags = [], [], []
+        self.found = []
+        self.comments = []
+        self.tags = []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -59,7 +61,8 @@ def test_a_page_holds_the_episodes_as_their_files_do(tmp_path):
 
 def test_a_page_is_small_and_loads_nothing():
     rng = np.random.default_rng(0)
-    steps, cells = 150, 256
+    steps = 150
+    cells = 256
     belief = rng.dirichlet(np.ones(cells), (steps + 1, 1))
     ordinary = flight(steps, cells=rng.uniform(-200, 200, (cells, 2)), belief=belief)
     text = page([ordinary])

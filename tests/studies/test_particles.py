@@ -15,7 +15,8 @@ WORLDS = 12
 def crowded(env: SimpleSpread) -> None:
     """Begin episodes in which bodies often touch each other and landmarks lie among them."""
     env.reset()
-    env.position, env.landmarks = 0.4 * env.position, 0.4 * env.landmarks
+    env.position = 0.4 * env.position
+    env.landmarks = 0.4 * env.landmarks
 
 
 def as_in_mpe2(

@@ -71,10 +71,13 @@ def way(steps: TensorDictBase, t: int, then: int, world: int, agent: int, other:
 
 
 def test_what_is_registered_stands_where_it_was_as_seen_from_where_the_agent_is_now():
-    held, timeline = flown("registered"), flown("timeline")
-    others, known = ([1, 2], [0, 2], [0, 1]), []
+    held = flown("registered")
+    timeline = flown("timeline")
+    others = ([1, 2], [0, 2], [0, 1])
+    known = []
     for t, world, agent, i in product(range(HORIZON + 1), range(WORLDS), range(3), range(2)):
-        block, agents = 5 * agent + 3 + i, (world, agent, others[agent][i])
+        block = 5 * agent + 3 + i
+        agents = (world, agent, others[agent][i])
         found = at(held, t, keys.OBSERVATION)[world, agent, 4:14].view(5, 2)[3 + i]
         torch.testing.assert_close(found, way(held, t, newest(held, t, world, block), *agents))
         slots = at(timeline, t, keys.OBSERVATION)[world, agent, 4 : 4 + 15 * SLOTS].view(
@@ -112,7 +115,8 @@ def corrected(method: str) -> list[TensorDictBase]:
 @pytest.mark.parametrize("method", ["backupdate", "registered+backupdate", "timeline+backupdate"])
 def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, method):
     for late in corrected(method):
-        kinematics, critic = late["next", *KINEMATICS], late["next", *keys.GLOBAL_OBSERVATION]
+        kinematics = late["next", *KINEMATICS]
+        critic = late["next", *keys.GLOBAL_OBSERVATION]
         seen = late["next", *SEEN].unflatten(2, (3, 5))
         if "registered" in method:
             seen = seen - kinematics[..., 2:].unsqueeze(-2)

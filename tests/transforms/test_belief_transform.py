@@ -59,7 +59,8 @@ def expected(
 
     Each source is followed as if it were the only one, [K, C].
     """
-    server, found = env.server, []
+    server = env.server
+    found = []
     first = server.messages(data[keys.MESSAGE][begin])
     sent = server.messages(data["next", *keys.MESSAGE])
     flag = data["next", *keys.MESSAGE_SENT]

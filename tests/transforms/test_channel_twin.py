@@ -20,7 +20,9 @@ from damian.delays.laws import Burst, Law, Trace, Uniform, law_of, sampler_of
 from damian.delays.samplers import ContextSampler, MessageContext
 from damian.transforms import Channel
 
-N, WORLDS, STEPS = 3, [3, 5, 8], 25
+N = 3
+WORLDS = [3, 5, 8]
+STEPS = 25
 CLOCKS = 2 * STEPS + 2
 ALL = set(permutations(range(N), 2))
 
@@ -45,19 +47,20 @@ class World:
         known: bool = False,
         own_at_reset: bool = True,
     ) -> None:
-        self.agents, self.delay, self.known, self.own_at_reset = (
-            range(n_agents),
-            delay,
-            known,
-            own_at_reset,
-        )
-        self.clock, self.began = 0, 0
+        self.agents = range(n_agents)
+        self.delay = delay
+        self.known = known
+        self.own_at_reset = own_at_reset
+        self.clock = 0
+        self.began = 0
 
     def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
         """Send on the wanted links, and receive."""
         self.clock += 1
         if begins:
-            self.began, self.in_transit, self.holds = self.clock, [], {}
+            self.began = self.clock
+            self.in_transit = []
+            self.holds = {}
         for link in wanted:
             if (delay := self.delay(self.clock, link)) is not None:
                 self.in_transit.append((self.clock + delay, link, self.clock, contents[link[1]]))
@@ -102,7 +105,8 @@ def check_against_twin(
         sent: key of what is sent, among the outputs, or among the inputs of a step.
     """
     torch.manual_seed(0)
-    td, worlds = env.reset(), range(env.batch_size[0])
+    td = env.reset()
+    worlds = range(env.batch_size[0])
     twins = [make(b, env.transform[-1].memory["streams"]) for b in worlds]
 
     def follow(outputs: TensorDictBase, inputs: TensorDictBase | None, mask: list[bool]) -> None:
@@ -191,7 +195,8 @@ def test_a_flag_chooses_who_sends():
 def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
     file = tmp_path / "trace.csv"
     file.write_text("\n".join(["delay", *"140203", "lost", "6"]))
-    burst, trace = Burst(0.3, 0.4, good=Uniform(0, 2), bad=5), Trace(str(file))
+    burst = Burst(0.3, 0.4, good=Uniform(0, 2), bad=5)
+    trace = Trace(str(file))
     laws = [[None, 3, burst], [trace, None, 3], [Uniform(0, 4), burst, None]]
     losses = [[0.0, 0.3, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 1.0]]
     losses[2][1] = 0.5

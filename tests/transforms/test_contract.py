@@ -209,7 +209,8 @@ def test_the_outputs_match_the_specs_and_every_spec_can_do_without_the_batch(cas
     for name in (
         name for name in dir(type(env)) if name.endswith("_spec_unbatched") and name[0] != "_"
     ):
-        spec, whole = getattr(env, name), getattr(env, name.removesuffix("_unbatched"))
+        spec = getattr(env, name)
+        whole = getattr(env, name.removesuffix("_unbatched"))
         assert spec.shape == whole.shape[dims:], name
         assert spec.rand().shape == spec.shape
 
@@ -285,7 +286,8 @@ def test_a_loaded_checkpoint_continues_bit_for_bit(case, whole, n_steps, used):
 def test_a_state_that_is_loaded_after_a_reset_shows_no_message_of_its_own_episode(case):
     """Only random streams are loaded, so that it is all one whether the state or the reset comes
     first."""
-    other, made = case.build(), []
+    other = case.build()
+    made = []
     begun(other)
     state = saved_and_loaded(other.transform.state_dict())
     for state_first in (True, False):
@@ -304,8 +306,12 @@ def test_a_state_that_is_loaded_after_a_reset_shows_no_message_of_its_own_episod
 @pytest.mark.sample(4)
 @every_case
 def test_in_the_middle_of_an_episode_no_other_state_is_loaded(case):
-    env, twin, other = case.build(), case.build(), case.build()
-    td, _, _ = begun(env, 3), begun(twin, 3), begun(other, 5, seed=9)
+    env = case.build()
+    twin = case.build()
+    other = case.build()
+    td = begun(env, 3)
+    _ = begun(twin, 3)
+    _ = begun(other, 5, seed=9)
     with pytest.warns(UserWarning, match="in the middle of an episode no state is loaded"):
         env.load_state_dict(saved_and_loaded(other.state_dict()))
     assert all_same(onward(env, td.clone()), onward(twin, td.clone()))
@@ -317,14 +323,17 @@ def test_in_the_middle_of_an_episode_no_other_state_is_loaded(case):
 @pytest.mark.sample(8)
 @some(CASES, fast=AGENTS)
 def test_a_step_compiles_into_one_graph_that_does_the_same(case):
-    env, twin = case.build(), case.build()
-    td, _ = begun(env), begun(twin)
+    env = case.build()
+    twin = case.build()
+    td = begun(env)
+    _ = begun(twin)
     torch._dynamo.reset()
     compiled = torch.compile(whole_step(twin.transform), fullgraph=True, backend="eager")
     for _ in range(4):
         td = env.rand_action(td)
         after = env.base_env.step(td)["next"]
-        one, other = whole_step(env.transform)(td, after.clone()), compiled(td, after.clone())
+        one = whole_step(env.transform)(td, after.clone())
+        other = compiled(td, after.clone())
         assert same(one, other)
     assert all(
         a.equal(b) for a, b in zip(memory(env.transform), memory(twin.transform), strict=True)
@@ -346,7 +355,8 @@ def whole_step(transform):
 @pytest.mark.sample(5)
 @every_case
 def test_a_collector_returns_the_same_data_as_a_rollout(case):
-    env, twin = case.build(), case.build()
+    env = case.build()
+    twin = case.build()
     for each in (env, twin):
         set_seed(each, 0)
     n_worlds = env.batch_size.numel()
@@ -364,8 +374,10 @@ def test_a_collector_returns_the_same_data_as_a_rollout(case):
 
 @pytest.mark.parametrize("case", BATCHED.values(), ids=BATCHED)
 def test_a_reset_of_some_worlds_does_not_change_the_others(case):
-    env, twin = case.build(), case.build()
-    td, _ = begun(env, 2), begun(twin, 2)
+    env = case.build()
+    twin = case.build()
+    td = begun(env, 2)
+    _ = begun(twin, 2)
     mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
     mask[0] = True
     reset = env.reset(td.clone().set("_reset", mask))
@@ -440,7 +452,8 @@ def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(k
 @drawing
 def test_set_seed_reaches_the_transforms_of_an_environment(kind, make):
     env = TransformedEnv(kind.make(), make(kind, Uniform(0, 20)))
-    outputs, streams = [], []
+    outputs = []
+    streams = []
     for number, seed in enumerate((3, 4, 3)):
         torch.manual_seed(number)  # the state of torch's generator does not matter
         set_seed(env, seed)
@@ -469,7 +482,8 @@ def test_all_streams_of_an_environment_differ(wrap):
         ]
 
     for seeded in (False, True):
-        env, transforms = KINDS["flags in the group"].make(), chain()
+        env = KINDS["flags in the group"].make()
+        transforms = chain()
         for transform in transforms if wrap else [Compose(*transforms)]:
             env = TransformedEnv(env, transform, auto_unwrap=False)
         if seeded:
@@ -542,12 +556,14 @@ class ByContent(Law):
     ids=[*TRANSFORMS, "ObservationDelay by content"],
 )
 def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
-    kind, law = KINDS["CartPole"], Burst(0.4, 0.4, good=Uniform(0, 2), bad=3, bad_loss=0.0)
+    kind = KINDS["CartPole"]
+    law = Burst(0.4, 0.4, good=Uniform(0, 2), bad=3, bad_loss=0.0)
     skipping, steady = (TransformedEnv(two_worlds(), make(kind, law)) for _ in range(2))
     for env in (skipping, steady):
         set_seed(env, 1)
         env.transform.seed_worlds(torch.tensor([5, 6]))
-    td, other = skipping.reset(), steady.reset()
+    td = skipping.reset()
+    other = steady.reset()
     actions = torch.randint(2, (8, 2), generator=torch.Generator().manual_seed(0))
     for t in range(8):
         after = steady.step(other.clone().set("action", actions[t]))["next"]

@@ -71,17 +71,22 @@ def test_between_two_ticks_entries_and_actions_are_held_and_no_agent_is_ready(pe
     clock = SampleAndHold(
         period, [("agents", "message_sent")], [ACTION], ready_key=("agents", "ready")
     )
-    outputs, undelayed = play(delayed(clock), chosen), play(Counting(WORLDS, N_AGENTS), chosen)
-    ready, held = column(outputs, "agents", "ready"), column(outputs, "agents", "message_sent")
+    outputs = play(delayed(clock), chosen)
+    undelayed = play(Counting(WORLDS, N_AGENTS), chosen)
+    ready = column(outputs, "agents", "ready")
+    held = column(outputs, "agents", "message_sent")
     ready_now, sent, done = (
         column(undelayed, *key)
         for key in (("agents", "ready"), ("agents", "message_sent"), ("done",))
     )
     executed = column(outputs, *OBSERVATION)
     for w, n in ROWS:
-        elapsed, sampled, executes = 0, sent[0][w][n], None
+        elapsed = 0
+        sampled = sent[0][w][n]
+        executes = None
         for t in range(STEPS):
-            at, reset = 2 * t + 1, 2 * t + 2
+            at = 2 * t + 1
+            reset = 2 * t + 2
             executes = chosen[t][w, n].item() if elapsed % period == 0 else executes
             elapsed += 1
             ticks = elapsed % period == 0
@@ -90,7 +95,8 @@ def test_between_two_ticks_entries_and_actions_are_held_and_no_agent_is_ready(pe
             assert [held[at][w][n], ready[at][w][n]] == expected
             assert executed[at][w][n][5] == executes
             if done[at][w][0]:
-                elapsed, sampled = 0, sent[reset][w][n]
+                elapsed = 0
+                sampled = sent[reset][w][n]
                 expected = [sampled, ready_now[reset][w][n]]
             assert [held[reset][w][n], ready[reset][w][n]] == expected
 
@@ -98,11 +104,13 @@ def test_between_two_ticks_entries_and_actions_are_held_and_no_agent_is_ready(pe
 @pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize("recorded_key", [None, "ready"])
 def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_key):
-    default, chosen = 2, choices()
+    default = 2
+    chosen = choices()
     history = ActionHistory(steps, ACTION, default=default, recorded_key=recorded_key)
     outputs = play(delayed(history), chosen)
     found = torch.stack([td["agents", "action_history"] for td in outputs])
-    ready, done = before(outputs, "agents", "ready"), after(outputs, "done")
+    ready = before(outputs, "agents", "ready")
+    done = after(outputs, "done")
     for w, n in ROWS:
         recorded = []
         for t in range(STEPS):
@@ -120,14 +128,16 @@ def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_
 def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_does_not_reflect(
     law, recorded_key, reflected_after
 ):
-    default, chosen = 2, choices()
+    default = 2
+    chosen = choices()
     late = ObservationDelay(law, [OBSERVATION])
     when = {"recorded_key": recorded_key, "reflected_after": reflected_after}
     history = ActionHistory(3, ACTION, default=default, age_key="age", **when)
     outputs = play(delayed(late, history), chosen)
     found = torch.stack([td["agents", "action_history"] for td in outputs])
     ages = column(outputs, "agents", "age")
-    ready, done = before(outputs, "agents", "ready"), after(outputs, "done")
+    ready = before(outputs, "agents", "ready")
+    done = after(outputs, "done")
     for w, n in ROWS:
         recorded: list[tuple[int, int]] = []
         for t in range(STEPS):

@@ -74,7 +74,8 @@ def collect(env: EnvBase, n_steps: int = 30) -> TensorDictBase:
 def test_stored_steps_are_delayed_as_in_the_environment(kind, chain):
     make, keys = KINDS[kind]
     env = TransformedEnv(make(), CHAINS[chain](*keys))
-    online, stored = collect(env), collect(make())
+    online = collect(env)
+    stored = collect(make())
     assert online[keys[1]].equal(stored[keys[1]])
     found = delay_trajectories(stored, env.transform, action_spec=make().action_spec)
     assert same(found, online)

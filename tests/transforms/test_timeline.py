@@ -14,7 +14,9 @@ from damian.envs.uav_env import UavEnv
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms import Channel, ObservationDelay, ObservationTimeline, set_seed
 
-K, WORLDS, AGENTS = 3, 2, 3
+K = 3
+WORLDS = 2
+AGENTS = 3
 ALL = [(False, False), (True, False), (True, True)]
 """Whether a timeline is that of a group, and whether it has one's own messages at once."""
 
@@ -51,7 +53,10 @@ def twin(
 
     With ``until``, it is that of hindsight: from what has arrived after that step.
     """
-    steps, after, found, first = data[world], data[world]["next"], [], 0
+    steps = data[world]
+    after = data[world]["next"]
+    found = []
+    first = 0
     senders = [(receiver + i) % AGENTS for i in range(AGENTS)] if group else [receiver]
 
     def arrived(entries: TensorDictBase, sender: int, since: int) -> bool:
@@ -64,12 +69,14 @@ def twin(
         rows = []
         for sender in senders:
             for age in range(K):
-                sent, since = now - age, (now if until is None else until) - (now - age)
+                sent = now - age
+                since = (now if until is None else until) - (now - age)
                 row = torch.zeros(steps[keys.MESSAGE].shape[-1] + 1)
                 is_own = own and sender == receiver
                 if sent >= first:
                     at_once = is_own and bool(after[keys.MESSAGE_SENT][sent, sender])
-                    known, message = arrived(after[sent], sender, since) or at_once, after[sent]
+                    known = arrived(after[sent], sender, since) or at_once
+                    message = after[sent]
                 else:  # the message of the reset, or one before it
                     known = sent == first - 1 and (arrived(steps[first], sender, since) or is_own)
                     message = steps[first]
@@ -106,7 +113,8 @@ def test_stored_timelines_are_corrected_by_what_has_arrived_since(group, own):
     storage = BackupdateStorage(
         1000, lambda steps, latest: {}, 3, corrections=corrections_of(env.transform, [key])
     )
-    buffer, steps = ReplayBuffer(storage=storage), env.rollout(17, break_when_any_done=False)
+    buffer = ReplayBuffer(storage=storage)
+    steps = env.rollout(17, break_when_any_done=False)
     for end, part in zip((7, 8, 17), steps.split([7, 1, 9], 1), strict=True):
         buffer.extend(part)
         data = steps[:, :end]

@@ -23,7 +23,8 @@ def test_recorded_flights_have_the_same_drain():
     rows = [row for row in ENERGY["consumption"] if row["mode"] == "estimate"]
     assert len(rows) == 5
     for row in rows:
-        vertical, distance = row["T_takeoff_or_landing"], row["speed"] * row["T_flight"]
+        vertical = row["T_takeoff_or_landing"]
+        distance = row["speed"] * row["T_flight"]
         drain = flight_drain(tensor(vertical), tensor(distance), BATTERY)
         assert drain.item() == pytest.approx(row["battery_percent"], rel=1e-4)
 
@@ -60,21 +61,23 @@ def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical
 
 def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
     env = fresh(everything(episode=KEEPS_GOING), num_worlds=4)
-    battery, motion = env.scenario.battery, env.scenario.motion
+    battery = env.scenario.battery
+    motion = env.scenario.motion
     power = (
         100 * battery.engine_power_kw / (battery.capacity_kwh * battery.efficiency) / 3600
     )  # % a second
     gain = 100 * battery.charging_power_kw / (3600 * battery.capacity_kwh)
-    hardest, generator, flown = 10 * math.sqrt(3) / 3, torch.Generator().manual_seed(0), 0
-    levels, before = env.state.battery.tolist(), env.state.position[..., :2].tolist()
+    hardest = 10 * math.sqrt(3) / 3
+    generator = torch.Generator().manual_seed(0)
+    flown = 0
+    levels = env.state.battery.tolist()
+    before = env.state.position[..., :2].tolist()
     for _ in range(12):
         act(env, random_actions(env, generator))
         after = env.state.position[..., :2].tolist()
         for b, n in [(b, n) for b in range(4) for n in range(3)]:
-            way, height = (
-                math.dist(before[b][n], after[b][n]),
-                motion.min_level + n * motion.level_separation,
-            )
+            way = math.dist(before[b][n], after[b][n])
+            height = motion.min_level + n * motion.level_separation
             hard = math.sqrt(hardest * height / motion.max_acceleration)
             up = max(15 / 8 * height / motion.max_speed, hard)
             drain = power * (2 * up / 0.9 + way / battery.reference_speed) if way else -gain

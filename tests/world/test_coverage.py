@@ -69,14 +69,16 @@ def test_coverage_is_within_one_percent_of_the_exact_area(kind, spread):
         polygon = random_polygon(rng, kind)
         positions = random_points(rng, polygon, n_uavs * n_last, spread)
         positions = positions.reshape(n_uavs, n_last, 2)
-        got, exact = share_at(polygon, positions), exact_share(polygon, positions, R)
+        got = share_at(polygon, positions)
+        exact = exact_share(polygon, positions, R)
         np.testing.assert_allclose(got, exact, rtol=0, atol=0.01)
 
 
 def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
     golden = json.loads((DATA / "motion_energy_coverage.json").read_text())["coverage"]
     scenario = json.loads((DATA / "usecase1.json").read_text())["scenario"]
-    polygon, radius = Polygon(scenario["polygon_vertices_ring"]), golden["footprint_radius"]
+    polygon = Polygon(scenario["polygon_vertices_ring"])
+    radius = golden["footprint_radius"]
     assert len(golden["cases"]) == 6
     for case in golden["cases"]:
         newest = [[old_new[-1]] for old_new in case["stored_positions_old_new"]]
@@ -86,7 +88,8 @@ def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
 
 
 def test_a_sequence_of_steps_equals_each_step_by_itself():
-    axis, generator = np.linspace(-190, 190, 6), torch.Generator().manual_seed(0)
+    axis = np.linspace(-190, 190, 6)
+    generator = torch.Generator().manual_seed(0)
     points = np.array(list(itertools.product(axis, axis)))
     tables = build_tables([shapely.box(-200, -200, 200, 200)], points[None], R)
     places = torch.tensor(points, dtype=torch.float32)

@@ -56,6 +56,7 @@ def test_masked_actions_hold_and_legal_actions_lead_to_their_nearest_point(energ
         )
         assert legal.equal((nearest == 0) | (drain <= level))  # takeoff and landing count as well
         assert moved[legal].equal(nearest[legal] > 0)
-        masked, reached = masked + int((~legal).sum()), reached + int(moved.sum())
+        masked = masked + int((~legal).sum())
+        reached = reached + int(moved.sum())
     assert masked > 100
     assert reached > 100

@@ -26,7 +26,9 @@ from damian.world.config import (
 )
 
 DENTED = [[0, 0], [600, 0], [600, 400], [320, 400], [300, 240], [280, 400], [0, 400]]
-SPEED, HARDEST, LEAST = [8.0, 12.0, 20.0], [1.0, 2.0, 4.0], 2.0
+SPEED = [8.0, 12.0, 20.0]
+HARDEST = [1.0, 2.0, 4.0]
+LEAST = 2.0
 WORLD = ScenarioConfig(
     agents=3,
     region=RegionConfig(kind="vertices", vertices=DENTED, lattice_step=50.0),
@@ -42,7 +44,8 @@ STILL = replace(WORLD, motion=MotionConfig(), battery=BatteryConfig())
 
 def through_the_air(way, wind, speed):
     """Way through the air [m] of a flight over places, and its lowest ground speed [m/s]."""
-    total, slowest = 0.0, math.inf
+    total = 0.0
+    slowest = math.inf
     for (x, y), (u, v) in itertools.pairwise(way):
         length = math.hypot(u - x, v - y)
         if length:
@@ -60,10 +63,13 @@ def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
     env = UavEnv(replace(WORLD, wind=WindConfig(speed=speed, direction=whence)), 12, seed=1)
     blows = -speed * math.sin(math.radians(whence)), -speed * math.cos(math.radians(whence))
     env.set_seed(2)
-    td, flown = env.reset(), 0
+    td = env.reset()
+    flown = 0
     for _ in range(30):
-        mask, stands = td["agents", "action_mask"], env.state
-        points, nearest = env.simulation.points, env.simulation.candidates.nearest
+        mask = td["agents", "action_mask"]
+        stands = env.state
+        points = env.simulation.points
+        nearest = env.simulation.candidates.nearest
         ready = env.simulation.vehicles.ready(stands)
         for world, uav in ready.nonzero().tolist():
             origin = stands.goal[world, uav]
@@ -119,13 +125,16 @@ def test_equal_values_for_each_uav_are_bit_for_bit_one_value():
 
 def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
     drawn = {"wind.speed": [0, 6], "motion.max_acceleration": [1, 2, 3], "source.miss": [0.0, 0.5]}
-    flying, gusty = MotionConfig(kind="polynomial"), WindConfig(gusts=2.0)
+    flying = MotionConfig(kind="polynomial")
+    gusty = WindConfig(gusts=2.0)
     scenario = replace(WORLD, motion=flying, wind=gusty, randomise=drawn)
-    together, alone = UavEnv(scenario, 5, seed=0), UavEnv(scenario, 1, seed=0)
+    together = UavEnv(scenario, 5, seed=0)
+    alone = UavEnv(scenario, 1, seed=0)
     seeds = torch.arange(5) * 17
     together.seed_worlds(seeds)
     alone.seed_worlds(seeds[3:4])
-    tds, seen = [together.reset(), alone.reset()], []
+    tds = [together.reset(), alone.reset()]
+    seen = []
     for step in range(120):
         action = torch.randint(24, (5, 3), generator=torch.Generator().manual_seed(step))
         for index, (env, rows) in enumerate(((together, action), (alone, action[3:4]))):
@@ -144,10 +153,8 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
 
 @pytest.mark.parametrize(("kind", "belief"), [("instant", True), ("polynomial", False)])
 def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
-    levels, flying = (
-        [138.0, 142.0, 145.0],
-        MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0),
-    )
+    levels = [138.0, 142.0, 145.0]
+    flying = MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
     base = replace(
         STILL,
         motion=flying,
@@ -167,9 +174,11 @@ def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     envs += [make_env(scenario, 8) for scenario in scenarios]
     for env in envs:
         env.set_seed(1)
-    tds, met = [env.reset() for env in envs], set()
+    tds = [env.reset() for env in envs]
+    met = set()
     for step in range(30):
-        action, steps = torch.randint(24, (8, 3), generator=torch.Generator().manual_seed(step)), []
+        action = torch.randint(24, (8, 3), generator=torch.Generator().manual_seed(step))
+        steps = []
         for i, env in enumerate(envs):
             before, tds[i] = env.step_and_maybe_reset(tds[i].set(("agents", "action"), action))
             steps.append(before["next"])
@@ -197,7 +206,8 @@ def test_what_has_tables_for_each_level_refuses_a_range_of_them(seen):
 
 
 def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
-    losses, law = [0.0, 0.3, 0.9], {"law": "lag", "lag": {"law": "uniform", "low": 1, "high": 4}}
+    losses = [0.0, 0.3, 0.9]
+    law = {"law": "lag", "lag": {"law": "uniform", "low": 1, "high": 4}}
     scenarios = [replace(STILL, delay=DelayConfig(law), randomise={"delay.loss": losses})]
     scenarios += [replace(STILL, delay=DelayConfig(law, loss=loss)) for loss in losses]
     envs = [make_env(each, 12, 0, extras=["message"]) for each in scenarios]
@@ -206,7 +216,8 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
     ]
     flown = []
     for env in envs:
-        td, steps = env.reset(), []
+        td = env.reset()
+        steps = []
         for action in actions:
             before, td = env.step_and_maybe_reset(td.set(("agents", "action"), action))
             steps.append(before["next"])
@@ -222,11 +233,13 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
 def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
     source = replace(WORLD.source, level_db=150.0, miss=0.3, false_alarm=0.1)
     env = UavEnv(replace(STILL, source=source), 64, seed=0)
-    td, counts = env.reset(), torch.zeros(2, 2)
+    td = env.reset()
+    counts = torch.zeros(2, 2)
     for _ in range(40):
         state = env.state
         near = torch.linalg.vector_norm(state.position[..., :2] - state.source, dim=-1)
-        near, spotted = near <= env.simulation.radius, state.sent.spotted
+        near = near <= env.simulation.radius
+        spotted = state.sent.spotted
         for row, mask in enumerate((near, ~near)):
             counts[row] += torch.tensor([(spotted & mask).sum(), mask.sum()])
         td = env.rand_step(td)["next"]
@@ -240,8 +253,12 @@ def test_reports_of_two_sources_are_those_of_a_plain_loop():
     moving = replace(WORLD.motion, max_speed=60.0, max_acceleration=40.0)
     scenario = replace(WORLD, motion=moving, source=SourceConfig(count=2, each=each))
     scenario = replace(scenario, episode=EpisodeConfig(None, all_sources=True))
-    env, tag = UavEnv(scenario, 8, seed=0), torch.tensor(counter_rng.number_of("report"))
-    td, missed, alarms, successes = env.reset(), 0, 0, 0
+    env = UavEnv(scenario, 8, seed=0)
+    tag = torch.tensor(counter_rng.number_of("report"))
+    td = env.reset()
+    missed = 0
+    alarms = 0
+    successes = 0
     heard = [[[-1.0, -1.0] for _ in range(3)] for _ in range(8)]
     for t in range(31):
         state = env.state
@@ -277,14 +294,17 @@ def test_the_truth_pays_and_ends_as_if_there_were_no_misses_and_false_alarms(end
     reward = RewardConfig(
         spotted=1.0, spotting_agents=1.0, source_distance=0.5, bonus=7.0, penalty=3.0
     )
-    source, episode = SourceConfig(count=2, level_db=150.0), EpisodeConfig(12, **ends)
+    source = SourceConfig(count=2, level_db=150.0)
+    episode = EpisodeConfig(12, **ends)
     clear = replace(STILL, reward=reward, source=source, episode=episode)
     reported = replace(clear, source=replace(clear.source, miss=0.5, false_alarm=0.2))
-    judged, rewards = replace(reported, reward=replace(clear.reward, detection="truth")), []
+    judged = replace(reported, reward=replace(clear.reward, detection="truth"))
+    rewards = []
     for scenario in (clear, judged, reported):
         env = UavEnv(scenario, 16, seed=0)
         env.set_seed(1)
-        td, found = env.reset(), []
+        td = env.reset()
+        found = []
         for step in range(20):
             action = torch.randint(24, (16, 3), generator=torch.Generator().manual_seed(step))
             td = env.step(td.set(("agents", "action"), action))["next"]
@@ -312,8 +332,10 @@ def test_a_battery_is_empty_where_it_allows_no_flight_in_this_wind(kind):
     td = env.rand_action()
     td["agents", "action"] = torch.zeros_like(td["agents", "action"])  # all hold
     td = env.step(td)["next"]
-    state, points = env.state, env.simulation.points.tolist()
-    reach, counts = env.simulation.vehicles.battery_reach(state), [0, 0]
+    state = env.state
+    points = env.simulation.points.tolist()
+    reach = env.simulation.vehicles.battery_reach(state)
+    counts = [0, 0]
     for b, n in itertools.product(range(64), range(3)):
         at = points[state.goal[b, n]]
         if kind == "discrete":

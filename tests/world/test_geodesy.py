@@ -12,7 +12,8 @@ OFFSETS_M = st.floats(-35_000, 35_000)
 
 def test_distance_and_bearing_agree_with_vector_geometry_on_the_sphere():
     rng = np.random.default_rng(0)
-    lat, lon = rng.uniform(-89, 89, 500), rng.uniform(-180, 180, 500)
+    lat = rng.uniform(-89, 89, 500)
+    lon = rng.uniform(-180, 180, 500)
     for origin in [(0.0, 0.0), (52.8, -4.1), (-80.0, 179.0)]:
         x, y = to_local(lat, lon, origin)
         expected = [_local_by_vectors(a, b, origin) for a, b in zip(lat, lon, strict=True)]

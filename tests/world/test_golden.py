@@ -32,7 +32,8 @@ def reason_for_other_point(case: int, transition: Transition, uav: int) -> str |
     points = golden["scenario"]["landing_points"]
     polygon = shapely.Polygon(golden["scenario"]["polygon_vertices_ring"])
     row = golden["action_table"][transition.after["actions"][uav]]
-    here, there = transition.places[uav], transition.after["positions"]
+    here = transition.places[uav]
+    there = transition.after["positions"]
     target = [here[0] + row["dx"], here[1] + row["dy"]]
     if not shapely.contains_xy(polygon, *target):
         target = here
@@ -79,7 +80,8 @@ def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(
     theirs = column(records, "spotting_true").bool()
     assert spotted.equal(theirs)
     assert theirs.numel() == n_flags
-    motions, expected = env.state.motions, column(records, "motions_counter_after")
+    motions = env.state.motions
+    expected = column(records, "motions_counter_after")
     # In the original the counter of a UAV stays at 0 for some steps after a detection.
     side_effect = ~theirs & (expected == 0)
     assert int(side_effect.sum()) == after_detection
@@ -91,7 +93,8 @@ def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(
 def test_the_recorded_geometry_and_action_table_are_reproduced(case):
     golden = GOLDEN[case]["scenario"]
     env = UavEnv(usecase(case))
-    simulation, airspace = env.simulation, env.simulation.airspace
+    simulation = env.simulation
+    airspace = env.simulation.airspace
     assert airspace.n_points.tolist() == [golden["n_landing_points"]] == [92]
     ours = settings_points(env)
     distance = torch.cdist(ours, torch.tensor(golden["landing_points"], dtype=torch.float64))

@@ -120,9 +120,11 @@ def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds,
     polygons = [
         shapely.MultiPoint(points).buffer(r) for points, r in zip(lattices, radii, strict=True)
     ]
-    region, target = rng.integers(len(kinds), size=12), np.empty((12, 2))
+    region = rng.integers(len(kinds), size=12)
+    target = np.empty((12, 2))
     for i, (points, radius) in enumerate((lattices[r], radii[r]) for r in region):
-        distance, angle = rng.uniform(0, 0.9 * radius), rng.uniform(0, 2 * math.pi)
+        distance = rng.uniform(0, 0.9 * radius)
+        angle = rng.uniform(0, 2 * math.pi)
         if rng.random() < 0.5:  # round numbers, so that points may be equally near
             distance = min(rng.choice([0.0, 15.0, 30.0, 45.005]), distance)
             angle = math.pi / 4 * rng.integers(8)

@@ -43,7 +43,8 @@ def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(c
     position, crossed = poses(
         torch.stack([origin, target], -2), level, elapsed, *times, case["degree"]
     )
-    velocity, acceleration = [], []
+    velocity = []
+    acceleration = []
     for axis in position.unbind(-1):
         (v,) = torch.autograd.grad(axis.sum(), elapsed, create_graph=True)
         velocity.append(v)

@@ -24,7 +24,8 @@ def shortest(polygon, origin, goal):
     """Length of the shortest way in a polygon by Dijkstra's search over all corners, if there is
     one."""
     places = [tuple(origin), tuple(goal), *set(map(tuple, shapely.get_coordinates(polygon)))]
-    best, queue = {}, [(0.0, 0)]
+    best = {}
+    queue = [(0.0, 0)]
     while queue:
         length, here = heapq.heappop(queue)
         if here in best:
@@ -83,10 +84,12 @@ def test_a_flight_around_a_zone_takes_the_time_of_its_way():
     env = UavEnv(
         ScenarioConfig(agents=1, region=region, motion=MotionConfig(kind="polynomial")), 1, 0
     )
-    airspace, vehicles = env.simulation.airspace, env.simulation.vehicles
+    airspace = env.simulation.airspace
+    vehicles = env.simulation.vehicles
     first = divmod(int(airspace.detours.pair[0]), airspace.max_points)
     origin, goal = (torch.tensor([[each]]) for each in first)
-    state, yes = env.state._replace(goal=origin), torch.ones(1, 1, dtype=torch.bool)
+    state = env.state._replace(goal=origin)
+    yes = torch.ones(1, 1, dtype=torch.bool)
     state = vehicles.take_off(state, goal, yes, yes)
     straight = torch.dist(airspace.points[0, origin.item()], airspace.points[0, goal.item()])
     assert airspace.length(origin, goal) > straight

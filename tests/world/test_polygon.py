@@ -63,7 +63,8 @@ def test_an_impossible_lattice_is_refused(step, degrees, n, message):
 
 
 def test_random_polygons_have_the_statistics_of_the_original():
-    stats, rng = GOLDEN["random_polygon_stats"], np.random.default_rng(0)
+    stats = GOLDEN["random_polygon_stats"]
+    rng = np.random.default_rng(0)
     polygons = [random_polygon(rng, stats["min_area"], stats["max_area"]) for _ in range(300)]
     measured = {
         "area": lambda p: p.area,

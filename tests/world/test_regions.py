@@ -23,7 +23,8 @@ from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon
 from damian.world.regions.region import Region
 
 DATA = Path(__file__).parents[1] / "data" / "regions"
-FIR, ZONES = DATA / "fir.csv", DATA / "zones.geojson"
+FIR = DATA / "fir.csv"
+ZONES = DATA / "zones.geojson"
 SHIPPED = Path(damian.__file__).parent / "data" / "fir.csv"
 DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 
@@ -268,10 +269,8 @@ def test_a_wrong_choice_of_features_is_refused_by_its_key(choice, message):
 
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyogrio", None)
-    file, message = (
-        tmp_path / "map.gpkg",
-        "needs pyogrio, which is missing: pip install 'damian[gis]'",
-    )
+    file = tmp_path / "map.gpkg"
+    message = "needs pyogrio, which is missing: pip install 'damian[gis]'"
     _assert_one_line_error(file, message, lambda: read_area(file))
 
 
@@ -374,7 +373,8 @@ def test_a_plan_without_the_outline_of_a_fence_is_refused_with_the_remedy(tmp_pa
 
 
 def test_an_open_outline_of_a_kml_is_refused(tmp_path):
-    file, message = _map(tmp_path / "open.kml", ring=[*RING[:3], RING[1]]), "features[0]: "
+    file = _map(tmp_path / "open.kml", ring=[*RING[:3], RING[1]])
+    message = "features[0]: "
     _assert_one_line_error(file, message, lambda: read_area(file, index=1))
 
 

@@ -16,7 +16,8 @@ from damian.envs.uav_env import UavEnv
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import MotionConfig, RegionConfig, RequestConfig, SourceConfig
 
-RATE, MOST = 40.0, 3
+RATE = 40.0
+MOST = 3
 
 
 def scenario(**changed) -> ScenarioConfig:
@@ -38,16 +39,21 @@ def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
     motion = MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
     env = UavEnv(scenario(motion=motion, clock=ClockConfig(f"{dt}s")), 6, seed=2)
     env.set_seed(5)
-    mean, several = RATE * dt / 60, 0
+    mean = RATE * dt / 60
+    several = 0
     none_of = [math.exp(-mean) * mean**k / math.factorial(k) for k in range(MOST)]
     at_least = [1 - math.fsum(none_of[:k]) for k in range(1, MOST + 1)]
     tag = torch.tensor(counter_rng.number_of("request appears"))
-    td, radius, served_ever, lost = env.reset(), env.simulation.radius, 0, 0
+    td = env.reset()
+    radius = env.simulation.radius
+    served_ever = 0
+    lost = 0
     slots = [[(*row,) for row in world] for world in env.state.requests.tolist()]
     memory = env.state.sent.served.tolist()
     for _ in range(60):
         after, td = env.step_and_maybe_reset(env.rand_action(td))
-        state, rewards = env.state, after["next", "agents", "reward"]
+        state = env.state
+        rewards = after["next", "agents", "reward"]
         shares = counter_rng.uniform(state.seed, tag.expand(6), state.episode, state.steps).tolist()
         lands = env.simulation.vehicles.new_stop(
             state, env.simulation.vehicles.on_ground(state), None
@@ -64,7 +70,8 @@ def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
             several += min(number, len(free)) > 1
             for m in sorted(free, key=lambda m: slots[b][m][2])[:number]:
                 slots[b][m] = (*state.requests[b, m, :2].tolist(), float(state.steps[b] * dt))
-            taken, was = set(), [max(row[m] for row in memory[b]) for m in range(MOST)]
+            taken = set()
+            was = [max(row[m] for row in memory[b]) for m in range(MOST)]
             for n in range(3):
                 at = state.position[b, n, :2].tolist()
                 near = [
@@ -96,11 +103,13 @@ def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
 
 
 def test_with_a_range_uavs_know_what_they_have_heard_on_the_ground():
-    flying, reach = MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0), 120.0
+    flying = MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0)
+    reach = 120.0
     env = UavEnv(
         scenario(motion=flying, requests=RequestConfig(RATE, MOST, range=reach)), 6, seed=2
     )
-    td, heard = env.reset(), 0
+    td = env.reset()
+    heard = 0
     known = torch.full((6, 3, MOST, 3), -1.0).tolist()
     for _ in range(40):
         state = env.state
@@ -137,7 +146,11 @@ def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
     asked = scenario(motion=flying, delay=late, requests=RequestConfig(RATE, 6, range=reach))
     env = make_env(asked, 4, 0, extras=["message"])
     steps = env.rollout(39, break_when_any_done=False)["next", "agents"]
-    server, shown, overtaken, paid, served = env.uav_env.server, 0, 0, 0, 0
+    server = env.uav_env.server
+    shown = 0
+    overtaken = 0
+    paid = 0
+    served = 0
     held, sent = (server.messages(steps[name]) for name in ("received", "message"))
     half = server.scales(held)[0, 0].item() / 2
     seen = steps["global_observation"][..., 20:36].unflatten(-1, (4, 4))
@@ -146,7 +159,8 @@ def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
         before = [0.0] * 3
         for t in range(39):
             now = [field[b, t].tolist() for field in (held.time, held.serves, held.target)]
-            known, done = held.requests[b, t].tolist(), held.served[b, t].tolist()
+            known = held.requests[b, t].tolist()
+            done = held.served[b, t].tolist()
             newest = [
                 max((row[m] for row in known), key=lambda request: request[2]) for m in range(6)
             ]
@@ -194,9 +208,13 @@ def test_what_needs_requests_is_refused_without_them():
 
 def test_a_uav_observes_the_nearest_open_requests_by_the_newest_that_anybody_knows():
     env = UavEnv(scenario(), 1, seed=0)
-    sent, half = env.state.sent, env.simulation.airspace.scale.item() / 2
+    sent = env.state.sent
+    half = env.simulation.airspace.scale.item() / 2
     at = torch.tensor([[0.0, 0.0], [10.0, 0.0], [-60.0, 0.0]])
-    old, near, far, done = [50.0, 0, 1], [20.0, 0, 4], [-90.0, 0, 8], [5.0, 0, 6]
+    old = [50.0, 0, 1]
+    near = [20.0, 0, 4]
+    far = [-90.0, 0, 8]
+    done = [5.0, 0, 6]
     requests = torch.tensor(
         [[old, far, [0, 0, -1.0]], [near, [0, 0, -1.0], done], [near, far, done]]
     )

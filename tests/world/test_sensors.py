@@ -23,8 +23,12 @@ def sensing(motion: str = "instant", **changed) -> ScenarioConfig:
 def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_last_messages(
     motion,
 ):
-    env, generator = UavEnv(sensing(motion), num_worlds=4, seed=2), torch.Generator().manual_seed(0)
-    td, expected, kept, resets = env.reset(), readings_of(env), 0, 0
+    env = UavEnv(sensing(motion), num_worlds=4, seed=2)
+    generator = torch.Generator().manual_seed(0)
+    td = env.reset()
+    expected = readings_of(env)
+    kept = 0
+    resets = 0
     for _ in range(30):
         read = env.server.messages(td["agents", "message"]).readings
         torch.testing.assert_close(read, expected, rtol=0, atol=1e-3)
@@ -36,7 +40,8 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
         )
         sends = td["agents", "message_sent"]
         expected = torch.where(sends.unsqueeze(-1), readings_of(env), expected)
-        kept, resets = kept + int((~sends).sum()), resets + int(after["next", "done"].sum())
+        kept = kept + int((~sends).sum())
+        resets = resets + int(after["next", "done"].sum())
     assert resets > 0
     assert (kept > 50) == (motion == "polynomial")
 
@@ -49,7 +54,8 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
     shape=st.lists(st.integers(1, 3), min_size=1, max_size=3),
 )
 def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, n_sources, shape):
-    generator, widths = torch.Generator().manual_seed(seed), Widths(n_sources, n_readings)
+    generator = torch.Generator().manual_seed(seed)
+    widths = Widths(n_sources, n_readings)
     blank = Messages.blank(torch.randint(2**24, (*shape, window), generator=generator), widths)
     assert blank.readings.shape == (*shape, n_readings)
 

@@ -74,7 +74,8 @@ def test_success_needs_somebody_at_each_source_at_the_same_time():
         1,
     )
     env.reset()
-    airspace, state = env.simulation.airspace, env.state
+    airspace = env.simulation.airspace
+    state = env.state
     places = torch.tensor(PLACES, dtype=torch.float64) - airspace.offset[0].double()
     points = airspace.nearest(places.numpy(), 0)
     hold = int(env.simulation.candidates.hold.int().argmax())
@@ -106,7 +107,8 @@ def test_the_script_finds_more_than_chance():
     told = scenario(
         source, episode=EpisodeConfig(60, all_sources=True), reward=RewardConfig(bonus=1.0)
     )
-    env, found = make_env(told, 64, 0, "cpu", ["message", "state"]), []
+    env = make_env(told, 64, 0, "cpu", ["message", "state"])
+    found = []
     for policy in (script_policy(env), None):
         env.set_seed(0)
         rollout = env.rollout(60, policy, break_when_any_done=False, auto_reset=True)

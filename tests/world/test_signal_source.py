@@ -79,7 +79,10 @@ def recorded_legs():
 def test_recorded_legs_take_the_same_time():
     # Left out are triangular legs, which the original times as if they reached their largest speed,
     # and legs for which it kept the time of the leg before. Lengths are between planned stops.
-    compared, triangular, stale, before = 0, 0, 0, math.nan
+    compared = 0
+    triangular = 0
+    stale = 0
+    before = math.nan
     local = DYNAMIC.local_speed, DYNAMIC.local_acceleration
     for first, length, theirs in recorded_legs():
         speed, acceleration = (DYNAMIC.speed, DYNAMIC.acceleration) if first else local
@@ -104,7 +107,8 @@ def test_every_stop_is_inside_the_polygon_and_near_its_hotspot(name):
     assert shapely.dwithin(POLYGONS[name], places, 1e-3).all()
     hotspots = 0
     for w, n in enumerate(walk.arrive.isfinite().sum(1).tolist()):
-        stops, speeds = walk.stop[w, :n].tolist(), walk.speed[w, :n].tolist()
+        stops = walk.stop[w, :n].tolist()
+        speeds = walk.speed[w, :n].tolist()
         begins = [0] + [k + 1 for k in range(n - 1) if speeds[k] == DYNAMIC.speed]
         hotspots += len(begins)
         for begin, end in zip(begins, [*begins[1:], n], strict=True):

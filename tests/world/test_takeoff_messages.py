@@ -37,13 +37,17 @@ class FlyingUav:
 
     def choose(self, target: tuple, motion: MotionConfig) -> None:
         """Begin to fly to a landing point, or to hold."""
-        self.start, self.place, self.elapsed, self.duration = self.place, target, 0, 0.0
+        self.start = self.place
+        self.place = target
+        self.elapsed = 0
+        self.duration = 0.0
         self.stopped = False
         self.motions += 1
         if self.start != target:
             phases = self.level, math.dist(self.start, target), self.level
             # A phase of degree 5 is limited by its largest speed or its largest acceleration.
-            fast, hard = 15 / 8 / motion.max_speed, 10 * math.sqrt(3) / 3 / motion.max_acceleration
+            fast = 15 / 8 / motion.max_speed
+            hard = 10 * math.sqrt(3) / 3 / motion.max_acceleration
             self.duration = sum(max(fast * length, math.sqrt(hard * length)) for length in phases)
 
     def listen(self, now: float, dt: float, source: tuple, radius: float) -> bool:
@@ -55,9 +59,11 @@ class FlyingUav:
             return False
         spotted = landed and math.dist(self.place, source) <= radius
         if landed and not (self.stops and self.stopped):
-            self.stops, self.stopped = [(now, self.place), *self.stops], True
+            self.stops = [(now, self.place), *self.stops]
+            self.stopped = True
         if spotted:
-            self.heard_at, self.heard_from = now, self.place
+            self.heard_at = now
+            self.heard_from = self.place
         self.message = {
             "time": now,
             "position": self.place if landed else self.start,
@@ -74,7 +80,8 @@ class FlyingUav:
 
 def twins(env: UavEnv) -> list[list[FlyingUav]]:
     """The UAVs of all worlds as they begin an episode."""
-    levels, places = env.simulation.vehicles.levels.tolist(), env.state.position[..., :2].tolist()
+    levels = env.simulation.vehicles.levels.tolist()
+    places = env.state.position[..., :2].tolist()
     worlds = [
         [FlyingUav(*uav) for uav in zip(levels, map(tuple, row), strict=True)] for row in places
     ]
@@ -98,13 +105,15 @@ def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
         episode=KEEPS_GOING,
     )
     env = fresh(scenario, num_worlds=6)
-    worlds, generator = twins(env), torch.Generator().manual_seed(0)
+    worlds = twins(env)
+    generator = torch.Generator().manual_seed(0)
     begun = spotting = 0
     for step in range(1, 41):
         ready = env.simulation.vehicles.ready(env.state).tolist()
         output = act(env, random_actions(env, generator))
         goals = env.simulation.points[env.state.goal].tolist()
-        sent, told = sent_messages(output), output["agents", "message_sent"].tolist()
+        sent = sent_messages(output)
+        told = output["agents", "message_sent"].tolist()
         for b, world in enumerate(worlds):
             source = env.state.source[b, 0].tolist()
             for n, uav in enumerate(world):

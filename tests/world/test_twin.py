@@ -67,7 +67,9 @@ def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
 
 def twins(env: UavEnv) -> list[twin.World]:
     """The twin's worlds, in the initial conditions of the environment's worlds."""
-    airspace, state, worlds = env.simulation.airspace, env.state, []
+    airspace = env.simulation.airspace
+    state = env.state
+    worlds = []
     for b, region in enumerate(state.region.tolist()):
         points = airspace.points[region, : airspace.n_points[region]].tolist()
         first = state.goal[b] - region * airspace.max_points
@@ -147,7 +149,8 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         reward=RewardConfig(spotted=0.0, coverage=1.0),
         episode=KEEPS_GOING,
     )
-    env, generator = fresh(scenario, num_worlds=3), torch.Generator().manual_seed(0)
+    env = fresh(scenario, num_worlds=3)
+    generator = torch.Generator().manual_seed(0)
     trails = env.state.position[..., :2].unsqueeze(2).expand(-1, -1, window, -1)
     for _ in range(5):
         output = act(env, random_actions(env, generator))

@@ -100,7 +100,9 @@ class FeatureCache:
     """
 
     def __init__(self, messages: Messages, context: ServerContext, own_only: bool = False) -> None:
-        self.messages, self.context, self.own_only = messages, context, own_only
+        self.messages = messages
+        self.context = context
+        self.own_only = own_only
         self._shared: dict[Callable, Tensor] = {}
 
     def __call__(self, compute: Callable[["FeatureCache"], Tensor]) -> Tensor:
@@ -287,7 +289,8 @@ def check_features(config: ObservationConfig) -> None:
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
     """Features by name of messages [*, N], each [*, N, ...] in the shape and range that it
     declares."""
-    cache, found = FeatureCache(messages, context), {}
+    cache = FeatureCache(messages, context)
+    found = {}
     for name in names:
         found[name] = feature_of(name).compute(cache)
         _check_shape(name, found[name], messages.time.shape)
@@ -296,7 +299,8 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
 
 def _check_shape(name: str, values: Tensor, uavs: torch.Size) -> None:
     """Require the values of a feature of UAVs [*, N] to have the shape that it declares."""
-    declared, several = feature_of(name).shape, values.shape[len(uavs) :]
+    declared = feature_of(name).shape
+    several = values.shape[len(uavs) :]
     same = len(declared) == len(several) and values.shape[: len(uavs)] == uavs
     if not same or any(size not in (None, n) for size, n in zip(declared, several, strict=True)):
         expected = [*uavs, *declared]
@@ -306,7 +310,8 @@ def _check_shape(name: str, values: Tensor, uavs: torch.Size) -> None:
 
 def observe_own(known: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
     """As ``observe``, but each UAV computes its own from messages [*, N, N] (receiver, sender)."""
-    cache, sender = FeatureCache(known, context, own_only=True), known.time.dim() - 1
+    cache = FeatureCache(known, context, own_only=True)
+    sender = known.time.dim() - 1
     values = {name: feature_of(name).compute(cache) for name in names}
     return {
         name: (each if each.shape[sender] == 1 else cache.wanted(each)).squeeze(sender)
@@ -318,7 +323,8 @@ def layout_of(features: Mapping[str, Tensor], names: Sequence[str]) -> Layout:
     """The layout of an observation of these features, from values [Q, N, ...] of each."""
     found = Layout()
     for name in names:
-        declared, shape = feature_of(name), tuple(features[name].shape[2:])
+        declared = feature_of(name)
+        shape = tuple(features[name].shape[2:])
         found = found.appended(
             name,
             shape,

@@ -40,8 +40,10 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     Actions begin at the latest landing point, are taken to be flown at once, and lead to the
     nearest landing point, or to the second nearest if another UAV is known to stand there.
     """
-    everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
-    standing, level = v.wanted(v.messages.trail[..., 0]), v.context.level
+    everyone = v.messages.trail[..., 0] % v.context.n_points
+    n_points = v.context.n_points
+    standing = v.wanted(v.messages.trail[..., 0])
+    level = v.context.level
     rows = v.wanted(report_rows(v.grid, v.messages, level).movedim(-2, -1)).movedim(-1, -2)
     stays = any_of(chance_of_staying(v.grid, v.belief, rows)).unsqueeze(-1)
     chance = any_of(detection_chance(v.grid, v.belief, places(v.grid, v.region, level)))
@@ -70,7 +72,8 @@ def _belief_moments(v: FeatureCache) -> Tensor:
 
     These four of each source, [*, N, K, 4].
     """
-    belief, centres = v.belief, v.grid.centres
+    belief = v.belief
+    centres = v.grid.centres
     *mean, square = (belief @ torch.cat([centres, centres.square().sum(-1, True)], -1)).unbind(-1)
     mean = torch.stack(mean, -1)
     variance = (square - mean.square().sum(-1)).clamp(min=0)

@@ -35,7 +35,8 @@ def footprint_tables(
 ) -> tuple[FootprintTables, Tensor]:
     """Masks of all footprints, and the landing points, each for every radius, in the unit of the
     first one."""
-    airspace, radii = simulation.airspace, footprint_radii(simulation)
+    airspace = simulation.airspace
+    radii = footprint_radii(simulation)
     polygons = [region.polygon for region in airspace.regions]
     tables = tables_of_all(polygons, airspace.points.double().cpu().numpy(), radii)
     points = airspace.points.flatten(0, 1)
@@ -75,7 +76,8 @@ def places_inside(airspace: Airspace, radius: float) -> Tensor:
 def _coverage(v: FeatureCache) -> Tensor:
     """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
     footprints, points = v.table(footprint_tables)
-    trail, known = v.tabled(v.trail), v.context.coverage
+    trail = v.tabled(v.trail)
+    known = v.context.coverage
     if v.own_only:
         return own_covered_share(footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
     if known is not None and devices.data_dependent(trail.device):
@@ -92,8 +94,10 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     It is the distance of a place from the nearest of all UAVs' latest landing points, over the
     diameter of a footprint; older landing points of ``observation.window`` count as further away.
     """
-    context, trail = v.context, v.trail
-    standing, radius = v.wanted(trail[..., 0]), context.radius
+    context = v.context
+    trail = v.trail
+    standing = v.wanted(trail[..., 0])
+    radius = context.radius
     if isinstance(radius, Tensor):
         radius = radius[..., None, None]
     offsets = ring_places(radius, standing.device).unsqueeze(-3)

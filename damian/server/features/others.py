@@ -79,7 +79,8 @@ def _ages(v: FeatureCache) -> Tensor:
 def _nearest(v: FeatureCache) -> Tensor:
     """Indices of at most four other UAVs, those with the nearest targets, the nearest first,
     [*, N, 4]."""
-    target, half = v.messages.target, (v.context.scale / 2)[..., None, None, None]
+    target = v.messages.target
+    half = (v.context.scale / 2)[..., None, None, None]
     ways = (target.unsqueeze(-3) - v.wanted(target).unsqueeze(-2)) / half
     distance = of_others(v, ways.square().sum(-1, keepdim=True)).squeeze(-1)
     found = distance.argsort(dim=-1, stable=True)[..., :OTHERS]  # of the others
@@ -100,7 +101,8 @@ def ways_to_nearest(v: FeatureCache, places: Tensor) -> Tensor:
 
     ``places`` [*, N, P, 3]: east, north, and 1 if it is known, else 0.
     """
-    half, own = v.context.scale / 2, v.wanted(v.messages.target).unsqueeze(-2)
+    half = v.context.scale / 2
+    own = v.wanted(v.messages.target).unsqueeze(-2)
     places, known = _of_nearest(v, places.flatten(-2)).unflatten(-1, (-1, 3)).split([2, 1], -1)
     ways = ((places - own.unsqueeze(-2)) / half[..., None, None, None, None]).clamp(-1, 1)
     return torch.cat([ways * known, known], -1)

@@ -36,7 +36,8 @@ def _requests(v: FeatureCache) -> Tensor:
     region, its age over ``observation.time_scale``, and 1; zeros stand for those that do not exist.
     """
     requests, unserved = known_requests(v.messages)
-    own, half = v.wanted(v.messages.target), (v.context.scale / 2)[..., None, None, None]
+    own = v.wanted(v.messages.target)
+    half = (v.context.scale / 2)[..., None, None, None]
     ways = (requests[..., :2].unsqueeze(-3) - own.unsqueeze(-2)) / half  # [*, N, M, 2]
     age = (v.context.now.unsqueeze(-1) - requests[..., 2]) / v.context.time_scale
     age = age.clamp(0, 1)[..., None, :, None].expand(*ways.shape[:-1], 1)

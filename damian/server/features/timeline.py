@@ -27,7 +27,8 @@ def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
 
 def first_timeline(messages: Messages, context: ServerContext) -> Tensor:
     """What is known from first messages alone, [*, slots, 3], as ``ServerContext.timeline``."""
-    facts, ages = stop_places(messages, context), stop_ages(messages, context)
+    facts = stop_places(messages, context)
+    ages = stop_ages(messages, context)
     places, told = told_slots(facts, ages, context.observation.timeline)
     return torch.cat([places, told.unsqueeze(-1)], -1)
 
@@ -49,7 +50,8 @@ def _timeline(v: FeatureCache) -> Tensor:
     that has arrived tells of that step. Behind the slots stands the same of the destination of a
     UAV in flight. Ways begin where the observer is bound for.
     """
-    messages, context = v.messages, v.context
+    messages = v.messages
+    context = v.context
     known = first_timeline(messages, context) if context.timeline is None else context.timeline
     flies = messages.in_flight.to(known.dtype).unsqueeze(-1)
     destination = torch.cat([messages.target, flies], -1).unsqueeze(-2)

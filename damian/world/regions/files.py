@@ -124,7 +124,8 @@ def _from_geojson(path: Path) -> list[_Feature]:
     document = json.loads(read_text(path))
     if document["type"] not in ("Feature", "FeatureCollection"):
         return [_Feature("geometry", {}, document, document.get("crs"))]
-    alone, found = document["type"] == "Feature", []
+    alone = document["type"] == "Feature"
+    found = []
     for i, each in enumerate([document] if alone else document["features"]):
         geometry = each.get("geometry") or {}
         crs = next(filter(None, (holder.get("crs") for holder in (geometry, each, document))), None)
@@ -136,7 +137,8 @@ def _from_geojson(path: Path) -> list[_Feature]:
 def _from_plan(path: Path) -> list[_Feature]:
     """The polygons of the fence of a plan, whose corners are latitude and longitude, the first
     once."""
-    fence, found = json.loads(read_text(path)).get("geoFence") or {}, []
+    fence = json.loads(read_text(path)).get("geoFence") or {}
+    found = []
     if fence.get("circles"):
         raise InputError("geoFence.circles: a circle is not read; draw a polygon in its place")
     if "polygon" in fence:
@@ -154,7 +156,8 @@ def _from_plan(path: Path) -> list[_Feature]:
 def _from_map(path: Path) -> list[_Feature]:
     """All features of all layers of a file that GDAL reads, but of tables without shapes, such as
     styles."""
-    pyogrio, found = _extra("pyogrio", f"a file {path.suffix}"), []
+    pyogrio = _extra("pyogrio", f"a file {path.suffix}")
+    found = []
     if not path.is_file():
         raise InputError("no such file")
     for layer in (name for name, kind in pyogrio.list_layers(path) if kind is not None):

@@ -9,7 +9,8 @@ from damian.common.errors import InputError
 from damian.common.text_files import Row, named, near, parse_table, read_text, show
 from damian.world.regions.region import Region, local_region
 
-_ID, _SEQUENCE = "Airspace ID", "Sequence Number"
+_ID = "Airspace ID"
+_SEQUENCE = "Sequence Number"
 _BOUNDS = {
     "Latitude": (-90.0, 90.0, "deg"),
     "Longitude": (-360.0, 360.0, "deg"),

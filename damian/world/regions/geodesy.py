@@ -28,7 +28,8 @@ def to_local(
     bearing b from the origin (latitude, longitude) in degrees. The bearing of its antipode is
     arbitrary.
     """
-    lat, lat_0 = np.radians(np.asarray(lat_deg, float)), np.radians(origin[0])
+    lat = np.radians(np.asarray(lat_deg, float))
+    lat_0 = np.radians(origin[0])
     d_lon = np.radians(np.asarray(lon_deg, float) - origin[1])
     haversine = (
         np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
@@ -48,9 +49,13 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tu
 
     Latitudes are in [-90, 90] and longitudes in [-180, 180) degrees.
     """
-    x, y, lat_0 = np.asarray(x_m, float), np.asarray(y_m, float), np.radians(origin[0])
-    arc, bearing = np.hypot(x, y) / EARTH_RADIUS_M, np.arctan2(x, y)
-    east, north = np.sin(arc) * np.sin(bearing), np.sin(arc) * np.cos(bearing)
+    x = np.asarray(x_m, float)
+    y = np.asarray(y_m, float)
+    lat_0 = np.radians(origin[0])
+    arc = np.hypot(x, y) / EARTH_RADIUS_M
+    bearing = np.arctan2(x, y)
+    east = np.sin(arc) * np.sin(bearing)
+    north = np.sin(arc) * np.cos(bearing)
     # Cartesian coordinates on the unit sphere, with the origin's meridian as the x-z plane. Near
     # the poles an arcsine would lose half the digits of the latitude; the arctangent keeps them.
     out = np.cos(arc) * np.cos(lat_0) - north * np.sin(lat_0)
@@ -79,13 +84,16 @@ def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
         # would lose all digits; the part of it that cancels over a closed ring is therefore left
         # out.
         offset = np.column_stack([outward, -2 * np.sin(distance / 2) ** 2])
-        start, end, up = offset[:-1], offset[1:], np.array([0.0, 0.0, 1.0])
+        start = offset[:-1]
+        end = offset[1:]
+        up = np.array([0.0, 0.0, 1.0])
         bent = np.cross(start, end)
         normal = np.cross(up, end - start) + bent
         angle = 2 * np.arcsin(np.minimum(np.linalg.norm(end - start, axis=1) / 2, 1))
         moment += ((1 / np.sinc(angle / np.pi) - 1)[:, None] * normal + bent).sum(0)
     east, north, up = moment
-    arc, bearing = EARTH_RADIUS_M * np.arctan2(np.hypot(east, north), up), np.arctan2(east, north)
+    arc = EARTH_RADIUS_M * np.arctan2(np.hypot(east, north), up)
+    bearing = np.arctan2(east, north)
     lat, lon = to_latlon(arc * np.sin(bearing), arc * np.cos(bearing), base)
     return float(lat), float(lon)
 

@@ -117,7 +117,8 @@ def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Gene
     for _ in range(_MAX_ROUNDS if share.sum() > 0 else 0):
         triangle = rng.choice(len(share), n - len(points), p=share / share.sum())
         a, b, c = corners[triangle].swapaxes(0, 1)
-        root, along = np.sqrt(rng.random((len(a), 1))), rng.random((len(a), 1))
+        root = np.sqrt(rng.random((len(a), 1)))
+        along = rng.random((len(a), 1))
         drawn = (1 - root) * a + root * (1 - along) * b + root * along * c
         points = np.vstack([points, drawn[shapely.contains_xy(polygon, drawn)]])
         if len(points) == n:
@@ -152,14 +153,18 @@ def _disc(rng: np.random.Generator, area_m2: float, n: int) -> Floats:
 def _lattice(bounds: tuple[float, float, float, float], step: float, slant: float) -> Floats:
     """All lattice points in the bounding box and a margin around it, row by row, [P, 2]."""
     min_x, min_y, max_x, max_y = bounds
-    width, height, rise = max_x - min_x, max_y - min_y, step * np.sin(slant)
+    width = max_x - min_x
+    height = max_y - min_y
+    rise = step * np.sin(slant)
     # Compared as products, since a quotient by a tiny step could overflow.
     if (width + 4 * step) * (height + rise) > MAX_CANDIDATES * step * rise:
         problem = (
             f"is too fine for a polygon of {width:g} m x {height:g} m: over {MAX_CANDIDATES} points"
         )
         raise InputError(f"region.lattice_step: {step:g} m {problem}; take a longer one")
-    rows, start, ends = [], min_x, itertools.cycle([(max_x, 1), (min_x, -1)])
+    rows = []
+    start = min_x
+    ends = itertools.cycle([(max_x, 1), (min_x, -1)])
     for y, (end, sign) in zip(min_y + rise * np.arange(int(height / rise) + 1), ends, strict=False):
         # A bound missed by a rounding error counts as reached.
         n_steps = int(np.ceil(sign * (end - start) / step - 1e-9))
@@ -175,7 +180,8 @@ def _by_direction(points: Floats, centre: Floats, n: int | None) -> Floats:
     # Rounded, so that ties are ties on every machine; 0.0 removes negative zeros, which would move
     # due west.
     x, y = (np.round(points - centre, 9) + 0.0).T
-    distance, angle = np.round(np.hypot(x, y), 6), np.round(np.arctan2(y, x), 12)
+    distance = np.round(np.hypot(x, y), 6)
+    angle = np.round(np.arctan2(y, x), 12)
     order = np.lexsort([distance, angle])
     nearest = np.argsort(distance[order], kind="stable")[:n]
     return points[order[np.sort(nearest)]]

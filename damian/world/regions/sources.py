@@ -106,7 +106,8 @@ def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     """Read the region from its file or vertices, or draw ``pool`` random regions."""
     source = REGION_SOURCES.get(config.kind, "region.kind")
     found = [_without_zones(centred(region), config, rng) for region in source(config, rng)]
-    most, problem = config.initial_conditions, "regions: each needs at least one initial condition"
+    most = config.initial_conditions
+    problem = "regions: each needs at least one initial condition"
     checks.require(
         len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem
     )

@@ -30,10 +30,8 @@ class Adviser(Tracker):
     def __init__(
         self, node: Node, uavs: Sequence[str], policy: Policy, drawn: bool = False, **more: Any
     ) -> None:
-        self.policy, self.kind = (
-            policy,
-            ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC,
-        )
+        self.policy = policy
+        self.kind = ExplorationType.RANDOM if drawn else ExplorationType.DETERMINISTIC
         modules = policy.modules() if isinstance(policy, torch.nn.Module) else ()
         sizes = [each.cell.hidden_size for each in modules if isinstance(each, AgentGRU)]
         self._start = torch.zeros(1, len(uavs), sizes[0]) if sizes else None
@@ -94,12 +92,14 @@ def next_landings(
     for _ in adviser.steps(latest):
         pass
     asking = [uav for uav in uavs if not adviser.held[uav].report.flies]
-    before, ground = adviser.state(asking), node.ground
+    before = adviser.state(asking)
+    ground = node.ground
     chooses = torch.tensor([[uav in asking for uav in uavs]])
     after = node.simulation.decide(before, adviser.ask(asking), chooses)
     answers = []
     for i, uav in enumerate(uavs):
-        here, there = int(before.goal[0, i]), int(after.goal[0, i])
+        here = int(before.goal[0, i])
+        there = int(after.goal[0, i])
         answer: dict[str, Any] = {"ID": uav, "state": "in flight"}
         if uav in asking:
             answer["state"], (distance, heading) = (

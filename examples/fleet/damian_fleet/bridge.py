@@ -177,7 +177,9 @@ class Bridge:
         system: int | None = None,
         memory: Memory | None = None,
     ) -> None:
-        self.uav, self.path, self.uavs = uav, f"/fleets/{fleet}", [*uavs] or [uav]
+        self.uav = uav
+        self.path = f"/fleets/{fleet}"
+        self.uavs = [*uavs] or [uav]
         self.period, self.listen = 5.0, listen
         """``period``: between two reports of a vehicle on the ground [s]; a step of the service."""
         self.memory = memory or Memory()
@@ -187,7 +189,10 @@ class Bridge:
         """``leaving``: it ends the flight in hand and leaves the fleet."""
         self.why = "no heartbeat of a copter with ArduPilot"
         """What the state waits for."""
-        self.mode, self.height, self.battery, self.time = -1, 0.0, None, math.nan
+        self.mode = -1
+        self.height = 0.0
+        self.battery = None
+        self.time = math.nan
         self.armed = self.on_ground = self.in_air = self.is_linked = False
         self.is_ready = True
         self.ahead, self._trip, self._timed = math.nan, math.inf, -math.inf
@@ -201,7 +206,9 @@ class Bridge:
         self.now = self._since = self._place_at = self._steady = self._reported = -math.inf
         self._retry = self._asked_at = self._landed_at = self._commanded = -math.inf
         self._heard_at = self._climbs_from = self._handed_at = self._stood_since = -math.inf
-        self._down, self._number, self._boots = math.inf, 0, 0
+        self._down = math.inf
+        self._number = 0
+        self._boots = 0
         self._came: dict[str, float] = {}
         self._due: dict[str, float] = {}
         self._raw: tuple[tuple[float, float], float] = ((0.0, 0.0), -math.inf)
@@ -230,7 +237,9 @@ class Bridge:
             return [], []
         if self._since == -math.inf:
             self._since, self._due["word"] = now, now + WORD
-        self.now, self._out, self._wish = now, [], None
+        self.now = now
+        self._out = []
+        self._wish = None
         for message in messages:
             self._hear(message)
         self._look()
@@ -269,7 +278,8 @@ class Bridge:
 
     def _look(self) -> None:
         """What the newest messages say."""
-        seen, low = self.seen, mavlink.MAV_LANDED_STATE_ON_GROUND
+        seen = self.seen
+        low = mavlink.MAV_LANDED_STATE_ON_GROUND
         self.time = self.now + self.ahead
         levels = [left for at, left in self._levels.values() if left >= 0 and self.now < at + 30]
         self.battery = min(levels, default=None)
@@ -284,13 +294,15 @@ class Bridge:
             self.on_ground = said == low or (not self.armed and self.height < 0.5)
             self.in_air = not self.on_ground and (said > low or (self.armed and self.height > 1))
         if "SYS_STATUS" in seen:  # has a bit for the pre-arm checks
-            status, bit = seen["SYS_STATUS"], mavlink.MAV_SYS_STATUS_PREARM_CHECK
+            status = seen["SYS_STATUS"]
+            bit = mavlink.MAV_SYS_STATUS_PREARM_CHECK
             passed = ~status.onboard_control_sensors_present | status.onboard_control_sensors_health
             self.is_ready = bool(passed & bit)
 
     def _hear(self, message: Any) -> None:
         """Take a message, if it is one of the vehicle."""
-        kind, system = message.get_type(), message.get_srcSystem()
+        kind = message.get_type()
+        system = message.get_srcSystem()
         if (
             kind == "NAMED_VALUE_FLOAT"
             and system == self.memory.system
@@ -344,7 +356,8 @@ class Bridge:
 
     def _hear_global_position_int(self, message: Any) -> None:
         """Take a position if it is one: no sentinel, after a fix, no jump."""
-        place, fix = (message.lat / 1e7, message.lon / 1e7), self.seen.get("GPS_RAW_INT")
+        place = (message.lat / 1e7, message.lon / 1e7)
+        fix = self.seen.get("GPS_RAW_INT")
         at = self._came["GLOBAL_POSITION_INT"]
         self._falls.append((self.now, message.vz / 100))
         while self._falls[0][0] < self.now - 3:
@@ -361,13 +374,15 @@ class Bridge:
             if self._is_due("jump", 10):
                 self._say(f"a position is {away:.0f} m away at once, and not taken")
             return
-        self.here, self._place_at = place, at
+        self.here = place
+        self._place_at = at
 
     def _hear_rc_channels(self, message: Any) -> None:
         """Note where a pilot's switch stands, and that he has moved it."""
         if not 800 < message.chan5_raw < 2200:
             return  # no receiver, or no pilot
-        stands, memory = sum(message.chan5_raw > edge for edge in SWITCH), self.memory
+        stands = sum(message.chan5_raw > edge for edge in SWITCH)
+        memory = self.memory
         is_settled = (
             self.state not in ("connect", "watch", "left") and self.now > self._handed_at + SETTLED
         )
@@ -405,7 +420,8 @@ class Bridge:
         if not is_fresh or self.now < self._sent.get(command, -math.inf) + RETRY:
             return False
         self._sent[command] = self._commanded = self.now
-        own, target = (*params, *[0.0] * 7)[:7], (self.memory.system, AUTOPILOT)
+        own = (*params, *[0.0] * 7)[:7]
+        target = (self.memory.system, AUTOPILOT)
         if place is None:
             self._out.append(mavlink.MAVLink_command_long_message(*target, command, 0, *own))
         else:
@@ -431,7 +447,8 @@ class Bridge:
         if self.memory.system is not None and self._is_due("clock", 1.0):
             self._out.append(mavlink.MAVLink_timesync_message(0, self.order.ask_time(self.now)))
         if not self._is_quiet and self._is_due("heartbeat", 1.0):
-            kind, none = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
+            kind = mavlink.MAV_TYPE_GCS
+            none = mavlink.MAV_AUTOPILOT_INVALID
             self._out.append(
                 mavlink.MAVLink_heartbeat_message(kind, none, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
             )
@@ -498,7 +515,8 @@ class Bridge:
         request = self._pending
         if request is None or answer.number != request.number:
             return
-        self._pending, self._asked_at = None, request.at
+        self._pending = None
+        self._asked_at = request.at
         known = (200, 201, 400, 409, 413, 422, 404 if request.method == "GET" else 200)
         try:
             if answer.status not in known or not isinstance(answer.body, dict):
@@ -521,10 +539,13 @@ class Bridge:
         """
         if not 0 < (said := float(body["time"])) < 4e9:
             raise ValueError(f"{said} is no time [s since 1970]")
-        trip, ahead = self.now - self._asked_at, said - (self._asked_at + self.now) / 2
+        trip = self.now - self._asked_at
+        ahead = said - (self._asked_at + self.now) / 2
         contradicts = abs(ahead - self.ahead) > (trip + self._trip) / 2 + 0.1
         if trip <= self._trip or contradicts or self.now > self._timed + 300:
-            self.ahead, self._trip, self._timed = ahead, trip, self.now
+            self.ahead = ahead
+            self._trip = trip
+            self._timed = self.now
 
     def _hear_delivery(self, status: int, body: dict[str, Any]) -> None:
         path, _ = self.memory.outbox.pop(0)
@@ -547,7 +568,8 @@ class Bridge:
 
     def _report(self) -> None:
         """Report what the newest telemetry says, unless that has been reported."""
-        memory, flies = self.memory, self.in_air
+        memory = self.memory
+        flies = self.in_air
         if math.isnan(self.time) or self.here is None or self._place_at <= self._reported:
             return
         memory.number = (
@@ -564,7 +586,8 @@ class Bridge:
         row |= {"track": self._track, "takeoff-landing time": self._turned}
         row |= {"bridge": memory.bridge, "vehicle": memory.vehicle or None}
         row |= {"previous": memory.stops[1:], "landed": memory.landed, "motions": memory.motions}
-        self._was_spotted, self._reported = self._spotted and not flies, self._place_at
+        self._was_spotted = self._spotted and not flies
+        self._reported = self._place_at
         memory.number += 1
         memory.outbox.append(("/reports", row))
 
@@ -599,7 +622,8 @@ class Bridge:
         if status >= 400:
             self.why = f"the service says {body.get('error')}"
             return
-        told, goal = Advice.model_validate(body["advice"][0]), self.memory.goal
+        told = Advice.model_validate(body["advice"][0])
+        goal = self.memory.goal
         if told.state not in ("hold", "none") and None in (
             told.answer,
             told.lat,
@@ -622,7 +646,8 @@ class Bridge:
     def _hear_confirmation(self, status: int, body: dict[str, Any]) -> None:
         if self._offer is None or self.here is None:
             return
-        told, come = self._offer, body["status"][0] if status < 400 else "refused"
+        told = self._offer
+        come = body["status"][0] if status < 400 else "refused"
         self._offer = None
         if told.state == "hold":
             self._held = told.answer
@@ -630,7 +655,8 @@ class Bridge:
                 self._decided()
             return
         if come in ("accepted", "taken off"):
-            self.memory.goal, self.memory.taken_off = told, come == "taken off"
+            self.memory.goal = told
+            self.memory.taken_off = come == "taken off"
             self._track = way(self.here, (told.lat, told.lon))[1]
         if come == "accepted":
             self._turn("guided", f"mode GUIDED for {told.answer}")
@@ -645,9 +671,13 @@ class Bridge:
         self._say(f"{self.state} -> {state}: {why}")
         before = self.state
         self.state, self.why, self._since, self._due["word"] = state, why, self.now, self.now + WORD
-        self.memory.state, self.memory.mode = state, self.mode
-        self._sent, self._results = {}, {}
-        self._down, self._is_other, self._has_switched = math.inf, False, False
+        self.memory.state = state
+        self.memory.mode = self.mode
+        self._sent = {}
+        self._results = {}
+        self._down = math.inf
+        self._is_other = False
+        self._has_switched = False
         if state == "join" and before == "watch":
             self._handed_at = self.now
         elif state == "guided":
@@ -658,10 +688,12 @@ class Bridge:
 
     def _act_of_pilot(self) -> str:
         """What somebody else has done with the vehicle in this state; empty if nothing."""
-        has_booted, self._boots = self.order.boots > self._boots, self.order.boots
+        has_booted = self.order.boots > self._boots
+        self._boots = self.order.boots
         if self.state not in MOTORS and self.state not in FLIGHT:
             return ""
-        lands, memory = self.state == "landing", self.memory
+        lands = self.state == "landing"
+        memory = self.memory
         own = {GUIDED} if self.state in ("join", "ground", "accept", "guided") else set()
         if lands:
             own = {GUIDED} if memory.mode != LAND else set()
@@ -686,7 +718,8 @@ class Bridge:
     def _aims_elsewhere(self) -> bool:
         """Whether the vehicle flies to a place that is not its goal, because another station has
         told it."""
-        aim, goal = self.seen.get("POSITION_TARGET_GLOBAL_INT"), self.memory.goal
+        aim = self.seen.get("POSITION_TARGET_GLOBAL_INT")
+        goal = self.memory.goal
         flies = self.state in ("climb", "cruise", "landing") and self.mode == GUIDED and self.in_air
         if (
             not flies
@@ -715,11 +748,9 @@ class Bridge:
         """End what has taken too long."""
         if self.state in FLIGHT and self._heard_at - ABOUT <= self._commanded < self.now - SILENCE:
             self._hands_off(f"mode and motors not heard for {SILENCE:.0f} s after a command")
-        goal, lasting, limit = (
-            self.memory.goal,
-            self.now - self._since,
-            LIMITS.get(self.state, math.inf),
-        )
+        goal = self.memory.goal
+        lasting = self.now - self._since
+        limit = LIMITS.get(self.state, math.inf)
         if self.state == "climb":
             limit = 30 + 2 * goal.altitude
         elif self.state == "cruise":
@@ -734,7 +765,8 @@ class Bridge:
 
     def _end(self) -> None:
         """End the flight in hand, and say how by where the vehicle stands."""
-        goal, memory = self.memory.goal, self.memory
+        goal = self.memory.goal
+        memory = self.memory
         if goal is None or self.here is None:
             return
         away = way(self.here, (goal.lat, goal.lon))[0]
@@ -742,28 +774,25 @@ class Bridge:
         how = "landed" if is_there else "aborted"
         self._say(f"{goal.answer} {how}, {away:.0f} m from its goal")
         self._say_fact(goal.answer, how)
-        memory.goal, memory.taken_off = None, False
+        memory.goal = None
+        memory.taken_off = False
 
     def _decided(self) -> None:
         """Note that a decision has been followed: where, and when."""
         memory = self.memory
         memory.motions = (0 if self._was_spotted else memory.motions) + bool(memory.stops)
-        memory.stops, memory.landed = (
-            [self.here, *memory.stops][:17],
-            [self.time, *memory.landed][:17],
-        )
+        memory.stops = [self.here, *memory.stops][:17]
+        memory.landed = [self.time, *memory.landed][:17]
 
     def _stand(self) -> bool:
         """Note when it has come to stand on the ground; returns whether it does, and has
         listened."""
         if self._is_flying and self.on_ground and not self.armed and not math.isnan(self.time):
             self._decided()
-            self._landed_at, self._turned, self._is_flying, self._spotted = (
-                self.now,
-                self.time,
-                False,
-                False,
-            )
+            self._landed_at = self.now
+            self._turned = self.time
+            self._is_flying = False
+            self._spotted = False
             self._need_fresh()
         return not self._is_flying and self.now >= self._landed_at + self.listen
 
@@ -780,7 +809,9 @@ class Bridge:
                     mavlink.MAVLink_command_long_message(self.memory.system, AUTOPILOT, *asked)
                 )
             return
-        state, mode, is_told = self.memory.state, self.memory.mode, self.memory.goal is not None
+        state = self.memory.state
+        mode = self.memory.mode
+        is_told = self.memory.goal is not None
         if state in ("watch", "cruise", "landing") or (is_told and self.in_air):
             self._turn(state, "on as before")
             self.memory.mode = mode  # what has changed since, somebody else has done
@@ -812,7 +843,8 @@ class Bridge:
                 "POST", f"{self.path}/uavs", {"join": [self.uav]}, self._hear_change
             )
         elif status == 200 and self.state == "join" and self.is_linked:
-            self._has_joined, self.period = True, float(body["dt"])
+            self._has_joined = True
+            self.period = float(body["dt"])
             self._turn("ground", "a report to be taken")
 
     def _leave(self) -> None:
@@ -861,11 +893,13 @@ class Bridge:
         self._turn("climb", "its level") if self.armed else self._change(*arm)
 
     def _climb(self) -> None:
-        goal, memory = self.memory.goal, self.memory
+        goal = self.memory.goal
+        memory = self.memory
         if not self.in_air:
             self._change(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, goal.altitude)
         elif not memory.taken_off:
-            memory.taken_off, self._turned = True, None if math.isnan(self.time) else self.time
+            memory.taken_off = True
+            self._turned = None if math.isnan(self.time) else self.time
             self._say_fact(goal.answer, "taken off")
             self._report()
         elif self.height >= goal.altitude - LEVEL:
@@ -874,8 +908,10 @@ class Bridge:
             self._ask()
 
     def _cruise(self) -> None:
-        goal, position = self.memory.goal, self.seen["GLOBAL_POSITION_INT"]
-        place, pace = (goal.lat, goal.lon), math.hypot(position.vx, position.vy) / 100
+        goal = self.memory.goal
+        position = self.seen["GLOBAL_POSITION_INT"]
+        place = (goal.lat, goal.lon)
+        pace = math.hypot(position.vx, position.vy) / 100
         is_near = way(self.here, place)[0] < NEAR and self.now < self._place_at + 2
         if self.on_ground:
             self._hands_off("on the ground in cruise")

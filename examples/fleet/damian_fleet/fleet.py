@@ -213,8 +213,12 @@ class Fleet:
         mark: str = "",
         computed_from: float = 0.0,
     ) -> None:
-        self.parts, self.config, self.mark = parts, config, mark
-        self.computed_from, self.clock, self.n_answers = computed_from, 0.0, 0
+        self.parts = parts
+        self.config = config
+        self.mark = mark
+        self.computed_from = computed_from
+        self.clock = 0.0
+        self.n_answers = 0
         self.uavs: dict[str, Uav] = {}
         self.leases: dict[str, Lease] = {}
         """The bridges that speak for UAVs."""
@@ -250,7 +254,8 @@ class Fleet:
     def advance(self, now: float) -> None:
         """Take all steps up to an instant [s], or skip them if they are too many or of before a
         restart."""
-        self.clock, tracker = max(self.clock, now), self.tracker
+        self.clock = max(self.clock, now)
+        tracker = self.tracker
         last = tracker.step_of(self.clock) if tracker.has_begun else tracker.step
         if last > tracker.step and (
             self.clock < self.computed_from or last > tracker.step + MOST_STEPS
@@ -271,7 +276,9 @@ class Fleet:
 
     def reported(self, rows: Rows, now: float) -> Event:
         """Reports that come in together; all or none."""
-        at, said, speakers = self._at(now), [], dict[str, Any]()
+        at = self._at(now)
+        said = []
+        speakers = dict[str, Any]()
         for where, report in rows:
             with named(where):
                 speaker = validated(Speaker, {"ID": report.id, **(report.model_extra or {})})
@@ -285,12 +292,15 @@ class Fleet:
 
     def acknowledged(self, rows: Sequence[Acknowledgement], now: float) -> Event:
         """What UAVs say of their answers; how far these have come stands in the event."""
-        at, said, so_far = self._at(now), [], dict[str, str]()
+        at = self._at(now)
+        said = []
+        so_far = dict[str, str]()
         self.advance(at)
         for row in rows:
             (uav,) = self.members([row.id], "ID")
             self.require_lease(uav.id, row.bridge, at)
-            decision, status = uav.answer(row.answer), "unknown"
+            decision = uav.answer(row.answer)
+            status = "unknown"
             if decision is not None:
                 before = so_far.get(row.answer, decision.status)
                 accepts = row.status == ACCEPTED and before == OFFERED
@@ -324,14 +334,16 @@ class Fleet:
         A UAV that is in danger is told to hold or to return instead; one that has an answer which
         still holds, or follows one, does not choose.
         """
-        asked, at = self.members(said.uavs, "uavs"), self._at(now)
+        asked = self.members(said.uavs, "uavs")
+        at = self._at(now)
         self.advance(at)
         for uav in asked if said.bridge else ():
             self.require_lease(uav.id, said.bridge, at)
         if not self.tracker.has_begun:
             waits = listed([uav for uav, log in self.tracker.logs.items() if log.newest is None])
             raise Waiting(f"no advice yet: no report of {waits} has come in")
-        found, choosing = dict[str, Decision](), list[str]()
+        found = dict[str, Decision]()
+        choosing = list[str]()
         for uav in asked:
             if reason := self.danger(uav):
                 if not self._is_told(uav, reason):
@@ -347,10 +359,8 @@ class Fleet:
 
     def _chosen(self, choosing: Sequence[str]) -> dict[str, Decision]:
         """What the policy chooses."""
-        action, mask = (
-            self.tracker.ask(choosing),
-            torch.tensor([[uav in choosing for uav in self.uavs]]),
-        )
+        action = self.tracker.ask(choosing)
+        mask = torch.tensor([[uav in choosing for uav in self.uavs]])
         goal = self.node.simulation.decide(self.tracker.state(choosing), action, mask).goal
         rows = zip(self.uavs.values(), action[0].tolist(), goal[0].tolist(), strict=True)
         return {uav.id: self._decision(uav, *row) for uav, *row in rows if uav.id in choosing}
@@ -381,7 +391,8 @@ class Fleet:
 
     def holds(self, uav: str, now: float) -> bool:
         """Whether the bridge that spoke for a UAV last still has it."""
-        seen, member = self.leases[uav].seen or 0.0, self.uavs.get(uav)
+        seen = self.leases[uav].seen or 0.0
+        member = self.uavs.get(uav)
         if order := member and member.open_order:
             seen = max(seen, order.time + 2 * order.duration + GRACE)
         return now <= seen + LEASE
@@ -429,7 +440,8 @@ class Fleet:
             self._regroup([*self.uavs, report.id], report)
             self.uavs[report.id].received = 1
             return "new"
-        uav, log = self.uavs[report.id], self.tracker.logs[report.id]
+        uav = self.uavs[report.id]
+        log = self.tracker.logs[report.id]
         uav.received += 1
         if log.has(report):
             uav.duplicates += 1
@@ -458,7 +470,8 @@ class Fleet:
 
     def _note(self, uav: Uav, filled: FilledReport) -> None:
         """Note what a report says of the order that its UAV follows."""
-        order, report = uav.open_order, filled.report
+        order = uav.open_order
+        report = filled.report
         if order is None or report.time <= order.time:
             return
         is_over = report.time > order.time + 2 * order.duration + GRACE
@@ -482,7 +495,8 @@ class Fleet:
     def _acknowledge(self, ID: str, answer: str, said: str, status: str) -> str:
         decision = self.uavs[ID].answer(answer)
         if decision is not None and decision.status != status:
-            was, decision.status = decision.is_followed, status
+            was = decision.is_followed
+            decision.status = status
             if status in (LANDED, ABORTED):
                 decision.since = self.tracker.step
             if not was and decision.is_followed and decision.action is not None:
@@ -511,7 +525,9 @@ class Fleet:
             if all(log.newest for log in new.logs.values()):
                 new.begin(self.clock)
             return
-        new.has_begun, new.start, new.step = True, old.start, old.step
+        new.has_begun = True
+        new.start = old.start
+        new.step = old.step
         new.pending = [each for each in old.pending if each[1] in new.logs]
         new.held = {uav: held for uav, held in old.held.items() if uav in new.logs}
         if first is not None:
@@ -522,7 +538,8 @@ class Fleet:
 
     def _standing(self, uav: str, asks: bool) -> int:
         """Landing point on which a UAV stands, or for which it is bound."""
-        order, held = self.uavs[uav].order, self.tracker.held[uav]
+        order = self.uavs[uav].order
+        held = self.tracker.held[uav]
         if order is None or order.status == ABORTED:
             return held.target
         if held.step <= max(order.step, order.since):
@@ -537,7 +554,8 @@ class Fleet:
     def danger(self, uav: Uav) -> str | None:
         """Why a UAV must not do what the policy chooses, one of ``REASONS``, or None; the fleet has
         begun."""
-        order, newest = uav.open_order, self._newest(uav)
+        order = uav.open_order
+        newest = self._newest(uav)
         if order is None and self.clock - newest.report.time > self.config.oldest_report:
             return "silent"  # in flight it may be: its goal is safer than a landing where it is
         if self.config.reserve > 0 and not (
@@ -563,7 +581,8 @@ class Fleet:
 
     def _is_busy(self, uav: Uav) -> bool:
         """Whether a UAV has nothing to choose now."""
-        offer, number = uav.offer, self.tracker.uavs.index(uav.id)
+        offer = uav.offer
+        number = self.tracker.uavs.index(uav.id)
         if self.tracker.chosen[0, number] or uav.open_order:
             return True
         if offer is None or (
@@ -574,7 +593,9 @@ class Fleet:
 
     def _is_told(self, uav: Uav, reason: str) -> bool:
         """Whether a UAV in danger has been told so, and the answer still holds."""
-        offer, order, may_fly = uav.offer, uav.open_order, uav.command != "hold"
+        offer = uav.offer
+        order = uav.open_order
+        may_fly = uav.command != "hold"
         if offer is not None and offer.status != LAPSED and self.clock <= offer.until:
             if offer.reason == reason:
                 return offer.status not in (REFUSED, ABORTED) and (may_fly or not offer.moves)
@@ -589,7 +610,8 @@ class Fleet:
         """Whether a flight is not safe any more that a UAV accepts now."""
         if not decision.moves or decision is not uav.offer:
             return False
-        newest, now = self._newest(uav).report, decision
+        newest = self._newest(uav).report
+        now = decision
         if newest.time > decision.time and not newest.flies:
             now = replace(decision, start=self.ground.local(newest.place() or (0.0, 0.0)))
         return (
@@ -608,7 +630,8 @@ class Fleet:
 
     def _flight(self, uav: Uav, start: tuple[float, float], goal: int) -> tuple[float, float]:
         """Expected duration of a flight [s], and the battery that it takes [%]."""
-        vehicles, battery = self.node.simulation.vehicles, self.node.scenario.battery
+        vehicles = self.node.simulation.vehicles
+        battery = self.node.scenario.battery
         length = torch.linalg.vector_norm(self.tracker.points[goal] - torch.tensor(start))
         vertical = vehicles.shortest_time(torch.tensor(uav.level))
         duration = float(2 * vertical + vehicles.shortest_time(length))
@@ -637,8 +660,10 @@ class Fleet:
 
     def _decision(self, uav: Uav, action: Any, goal: int, reason: str | None = None) -> Decision:
         """A decision for a UAV, made from where it stands or will land."""
-        origin, step = self._standing(uav.id, True), self.tracker.step
-        start, until = self._start(uav, origin), self.clock + self.config.answer_time
+        origin = self._standing(uav.id, True)
+        step = self.tracker.step
+        start = self._start(uav, origin)
+        until = self.clock + self.config.answer_time
         duration = self._flight(uav, start, goal)[0] if goal != origin else 0.0
         return Decision(
             step, self.clock, action, origin, goal, start, duration, until, reason, step
@@ -655,7 +680,8 @@ class Fleet:
 
     def booked(self, uav: Uav, found: dict[str, Decision] | None = None) -> set[int]:
         """Landing points where a UAV may stand or land."""
-        order, booked = uav.order, {each.goal for each in self._flights(uav, found or {})}
+        order = uav.order
+        booked = {each.goal for each in self._flights(uav, found or {})}
         if order is not None and (order.status == ACCEPTED or self._is_nowhere(uav)):
             booked |= {order.origin, order.goal}
         return booked | {self._standing(uav.id, False)}
@@ -667,7 +693,8 @@ class Fleet:
         A UAV may have to land anywhere on its way: so nobody is sent under the way of another one,
         nor over where another one may stand or land, whatever their levels are.
         """
-        way, points = self._path(decision), self.ground.points
+        way = self._path(decision)
+        points = self.ground.points
         for other in self._others(uav):
             places = self.booked(other, found)
             near = [way.distance(shapely.Point(self._start(other, place))) for place in places]
@@ -696,7 +723,8 @@ class Fleet:
     def _bends(self, decision: Decision) -> bool:
         """Whether the straight way from where a UAV stands is not clear; from outside it may come
         in."""
-        polygon, way = self.ground.region.polygon, self._path(decision)
+        polygon = self.ground.region.polygon
+        way = self._path(decision)
         if not polygon.covers(shapely.Point(decision.start)):
             within = way.intersection(polygon)
             if within.geom_type != "LineString" or within.length < way.length - self.config.margin:
@@ -715,7 +743,8 @@ class Fleet:
             .T
         )
         clear = self._is_clear(shapely.linestrings(np.stack([points[one], points[other]], 1)))
-        one, other = one[clear], other[clear]
+        one = one[clear]
+        other = other[clear]
         far = np.linalg.norm(points[one] - points[other], axis=1)
         return csr_array((far, (one, other)), shape=(len(points),) * 2)
 
@@ -739,7 +768,8 @@ class Fleet:
         low."""
         cleared: dict[str, Decision] = {}
         for number, (uav, decision) in enumerate(found, self.n_answers + 1):
-            reason, here = None, decision.origin
+            reason = None
+            here = decision.origin
             if decision.moves and self._meets(uav, decision, cleared):
                 reason = "conflict"
             elif decision.moves and self._bends(decision):
@@ -761,9 +791,12 @@ class Fleet:
         return [self._shown(uav, self.clock) for uav in self.members(asking.uavs, "uavs")]
 
     def _shown(self, uav: Uav, now: float) -> Advice:
-        offer, decision, told = uav.offer, uav.open_order, dict[str, Any]()
+        offer = uav.offer
+        decision = uav.open_order
+        told = dict[str, Any]()
         if offer is not None and offer.is_live(now):
-            decision, told = offer, {"state": offer.kind}
+            decision = offer
+            told = {"state": offer.kind}
         elif offer is not None and (offer.status, offer.moves) == (LANDED, False):
             still = now <= offer.until if offer.action is None else offer.step == self.tracker.step
             decision, told = (offer, {"state": "hold"}) if still else (decision, told)
@@ -785,10 +818,8 @@ class Fleet:
             told["altitude"] = uav.level
         if not uav.open_order:  # else nobody knows where it is
             way = self._path(decision)
-            distance, arrival = (
-                way.length * decision.moves,
-                written(decision.time + decision.duration),
-            )
+            distance = way.length * decision.moves
+            arrival = written(decision.time + decision.duration)
             told |= {
                 "distance": round(distance, 2),
                 "duration": round(decision.duration, 2),
@@ -803,13 +834,15 @@ class Fleet:
 
     def status(self, now: float) -> FleetStatus:
         """What is known of the fleet at an instant [s]."""
-        tracker, now = self.tracker, max(now, self.clock)
+        tracker = self.tracker
+        now = max(now, self.clock)
         uavs = [self._status(uav, now) for uav in self.uavs.values()]
         start = written(tracker.start) if tracker.has_begun else None
         return FleetStatus(start=start, step=tracker.step, dt=self.node.dt, uavs=uavs)
 
     def _status(self, uav: Uav, now: float) -> UavStatus:
-        newest, told = self.tracker.logs[uav.id].newest, {"ID": uav.id, "age": self._age(uav, now)}
+        newest = self.tracker.logs[uav.id].newest
+        told = {"ID": uav.id, "age": self._age(uav, now)}
         if newest is not None:
             told |= zip(self.ground.columns, newest.report.place() or (), strict=True)
             battery = newest.battery if newest.battery_known else None

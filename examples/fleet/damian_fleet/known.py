@@ -30,7 +30,8 @@ class Ground:
     places."""
 
     def __init__(self, airspace: Airspace, reach: float) -> None:
-        self.region, self.reach = airspace.regions[0], reach
+        self.region = airspace.regions[0]
+        self.reach = reach
         self.columns = METRES if self.region.origin is None else DEGREES
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
         self.landing_point = lru_cache(10_000)(
@@ -117,7 +118,10 @@ class UavLog:
     """The reports of one UAV."""
 
     def __init__(self, ground: Ground, n_stops: int, n_readings: int, dt: float) -> None:
-        self.ground, self.n_stops, self.n_readings, self.dt = ground, n_stops, n_readings, dt
+        self.ground = ground
+        self.n_stops = n_stops
+        self.n_readings = n_readings
+        self.dt = dt
         self.reports: list[FilledReport] = []
         self.identities: set[Hashable] = set()
         """Those of all reports that have come in."""
@@ -140,7 +144,8 @@ class UavLog:
         for place in (*own_places, *(report.previous or ())):
             if place is not None:
                 self.ground.landing_point(place)
-        given, n = report.readings, self.n_readings
+        given = report.readings
+        n = self.n_readings
         if given is not None and len(given) != n:
             raise InputError(f"readings: {len(given)} numbers are not {n}, as in the training")
         self._check_clock(report)
@@ -182,8 +187,10 @@ class UavLog:
 
     def _fill(self, filled: FilledReport, before: FilledReport | None) -> None:
         """Fill in what a report leaves open."""
-        report, near = filled.report, self.ground.landing_point
-        here, target = report.place(), report.place("target_")
+        report = filled.report
+        near = self.ground.landing_point
+        here = report.place()
+        target = report.place("target_")
         assert here is not None  # every report has it
         took_off = before.point if before and filled.origin is None else filled.origin
         filled.point = filled.target = (
@@ -198,11 +205,14 @@ class UavLog:
         filled.battery = known.battery if report.battery is None else report.battery
         filled.battery_known = known.battery_known or report.battery is not None
         filled.readings = known.readings if report.readings is None else report.readings
-        filled.spotted, place = report.source_spotted and not report.flies, report.place("source_")
+        filled.spotted = report.source_spotted and not report.flies
+        place = report.place("source_")
         if filled.spotted:
-            filled.detected, filled.detected_at = filled.step, filled.point
+            filled.detected = filled.step
+            filled.detected_at = filled.point
         elif report.source_time is None:
-            filled.detected, filled.detected_at = known.detected, known.detected_at
+            filled.detected = known.detected
+            filled.detected_at = known.detected_at
         elif place is not None:
             filled.detected_at = near(place)
         else:
@@ -216,7 +226,8 @@ class UavLog:
         self, filled: FilledReport, before: FilledReport | None
     ) -> tuple[tuple[int, int], ...]:
         """The latest stops of a UAV, as far as a report and the one before it tell."""
-        report, stops = filled.report, list(before.stops) if before else []
+        report = filled.report
+        stops = list(before.stops) if before else []
         if not stops or stops[0][0] != filled.point:
             stops = [(filled.point, filled.step), *stops]
         if report.previous is not None:

@@ -55,7 +55,8 @@ def ask(url: str, token: str, request: Request) -> Answer:
         except urllib.error.HTTPError as error:
             answer = error
         with answer:
-            status, text = answer.status, answer.read(1_000_000)
+            status = answer.status
+            text = answer.read(1_000_000)
         content = json.loads(text or b"{}")
     return Answer(status, content, request.number)
 
@@ -78,7 +79,8 @@ def serve(bridge: Bridge, address: str, url: str, token: str, memory: Path) -> N
     asked: queue.Queue[Request] = queue.Queue()
     answers: queue.Queue[Answer] = queue.Queue()
     threading.Thread(target=requester, args=(url, token, asked, answers), daemon=True).start()
-    stored, quiet = "", -math.inf
+    stored = ""
+    quiet = -math.inf
     while bridge.state != "left":
         try:
             messages = list(iter(link.recv_msg, None))
@@ -160,7 +162,9 @@ def main() -> None:
     given = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     given.memory.mkdir(parents=True, exist_ok=True)
-    threads, bridges, locks = [], [], []
+    threads = []
+    bridges = []
+    locks = []
     try:
         vehicles = parsed_vehicles(given.vehicle)
     except ValueError as error:

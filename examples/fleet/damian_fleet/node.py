@@ -100,7 +100,8 @@ class ReportedEnv(UavEnv):
     def outputs_of(self, reported: Reported, first: bool = False) -> Outputs:
         """The outputs of a step, before any transform; ``first``: of the step that begins an
         episode."""
-        state, on_time = reported.state, reported.on_time.unsqueeze(0)
+        state = reported.state
+        on_time = reported.on_time.unsqueeze(0)
         held = state.sent.pack()
         if first:
             outputs = self._outputs_at_reset(state, self.server.features(state.sent, state.steps))
@@ -123,8 +124,10 @@ class Node:
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         scenario = scenario_of_reports(scenario)
         self.worlds = ReportedEnv(scenario, seed, reward_terms)
-        self.scenario, self.dt = scenario, scenario.clock.dt
-        self.server, self.simulation = self.worlds.server, self.worlds.simulation
+        self.scenario = scenario
+        self.dt = scenario.clock.dt
+        self.server = self.worlds.server
+        self.simulation = self.worlds.simulation
         delays = scenario.make_delays()
         self.law_longest = delays.obs.longest
         longest = max(self.law_longest, REMEMBERED_STEPS)
@@ -186,10 +189,8 @@ def note_late(
     if isinstance(transform, Belief) and lag <= transform.longest:
         messages = transform.server.messages(message.view(1, 1, -1))
         slot = (memory["slot"] + 1 - lag) % len(memory["report"])
-        source, level = (
-            torch.arange(len(slot), device=slot.device),
-            transform.server.level(messages),
-        )
+        source = torch.arange(len(slot), device=slot.device)
+        level = transform.server.level(messages)
         memory["report"][slot, agent, source] = report_rows(transform.grid, messages, level).view(
             -1
         )

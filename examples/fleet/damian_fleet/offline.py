@@ -128,7 +128,10 @@ def _run(
 ) -> None:
     """Do the work of a program with the settings of the command line; wrong ones end it with one
     line."""
-    given, known, own, words = sys.argv[1:], rules(kind), dict[str, Any](), list[str]()
+    given = sys.argv[1:]
+    known = rules(kind)
+    own = dict[str, Any]()
+    words = list[str]()
     if {"-h", "--help"} & {*given}:
         settings = (f"  {name}: {rule.meaning}" for name, rule in known.items())
         print((__doc__ or "").strip(), "", *settings, sep="\n")

@@ -69,12 +69,16 @@ class Order:
         """How long a message was on its way; None if it, or a newer one of its kind, has come
         before."""
         drift = _DRIFT * max(now - self._bounded_at, 0.0) if self._bounded_at > -math.inf else 0.0
-        self._upper, self._lower, self._bounded_at = self._upper + drift, self._lower - drift, now
-        boot, number = getattr(message, "time_boot_ms", None), message.get_seq()
+        self._upper = self._upper + drift
+        self._lower = self._lower - drift
+        self._bounded_at = now
+        boot = getattr(message, "time_boot_ms", None)
+        number = message.get_seq()
         if boot is not None:
             if not self._clock(boot / 1e3, number, now):
                 return None
-            place, sent = boot / 1e3, boot / 1e3
+            place = boot / 1e3
+            sent = boot / 1e3
         else:
             place, sent = self._place(number, now)
         newest, came = self._newest.get(kind, (-math.inf, -math.inf))

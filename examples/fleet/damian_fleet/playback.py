@@ -72,7 +72,8 @@ def _parts(
     for where, line in lines:
         if line.join or line.leave:
             yield uavs, part
-            uavs, part = [*(uav for uav in uavs if uav not in line.leave), *line.join], []
+            uavs = [*(uav for uav in uavs if uav not in line.leave), *line.join]
+            part = []
         part.append((where, line))
     yield uavs, part
 
@@ -85,7 +86,9 @@ def _episode(
     about: Mapping[str, Any],
 ) -> Episode:
     """The flight of these steps; ``fitted`` has its messages, as of ``fit``."""
-    node, numbers, known = tracker.node, np.array(steps), list[Any]()
+    node = tracker.node
+    numbers = np.array(steps)
+    known = list[Any]()
     taken = tracker.steps(tracker.start + steps[-1] * node.dt)
     known += [outputs[0] for outputs in tqdm(taken, unit=" steps", delay=1)]
     reports = {uav: [each for _, each in rows if each.id == uav] for uav in tracker.uavs}
@@ -112,7 +115,8 @@ def _hindsight(
 ) -> dict[str, NDArray[Any]]:
     """Columns of a UAV that follow from its reports by the time when they were generated,
     [S, ...]."""
-    ground, rows = tracker.node.ground, []
+    ground = tracker.node.ground
+    rows = []
     for report in reports:
         target = report.place("target_")
         rows.append(
@@ -128,7 +132,8 @@ def _hindsight(
                 report.flies,
             )
         )
-    place, goal = ["east", "north", "up"], ["to_east", "to_north"]
+    place = ["east", "north", "up"]
+    goal = ["to_east", "to_north"]
     names = ["step", "time", *place, *goal, "battery", "track", "spotted", "flies"]
     table = (
         pd.DataFrame(rows, columns=names).sort_values("time").drop_duplicates("step", keep="last")
@@ -154,11 +159,10 @@ def _messages(
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N]
     each."""
-    sent, number = (
-        np.zeros((len(steps), len(tracker.uavs)), bool),
-        {uav: i for i, uav in enumerate(tracker.uavs)},
-    )
-    delay, found = np.zeros(sent.shape, int), fitted[fitted.uav.isin(tracker.uavs)]
+    sent = np.zeros((len(steps), len(tracker.uavs)), bool)
+    number = {uav: i for i, uav in enumerate(tracker.uavs)}
+    delay = np.zeros(sent.shape, int)
+    found = fitted[fitted.uav.isin(tracker.uavs)]
     # Of those of one step, the first that has arrived counts.
     found = found.sort_values("delay", ascending=False, na_position="first")
     for uav, time, received in found[["uav", "time", "received"]].itertuples(index=False):

@@ -127,10 +127,8 @@ def main() -> None:
             listener.setsockopt(*no_delay)
             print(*[f"token: {config.token}\n"] * config.is_made, end="")
             print("listening on http://{}:{}".format(*listener.getsockname()[:2]), flush=True)
-            app, quiet = (
-                make_app(fleets, str(config.token)),
-                {"log_level": "warning", "access_log": False},
-            )
+            app = make_app(fleets, str(config.token))
+            quiet = {"log_level": "warning", "access_log": False}
             gc.collect()
             gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
             served = uvicorn.Config(app, http=door(str(config.token)), ws="none", **quiet, **LIMITS)

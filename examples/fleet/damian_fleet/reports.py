@@ -222,7 +222,8 @@ class Report(Row):
 
     def check_places(self) -> None:
         """Require pairs of coordinates, of one kind, and the UAV's own place."""
-        said, prefixes = self.model_fields_set, ("", "source_", "target_")
+        said = self.model_fields_set
+        prefixes = ("", "source_", "target_")
         others = METRES if self.columns == DEGREES else DEGREES
         pairs = [{f"{prefix}{name}" in said for name in self.columns} for prefix in prefixes]
         mixed = any(f"{prefix}{name}" in said for prefix in prefixes for name in others)
@@ -290,7 +291,8 @@ def validated(model: type[Model], value: Any, where: str = "") -> Model:
         return model.model_validate(value)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        field, shown = ".".join(map(str, first["loc"])), show(first["input"])
+        field = ".".join(map(str, first["loc"]))
+        shown = show(first["input"])
         parts = [where, field, shown if field and first["type"] != "missing" else "", first["msg"]]
         raise InputError(": ".join(filter(None, parts))) from None
 

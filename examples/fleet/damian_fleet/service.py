@@ -76,7 +76,8 @@ class Clock:
     def __init__(
         self, least: float = 0.0, system: Any = time.time, monotonic: Any = time.monotonic
     ) -> None:
-        self._system, self._monotonic = system, monotonic
+        self._system = system
+        self._monotonic = monotonic
         self._base = max(system(), least) - monotonic()
 
     def __call__(self) -> float:

@@ -55,7 +55,8 @@ class Fleets:
         path: str | Path,
         about: Mapping[str, Any],
     ) -> None:
-        self.make, self.about = make, dict(about)
+        self.make = make
+        self.about = dict(about)
         self.problem: str | None = None
         """Why the last request could not be stored; None if it could."""
         self.loaded: dict[str, Fleet] = {}
@@ -95,7 +96,8 @@ class Fleets:
     def __getitem__(self, name: str) -> Fleet:
         """The fleet of a name."""
         if name not in self.loaded:
-            key, newest = self._id(name), "(SELECT max(time) FROM events WHERE fleet = id)"
+            key = self._id(name)
+            newest = "(SELECT max(time) FROM events WHERE fleet = id)"
             found = self._base.execute(f"SELECT head, {newest} FROM fleets WHERE id = ?", (key,))
             text, latest = found.fetchone()
             head = json.loads(text)

@@ -50,7 +50,8 @@ class Tracker:
         rows: Rows | None = None,
         standing: Callable[[str, bool], int] | None = None,
     ) -> None:
-        self.node, self.uavs = node, [*uavs]
+        self.node = node
+        self.uavs = [*uavs]
         self.points = node.simulation.airspace.points[0]
         self.logs = {uav: self.new_log() for uav in uavs}
         self.held: dict[str, FilledReport] = {}
@@ -84,7 +85,8 @@ class Tracker:
 
     def new_log(self) -> UavLog:
         """The log of a UAV that has not reported yet."""
-        widths, stops = self.node.simulation.widths, self.node.server.observation.carried_stops
+        widths = self.node.simulation.widths
+        stops = self.node.server.observation.carried_stops
         return UavLog(self.node.ground, stops, widths.readings, self.node.dt)
 
     def check(self, report: Report, log: UavLog | None = None) -> None:
@@ -132,7 +134,8 @@ class Tracker:
     def begin(self, now: float) -> None:
         """Begin at an instant [s], by when every UAV has sent a report."""
         newest = {uav: log.reports[-1].report for uav, log in self.logs.items()}
-        self.has_begun, self.start = True, min(each.time for each in newest.values())
+        self.has_begun = True
+        self.start = min(each.time for each in newest.values())
         self.step = self.first_step = max(self.step_of(now), 0)
         for uav, report in newest.items():
             self.logs[uav].reports.clear()
@@ -173,16 +176,16 @@ class Tracker:
         """End this step; in the next one it counts who has ``chosen`` which ``action`` in this
         one."""
         self.observe()
-        self.before, self.step, self._previous = (
-            self._after,
-            self.step + 1,
-            (self.action, self.chosen),
-        )
+        self.before = self._after
+        self.step = self.step + 1
+        self._previous = (self.action, self.chosen)
         self._begin_step()
 
     def begin_anew(self, step: int) -> None:
         """Go on in a later step, or in this one, with nothing but the message of each UAV."""
-        self.before, self.step, self.first_step = None, step, step
+        self.before = None
+        self.step = step
+        self.first_step = step
         self._begin_step()
         self._previous = self.action, self.chosen
 
@@ -195,7 +198,8 @@ class Tracker:
     def _begin_step(self) -> None:
         self.action = self.node.env.full_action_spec[keys.ACTION].zero()
         self.chosen = torch.zeros(1, len(self.uavs), dtype=torch.bool)
-        self._held_before, self._arrived = dict(self.held), list[tuple[str, FilledReport]]()
+        self._held_before = dict(self.held)
+        self._arrived = list[tuple[str, FilledReport]]()
         self._outputs = None
         self._collect()
 
@@ -207,7 +211,8 @@ class Tracker:
         self.pending = [each for each in self.pending if each[0] > self.step]
         arrived = sorted([*self._arrived, *due], key=lambda each: each[1].order)
         self._arrived = [*{(uav, filled.step): (uav, filled) for uav, filled in arrived}.values()]
-        self.held, self._outputs = dict(self._held_before), None
+        self.held = dict(self._held_before)
+        self._outputs = None
         by_arrival = self.node.scenario.delay.order == "arrival"
         for uav, filled in self._arrived:
             if by_arrival or filled.order >= self.held[uav].order:

@@ -66,17 +66,25 @@ class Copter:
     """
 
     def __init__(self, origin, place=0j, *, system=1, now=0.0, drain=0.05, station=None):
-        self.origin, self.place, self.height, self.landed = origin, complex(place), 0.0, True
-        self.system, self.drain, self.station = system, drain, station
-        self.wind, self.fix, self.glitch, self.prearm = 0j, True, 0j, None
-        self.battery, self.crashed, self.board, self.switch = (
-            [100.0],
-            False,
-            next(BOARDS),
-            SWITCH[STABILIZE],
-        )
+        self.origin = origin
+        self.place = complex(place)
+        self.height = 0.0
+        self.landed = True
+        self.system = system
+        self.drain = drain
+        self.station = station
+        self.wind = 0j
+        self.fix = True
+        self.glitch = 0j
+        self.prearm = None
+        self.battery = [100.0]
+        self.crashed = False
+        self.board = next(BOARDS)
+        self.switch = SWITCH[STABILIZE]
         self.aside = -math.inf  # until then the switch is off its place
-        self.mav, self.sent, self.now = mavlink.MAVLink(None, system, 1), [], now
+        self.mav = mavlink.MAVLink(None, system, 1)
+        self.sent = []
+        self.now = now
         self.reboot(now - FIX_AFTER_BOOT)  # it has stood there for a while
 
     def reboot(self, now):
@@ -84,16 +92,21 @@ class Copter:
         falls."""
         if not self.landed:
             self.crash()
-        self.mode, self.armed, self.failsafe, self.speed = STABILIZE, False, set(), DEFAULT_SPEED
-        self.goal, self.taking_off, self.position_control, self.home = (
-            None,
-            False,
-            False,
-            self.place,
-        )
-        self.velocity, self.climb, self.booted, self.on_ground_since = 0j, 0.0, now, now
+        self.mode = STABILIZE
+        self.armed = False
+        self.failsafe = set()
+        self.speed = DEFAULT_SPEED
+        self.goal = None
+        self.taking_off = False
+        self.position_control = False
+        self.home = self.place
+        self.velocity = 0j
+        self.climb = 0.0
+        self.booted = now
+        self.on_ground_since = now
         self.heard = self.lost_since = self.home_since = None
-        self.has_origin, self.streams = False, {0: [1.0, now]}
+        self.has_origin = False
+        self.streams = {0: [1.0, now]}
 
     @property
     def has_position(self):
@@ -112,7 +125,9 @@ class Copter:
         refusal = next((text for text, refuses in checks.items() if refuses), None)
         self.text(f"Arm: {refusal}" if refusal else "Arming motors")
         if not refusal:
-            self.armed, self.home, self.on_ground_since = True, self.place, self.now
+            self.armed = True
+            self.home = self.place
+            self.on_ground_since = self.now
         return self.armed
 
     def disarm(self, force=False):
@@ -126,7 +141,10 @@ class Copter:
 
     def crash(self):
         """The motors stop in the air. It falls, and counts as landed at once, as in ArduCopter."""
-        self.velocity, self.armed, self.landed, self.crashed = 0j, False, True, True
+        self.velocity = 0j
+        self.armed = False
+        self.landed = True
+        self.crashed = True
         self.stop()
 
     def change_mode(self, mode):
@@ -145,23 +163,23 @@ class Copter:
         if mode not in MODES or (self.armed and mode in NEED_POSITION and not self.has_position):
             self.text(f"Mode change to {mode} failed: requires position")
             return False
-        self.mode, self.home_since, self.speed, self.position_control = (
-            mode,
-            None,
-            DEFAULT_SPEED,
-            False,
-        )
+        self.mode = mode
+        self.home_since = None
+        self.speed = DEFAULT_SPEED
+        self.position_control = False
         self.stop()
         self.send(*self.stream(0))
         return True
 
     def stop(self):
-        self.goal, self.taking_off = None, False
+        self.goal = None
+        self.taking_off = False
 
     def step(self, now, messages=()):
         """Fly until `now` [s], obey what arrived, and return what was sent: messages of pymavlink,
         packed."""
-        dt, self.now = max(now - self.now, 0.0), now
+        dt = max(now - self.now, 0.0)
+        self.now = now
         for message in messages:
             self.receive(message)
         self.watch_failsafes()
@@ -172,13 +190,15 @@ class Copter:
             if now >= stream[1]:
                 stream[1] = now + stream[0]
                 self.send(*self.stream(number))
-        sent, self.sent = self.sent, []
+        sent = self.sent
+        self.sent = []
         return sent
 
     # What it is told.
 
     def receive(self, message):
-        kind, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        kind = message.get_type()
+        sender = (message.get_srcSystem(), message.get_srcComponent())
         if kind == "HEARTBEAT" and sender[0] == self.station:
             self.heard = self.now
         if kind == "TIMESYNC" and not message.tc1:
@@ -197,7 +217,8 @@ class Copter:
 
     def obey(self, command, altitude, frame):  # noqa: PLR0911
         """MAV_RESULT of a command."""
-        first, second = command.param1, command.param2
+        first = command.param1
+        second = command.param2
         modes = {
             mavlink.MAV_CMD_DO_SET_MODE: int(second) if int(first) & CUSTOM_MODE else None,
             mavlink.MAV_CMD_NAV_LAND: LAND,
@@ -215,11 +236,9 @@ class Copter:
                     self.armed and self.landed and self.mode == GUIDED and altitude > self.height
                 ):
                     return FAILED
-                self.goal, self.taking_off, self.position_control = (
-                    (self.place, altitude),
-                    True,
-                    False,
-                )
+                self.goal = (self.place, altitude)
+                self.taking_off = True
+                self.position_control = False
                 return ACCEPTED
             case mavlink.MAV_CMD_DO_REPOSITION:
                 return self.reposition(command, frame)
@@ -242,7 +261,8 @@ class Copter:
     def reposition(self, command, frame):
         if command.get_type() != "COMMAND_INT":
             return COMMAND_INT_ONLY
-        latitude, longitude = command.x / 1e7, command.y / 1e7
+        latitude = command.x / 1e7
+        longitude = command.y / 1e7
         if self.mode != GUIDED and not int(command.param2) & CHANGE_MODE:
             return DENIED
         if frame not in RELATIVE_ALTITUDE + AMSL or abs(latitude) > 90 or abs(longitude) > 180:
@@ -250,7 +270,8 @@ class Copter:
         if not self.enter(GUIDED):
             return FAILED
         if not self.position_control:  # entering it resets the speed: only a later one holds
-            self.speed, self.position_control = DEFAULT_SPEED, True
+            self.speed = DEFAULT_SPEED
+            self.position_control = True
         self.goal = (
             self.metres(latitude, longitude),
             command.z - (GROUND_AMSL if frame in AMSL else 0),
@@ -261,7 +282,8 @@ class Copter:
 
     def watch_failsafes(self):
         if self.has_position:
-            self.lost_since, self.has_origin = None, True
+            self.lost_since = None
+            self.has_origin = True
         elif self.lost_since is None:
             self.lost_since = self.now
         lost = self.lost_since is not None and self.now - self.lost_since >= EKF_FAILSAFE
@@ -289,7 +311,8 @@ class Copter:
             self.climb = self.climb - GRAVITY * dt if self.height else 0.0
             return
         if self.landed and not self.taking_off:
-            self.velocity, self.climb = 0j, 0.0
+            self.velocity = 0j
+            self.climb = 0.0
             if self.mode in (LAND, RTL) or self.now - self.on_ground_since >= DISARM_DELAY:
                 self.disarm()
             return
@@ -303,9 +326,13 @@ class Copter:
         self.climb = min(CLIMB_SPEED, max(-descent, (height - self.height) / dt))
         self.height = max(self.height + self.climb * dt, 0.0)
         if self.height > 0:
-            self.landed, self.taking_off, self.on_ground_since = False, False, self.now
+            self.landed = False
+            self.taking_off = False
+            self.on_ground_since = self.now
         elif self.now - self.on_ground_since >= LAND_DETECTOR and not self.landed:
-            self.landed, self.velocity, self.on_ground_since = True, 0j, self.now
+            self.landed = True
+            self.velocity = 0j
+            self.on_ground_since = self.now
             self.stop()
 
     def target(self):
@@ -348,7 +375,8 @@ class Copter:
     def metres(self, latitude, longitude):
         """The place of a latitude and longitude [deg]."""
         across = METRES_PER_DEGREE * math.cos(math.radians(self.origin[0]))
-        north, east = latitude - self.origin[0], longitude - self.origin[1]
+        north = latitude - self.origin[0]
+        east = longitude - self.origin[1]
         return complex(north * METRES_PER_DEGREE, east * across)
 
     # What it sends.
@@ -368,7 +396,8 @@ class Copter:
         """The messages of an id, which must be one of ``STREAMS``."""
         known = self.has_position if number == GPS_RAW else self.has_origin
         latitude, longitude = self.degrees(self.place + self.glitch) if known else (0.0, 0.0)
-        amsl, above_home = self.height + GROUND_AMSL if known else 0.0, round(self.height * 1000)
+        amsl = self.height + GROUND_AMSL if known else 0.0
+        above_home = round(self.height * 1000)
         place = (
             round(latitude * 1e7),
             round(longitude * 1e7),
@@ -377,10 +406,8 @@ class Copter:
         left = [max(0, round(level)) for level in self.battery]
         match number:
             case 0:  # HEARTBEAT
-                base, state = (
-                    CUSTOM_MODE | ARMED * self.armed,
-                    5 if self.failsafe else 3 if self.landed else 4,
-                )
+                base = CUSTOM_MODE | ARMED * self.armed
+                state = 5 if self.failsafe else 3 if self.landed else 4
                 yield mavlink.MAVLink_heartbeat_message(2, 3, base, self.mode, state, 3)
             case 1:  # SYS_STATUS
                 yield mavlink.MAVLink_sys_status_message(
@@ -427,7 +454,8 @@ class Copter:
 def main():
     """Fly copters over UDP in real time, until the program is ended."""
     origin, *addresses = sys.argv[1:]
-    place, links = tuple(map(float, origin.split(","))), []
+    place = tuple(map(float, origin.split(",")))
+    links = []
     for number, address in enumerate(addresses):
         copter = Copter(place, 60j * number, system=number + 1, now=time.monotonic(), station=255)
         links.append((mavutil.mavlink_connection(f"udpout:{address}"), copter))

@@ -41,7 +41,9 @@ from damian_fleet.vehicles import (
     mavlink,
 )
 
-UAVS, TICK, HOUR = "ABCDE", 0.25, 3600.0
+UAVS = "ABCDE"
+TICK = 0.25
+HOUR = 3600.0
 ORIGIN = (52.8110, -4.1283)
 STARTS = (0j, 170 + 0j, 340 + 0j, 510 + 0j, -170 + 0j)
 SAME_POINT, CLEARANCE = (
@@ -70,7 +72,8 @@ class Line:
     [s]."""
 
     def __init__(self, rng, slowest):
-        self.rng, self.items = rng, []
+        self.rng = rng
+        self.items = []
         self.usual = {"loss": 0.02, "double": 0.02, "slowest": slowest}
         vars(self).update(self.usual)
 
@@ -95,7 +98,10 @@ class Service:
         with mock.patch.object(program, "script_policy", random_policy):  # its UAVs meet often
             self.fleets = make_fleets(self.config, words)
             self.fleets.make([*UAVS], "", 0.0)  # the policy is made once for so many UAVs
-        self.now, self.jump, self.down_until, self.starts = 0.0, 0.0, 0.0, 0
+        self.now = 0.0
+        self.jump = 0.0
+        self.down_until = 0.0
+        self.starts = 0
         self.loop = asyncio.new_event_loop()
         self.serve()
 
@@ -128,7 +134,9 @@ class Link:
     """A bridge, and its links with a copter and with the service."""
 
     def __init__(self, name, copter, rng):
-        self.name, self.copter, self.bridge = name, copter, None
+        self.name = name
+        self.copter = copter
+        self.bridge = None
         self.down, self.up, self.asked, self.answered = [
             Line(rng, slowest) for slowest in (0.3, 0.3, 1.5, 1.5)
         ]
@@ -148,24 +156,26 @@ class Uav(Link):
         super().__init__(
             name, Copter(ORIGIN, STARTS[number] + aside, system=number + 1, station=255), rng
         )
-        self.memory, self.epoch, self.off_until = None, 0.0, 0.0
-        self.act, self.seen_at, self.changed, self.shown = None, None, {}, {}
-        self.second, self.second_until, self.ambush, self.others, self.wait = (
-            None,
-            0.0,
-            None,
-            0,
-            None,
-        )
-        self.strayed, self.known, self.confirmed, self.accepted, self.way = (
-            False,
-            0.0,
-            0.0,
-            0.0,
-            None,
-        )
+        self.memory = None
+        self.epoch = 0.0
+        self.off_until = 0.0
+        self.act = None
+        self.seen_at = None
+        self.changed = {}
+        self.shown = {}
+        self.second = None
+        self.second_until = 0.0
+        self.ambush = None
+        self.others = 0
+        self.wait = None
+        self.strayed = False
+        self.known = 0.0
+        self.confirmed = 0.0
+        self.accepted = 0.0
+        self.way = None
         self.last_command = self.hover_since = self.air_since = self.idle_since = None
-        self.commander, self.commanded = None, -np.inf
+        self.commander = None
+        self.commanded = -np.inf
         self.commanded_at, self.heartbeat_at = (
             -np.inf,
             -np.inf,
@@ -175,7 +185,8 @@ class Uav(Link):
     def stop_bridge(self, until):
         if self.bridge is not None:
             self.memory = self.bridge.memory.model_dump_json()
-        self.bridge, self.off_until = None, until
+        self.bridge = None
+        self.off_until = until
 
     def start_bridge(self, epoch):
         self.epoch = epoch
@@ -194,9 +205,12 @@ class Uav(Link):
         lands = copter.mode == LAND and (self.last_command == LAND or self.state == "landing")
         changed = [each for each in changed if each != "mode" or not lands or fell]
         if changed:
-            self.act, self.seen_at, self.changed = (now, why), None, {*changed}
+            self.act = (now, why)
+            self.seen_at = None
+            self.changed = {*changed}
         if (changed or fell) and (fell or not copter.landed):
-            self.strayed, self.known = True, np.inf
+            self.strayed = True
+            self.known = np.inf
 
     def hear(self, at, message, now):
         """Note whether a message that comes in shows what somebody else has done."""
@@ -224,10 +238,15 @@ class Campaign:
     def __init__(self, seed, folder):
         self.rng = np.random.default_rng(seed)
         torch.manual_seed(seed)  # the script draws
-        self.now, self.later, self.station = 0.0, [], mavlink.MAVLink(None, 255, 191)
+        self.now = 0.0
+        self.later = []
+        self.station = mavlink.MAVLink(None, 255, 191)
         self.service = Service(Path(folder))
         self.uavs = [Uav(name, number, self.rng) for number, name in enumerate(UAVS)]
-        self.broken, self.faults, self.answers, self.reported = {}, Counter(), {}, {}
+        self.broken = {}
+        self.faults = Counter()
+        self.answers = {}
+        self.reported = {}
         self.service.fleets.create("north", [*UAVS])
         self.ground = self.service.fleets["north"].ground
 
@@ -238,12 +257,14 @@ class Campaign:
         for _ in range(faults):
             kind = FAULTS[self.rng.integers(len(FAULTS))]
             self.faults[kind.__name__.replace("_", " ")] += 1
-            uav, seconds = self.uavs[self.rng.integers(len(self.uavs))], self.rng.uniform(2, 30)
+            uav = self.uavs[self.rng.integers(len(self.uavs))]
+            seconds = self.rng.uniform(2, 30)
             logging.info("%.2f s: %s, %s, %.1f s", self.now, kind.__name__, uav.name, seconds)
             kind(self, uav, seconds)
             self.run(self.rng.exponential(every))
         self.run(60.0)
-        waiting, end = {uav: uav.flights for uav in self.uavs}, self.now + 900.0
+        waiting = {uav: uav.flights for uav in self.uavs}
+        end = self.now + 900.0
         while waiting and self.now < end:
             self.run(30.0)
             waiting = {uav: flights for uav, flights in waiting.items() if uav.flights == flights}
@@ -295,7 +316,8 @@ class Campaign:
     # One step of one UAV.
 
     def step(self, uav):
-        copter, now = uav.copter, self.now
+        copter = uav.copter
+        now = self.now
         if uav.bridge is None and now >= uav.off_until:
             uav.start_bridge(self.rng.uniform(-HOUR, HOUR))
             uav.shown = {}
@@ -303,7 +325,8 @@ class Campaign:
         for link in links:
             for request in link.asked.due(now):
                 link.answered.send(now, Answer(*self.serve(uav, link, request), request.number))
-            heard, answers = link.up.due(now), link.answered.due(now)
+            heard = link.up.due(now)
+            answers = link.answered.due(now)
             if link.bridge is None:
                 continue
             if link is uav:
@@ -316,7 +339,8 @@ class Campaign:
                 message.pack(self.station)
             link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
             link.asked.send(now, *requests)
-        was_landed, failsafe = copter.landed, set(copter.failsafe)
+        was_landed = copter.landed
+        failsafe = set(copter.failsafe)
         before = {"mode": copter.mode, "motors": copter.armed}
         sent = copter.step(now, [each for link in links for each in link.down.due(now)])
         copter.mav.seq = (copter.mav.seq + uav.others) % 256
@@ -337,8 +361,10 @@ class Campaign:
             if uav.way and not uav.act and self.in_zone(copter.place, goal) > 1.0:
                 self.break_("no way through a zone", f"{uav.name} from {copter.place} to {goal}")
         if was_landed and not copter.landed:
-            uav.flights, uav.air_since = uav.flights + 1, now
-            uav.strayed, uav.accepted = uav.strayed and uav.act is not None, uav.confirmed
+            uav.flights = uav.flights + 1
+            uav.air_since = now
+            uav.strayed = uav.strayed and uav.act is not None
+            uav.accepted = uav.confirmed
         if uav.second and now > uav.second_until:
             uav.second = None
         if uav.wait and uav.bridge and uav.bridge.state == uav.wait[0]:
@@ -348,7 +374,8 @@ class Campaign:
 
     def in_zone(self, *places):
         """How much of a way between places lies in the zone [m]."""
-        ground, copter = self.ground, self.uavs[0].copter
+        ground = self.ground
+        copter = self.uavs[0].copter
         path = shapely.LineString([ground.local(copter.degrees(place)) for place in places])
         return path.intersection(shapely.Polygon(ZONE)).length
 
@@ -362,7 +389,8 @@ class Campaign:
         is_other = uav.commander not in (None, link.bridge.memory.bridge)
         if is_other and (self.now < uav.commanded + APART or not uav.copter.landed):
             self.break_("one bridge a UAV", f"{uav.name}: {link.name} {message}")
-        uav.commander, uav.commanded = link.bridge.memory.bridge, self.now
+        uav.commander = link.bridge.memory.bridge
+        uav.commanded = self.now
         to_land = number == mavlink.MAV_CMD_NAV_LAND or (number == 176 and message.param2 == LAND)
         uav.last_command = LAND if to_land else number
         if to_land and uav.seen_at is None and uav.copter.mode == LAND and uav.changed <= {"mode"}:
@@ -423,13 +451,15 @@ class Campaign:
             uav.idle_since = self.now
             if uav.act and copter.mode not in (LAND, RTL) and self.now > uav.act[0] + 20:
                 copter.change_mode(LAND)
-                uav.strayed, uav.known = True, np.inf
+                uav.strayed = True
+                uav.known = np.inf
         elif uav.idle_since is None or copter.armed:
             uav.idle_since = self.now
         elif self.now == uav.idle_since + 20:
             if copter.failsafe:
                 copter.reboot(self.now)
-            copter.crashed, copter.battery = False, [100.0]
+            copter.crashed = False
+            copter.battery = [100.0]
             stands = shapely.Point(self.ground.local(copter.degrees(copter.place)))
             if not self.ground.region.polygon.contains(
                 stands
@@ -437,7 +467,10 @@ class Campaign:
                 copter.place = STARTS[ord(uav.name) - ord("A")]
             copter.change_mode(STABILIZE)
         elif self.now >= uav.idle_since + 35:
-            uav.act, uav.seen_at, uav.changed, uav.idle_since = None, None, {}, self.now
+            uav.act = None
+            uav.seen_at = None
+            uav.changed = {}
+            uav.idle_since = self.now
             copter.change_mode(GUIDED)
 
     # What must hold.
@@ -506,7 +539,8 @@ class Faults:
     def another_bridge(field, uav, seconds):
         """Of the same name, or of another one, for the same vehicle."""
         name = uav.name if field.rng.random() < 0.5 else f"{uav.name}2"
-        uav.second, uav.second_until = Link(name, uav.copter, field.rng), field.now + 3 * seconds
+        uav.second = Link(name, uav.copter, field.rng)
+        uav.second_until = field.now + 3 * seconds
         uav.second.start()
 
     def requests_lost(field, uav, seconds):
@@ -565,7 +599,8 @@ class Faults:
             uav.acted(field.now, f"mode {mode}", *changed)
 
     def another_station_sends_it_elsewhere(field, uav):
-        copter, place = uav.copter, uav.copter.place + 60 * np.exp(2j * np.pi * field.rng.random())
+        copter = uav.copter
+        place = uav.copter.place + 60 * np.exp(2j * np.pi * field.rng.random())
         latitude, longitude = (round(each * 1e7) for each in copter.degrees(place))
         go = mavlink.MAV_CMD_DO_REPOSITION, 0, 0, -1, 0, 0, 0, latitude, longitude, 20.0
         message = mavlink.MAVLink_command_int_message(copter.system, 1, 6, *go)
@@ -650,7 +685,9 @@ def main():
     given = parser.parse_args()
     logging.basicConfig(level=logging.INFO if given.log else logging.CRITICAL, format="%(message)s")
     logging.getLogger("httpx2").setLevel(logging.WARNING)
-    faults, broken, totals = Counter(), Counter(), Counter()
+    faults = Counter()
+    broken = Counter()
+    totals = Counter()
     for seed in range(given.first, given.first + given.seeds):
         with tempfile.TemporaryDirectory() as folder:
             field = Campaign(seed, folder).play(given.faults)

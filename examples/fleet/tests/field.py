@@ -18,7 +18,8 @@ from damian_fleet.rows import Acknowledgement, Asking, Change, Command
 from damian_fleet.settings import FleetConfig
 from damian_fleet.store import Fleets
 
-EAST, WEST = 0, 1
+EAST = 0
+WEST = 1
 FEATURES = [
     "source_distance",
     "source_bearing",
@@ -62,13 +63,12 @@ class Field:
         policy_of=None,
         **rules: Any,
     ) -> None:
-        self.wishes, self.now = [EAST] * 4, START
-        self.scenario, self.policy_of, self.path, self.rules = (
-            scenario,
-            policy_of,
-            path,
-            FleetConfig(**rules),
-        )
+        self.wishes = [EAST] * 4
+        self.now = START
+        self.scenario = scenario
+        self.policy_of = policy_of
+        self.path = path
+        self.rules = FleetConfig(**rules)
         self.fleets = self.open()
         self.fleets.create("north", [*uavs])
 
@@ -144,7 +144,8 @@ def flights(
         that choose, and the step.
     """
     env = make_env(scenario, 1, 3, extras=["message"])
-    policy, uavs = policy_of(env), names_of(scenario.agents)
+    policy = policy_of(env)
+    uavs = names_of(scenario.agents)
     field = Field(
         ":memory:", uavs, scenario, policy_of, reserve=0.0, oldest_report=1e6, clearance=0.0
     )

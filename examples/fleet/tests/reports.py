@@ -33,7 +33,10 @@ class Reporter:
     """
 
     def __init__(self, env, ground: Ground, fraction: float = 0.0, start: float = START) -> None:
-        self.env, self.ground, self.fraction, self.start = env, ground, fraction, start
+        self.env = env
+        self.ground = ground
+        self.fraction = fraction
+        self.start = start
         self.dt = env.uav_env.scenario.clock.dt
         self.points = env.uav_env.simulation.airspace.points[0]
         self.in_transit: list[tuple[int, int, dict[str, Any]]] = []
@@ -51,7 +54,8 @@ class Reporter:
         def place(xy) -> tuple[float, float]:
             return self.ground.place(self.number_at(xy))
 
-        at, bound = place(messages.position[uav]), place(messages.target[uav])
+        at = place(messages.position[uav])
+        bound = place(messages.target[uav])
         first, second = self.ground.columns
         flying = bool((messages.position[uav] != messages.target[uav]).any())
         row = {

@@ -7,7 +7,8 @@ from typing import Any
 from damian_fleet.bridge import Answer, Bridge, Memory, Request
 from damian_fleet.vehicles import Copter, mavlink
 
-HOME, GOAL = (52.811, -4.1283), (52.8115, -4.1283)
+HOME = (52.811, -4.1283)
+GOAL = (52.8115, -4.1283)
 BEGIN = 1_750_000_000.0
 TICK = 0.25
 
@@ -22,7 +23,10 @@ class Vehicle(Copter):
         self.silent = self.deaf = False
         self.mute: tuple[str, ...] = ()
         """Types of messages that get lost."""
-        self.kind, self.sensors, self.receiver, self.acknowledges_to = (2, 3), (0, 0), None, None
+        self.kind = (2, 3)
+        self.sensors = (0, 0)
+        self.receiver = None
+        self.acknowledges_to = None
         super().__init__(HOME, system=system, drain=0.0)
 
     def commands(self, *numbers: int) -> list[int]:
@@ -49,10 +53,8 @@ class Vehicle(Copter):
                 each.fix_type = self.receiver
             elif each.get_type() == "SYS_STATUS":
                 present, healthy = self.sensors
-                each.onboard_control_sensors_present, each.onboard_control_sensors_health = (
-                    present,
-                    healthy,
-                )
+                each.onboard_control_sensors_present = present
+                each.onboard_control_sensors_health = healthy
         super().send(*messages)
 
     def switch_motors(self) -> None:
@@ -60,14 +62,18 @@ class Vehicle(Copter):
         if self.armed:
             self.disarm(force=True)
         else:
-            self.armed, self.on_ground_since = True, self.now
+            self.armed = True
+            self.on_ground_since = self.now
 
 
 class Service:
     """Sends the UAV to and fro, and keeps what it is told; ``bad`` changes its answers."""
 
     def __init__(self) -> None:
-        self.command, self.reason, self.status, self.n = "", "held", "", 0
+        self.command = ""
+        self.reason = "held"
+        self.status = ""
+        self.n = 0
         self.reports: list[dict[str, Any]] = []
         self.facts: list[tuple[str, str]] = []
         self.offer: dict[str, Any] | None = None
@@ -78,7 +84,8 @@ class Service:
     def answer(self, request: Request, now: float) -> Answer:
         name = request.path.rsplit("/", 1)[-1]
         self.log.append(f"{request.method} {name}")
-        status, body = 200, {}
+        status = 200
+        body = {}
         if name == "time":
             body = {"time": BEGIN + now}
         elif name == "reports":
@@ -86,7 +93,8 @@ class Service:
         elif name == "advice":
             body = {"advice": [self.advise()]}
         elif name == "acknowledgements":
-            answer, said = request.body["answer"], request.body["status"]
+            answer = request.body["answer"]
+            said = request.body["status"]
             self.facts.append((answer, said))
             if self.offer is not None and answer == self.offer["answer"]:
                 self.status = "landed" if self.offer["state"] == "hold" else said
@@ -97,9 +105,11 @@ class Service:
                 each for each in self.members if each not in request.body.get("leave", [])
             ]
         elif request.method == "PUT":
-            self.members, status = list(request.body["uavs"]), 201
+            self.members = list(request.body["uavs"])
+            status = 201
         elif self.members is None:
-            status, body = 404, {"error": "no fleet"}
+            status = 404
+            body = {"error": "no fleet"}
         else:
             body = {"dt": 2.0, "uavs": [{"ID": each} for each in self.members]}
         return self.bad(request, Answer(status, body, request.number))
@@ -108,7 +118,8 @@ class Service:
         is_over = self.offer is None or self.status in ("landed", "aborted", "lapsed")
         kind = self.command or "fly"
         if is_over or (self.command and self.offer["state"] != self.command):
-            self.n, self.status = self.n + 1, "offered"
+            self.n = self.n + 1
+            self.status = "offered"
             self.offer = {"answer": f"x-{self.n}", "ID": "A", "state": kind}
             self.offer |= {"reason": self.reason if self.command else None}
             if kind != "hold":
@@ -127,7 +138,9 @@ class World:
     """Bridge, vehicle and service in one virtual time; ``system`` as of ``Bridge``."""
 
     def __init__(self, system: int | None = None) -> None:
-        self.vehicle, self.service, self.now = Vehicle(), Service(), 0.0
+        self.vehicle = Vehicle()
+        self.service = Service()
+        self.now = 0.0
         self.bridge = Bridge("A", "north", system=system)
         self.states: list[str] = []
         self.others: Callable[[float], list[Any]] = lambda _: []
@@ -160,14 +173,16 @@ class World:
 
     def heal(self) -> "World":
         """Let everything go as it should from now on."""
-        self.vehicle.results, self.service.bad = {}, lambda _, answer: answer
+        self.vehicle.results = {}
+        self.service.bad = lambda _, answer: answer
         return self
 
     def start_again(self) -> "World":
         """Start the bridge again, with what it remembers."""
         stored = self.bridge.memory.model_dump_json()
         self.bridge = Bridge("A", "north", memory=Memory.model_validate_json(stored))
-        self._out, self._answers = [], []
+        self._out = []
+        self._answers = []
         return self
 
 

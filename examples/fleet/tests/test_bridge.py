@@ -12,8 +12,14 @@ from damian_fleet.vehicles import GUIDED, LAND, LOITER, RTL, mavlink
 
 FLIGHT = ["ground", "accept", "guided", "arm", "climb", "cruise", "landing"]
 TOLD = ["accepted", "taken off", "landed"]
-SET_MODE, ARM, TAKEOFF, REPOSITION, SPEED, TO_LAND = 176, 400, 22, 192, 178, 21
-REFUSED, TEMPORARILY = 4, 1
+SET_MODE = 176
+ARM = 400
+TAKEOFF = 22
+REPOSITION = 192
+SPEED = 178
+TO_LAND = 21
+REFUSED = 4
+TEMPORARILY = 1
 
 
 def test_it_reports_asks_accepts_flies_lands_and_reports_again():
@@ -137,7 +143,8 @@ def test_nothing_is_sent_again_until_mode_and_motors_are_heard_then_it_watches(c
     world = World()
     world.vehicle.results = {command: TEMPORARILY}
     assert world.run(90, lambda: world.vehicle.commands(command))
-    before, world.vehicle.mute = len(world.vehicle.commands()), ("HEARTBEAT",)
+    before = len(world.vehicle.commands())
+    world.vehicle.mute = ("HEARTBEAT",)
     world.run(4.5)
     assert (len(world.vehicle.commands()), world.bridge.state == "watch") == (before, False)
     world.run(3)
@@ -187,7 +194,9 @@ def test_a_pilot_who_flies_keeps_it_whoever_watches():
 
 def test_messages_up_to_five_seconds_late_are_no_boot_and_no_act():
     """At 50 messages a second, out of order."""
-    draw, world, under_way = random.Random(5), in_state("cruise"), []
+    draw = random.Random(5)
+    world = in_state("cruise")
+    under_way = []
     heard = world.vehicle.step
 
     def late(now, messages):
@@ -198,7 +207,8 @@ def test_messages_up_to_five_seconds_late_are_no_boot_and_no_act():
         under_way[:] = [each for each in under_way if each[0] > now]
         return due
 
-    world.vehicle.step, world.vehicle.station = late, 255
+    world.vehicle.step = late
+    world.vehicle.station = 255
     assert world.run(120, lambda: world.vehicle.landed), "by its bridge, or else by its failsafe"
     assert (world.bridge.order.boots, "not heard" in world.bridge.why) == (0, True)
     world.vehicle.reboot(world.now)
@@ -285,7 +295,8 @@ def test_a_command_that_comes_late_is_no_handing_over():
 
 
 def test_it_commands_its_own_vehicle_alone():
-    world, other = World(), Vehicle(2)
+    world = World()
+    other = Vehicle(2)
     other.change_mode(LOITER)
     world.others = other.step
     assert world.until_said("x-1", "landed")
@@ -363,7 +374,8 @@ def test_an_error_of_the_service_is_a_missing_answer(bad):
 
 def test_the_policy_may_hold_and_that_is_a_decision():
     world = World()
-    world.service.command, world.service.reason = "hold", None
+    world.service.command = "hold"
+    world.service.reason = None
     world.until("ground").run(10)
     n_holds = len(world.service.facts)
     assert n_holds > 2
@@ -374,7 +386,8 @@ def test_the_policy_may_hold_and_that_is_a_decision():
 @pytest.mark.parametrize("state", ["guided", "arm", "climb", "cruise"])
 def test_an_operator_is_heard_in_every_state_of_a_flight(state):
     world = in_state(state)
-    world.service.command, world.vehicle.results = "hold", {}
+    world.service.command = "hold"
+    world.vehicle.results = {}
     assert world.run(5, lambda: world.bridge.state == "landing")
     assert ("x-1", "aborted") not in world.service.facts, "it is in the air yet"
     world.until("ground").run(2)
@@ -391,7 +404,8 @@ def test_after_a_lost_link_it_reports_before_it_asks():
     world.run(2)  # it has heard that its commands are followed
     world.vehicle.silent = world.vehicle.deaf = True
     world.run(10)
-    n_sent, world.service.log = len(world.vehicle.orders), []
+    n_sent = len(world.vehicle.orders)
+    world.service.log = []
     world.run(10)
     assert ("POST advice" in world.service.log, len(world.vehicle.orders)) == (False, n_sent)
     world.vehicle.silent = world.vehicle.deaf = False
@@ -426,7 +440,8 @@ def test_started_again_it_goes_on_as_it_was_and_tells_what_it_had_to_tell(state)
     world.run(5 if state in ("watch", "hold") else 0)
     world.service.bad = missing
     world.bridge._say_fact("x-1", "taken off")
-    n_reports, before = len(world.service.reports), len(world.vehicle.commands())
+    n_reports = len(world.service.reports)
+    before = len(world.vehicle.commands())
     world.run(1)
     n_told = world.service.facts.count(("x-1", "taken off"))
     world.start_again().heal().run(60)
@@ -517,7 +532,8 @@ def test_what_waits_says_so(state, caplog):
 
 def test_what_the_vehicle_says_is_logged_and_its_own_checks_are_waited_for(caplog):
     caplog.set_level("INFO")
-    world, bit = World(), mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    world = World()
+    bit = mavlink.MAV_SYS_STATUS_PREARM_CHECK
     world.vehicle.sensors = bit, 0
     world.until("ground").vehicle.text("PreArm: Compass not calibrated")
     world.run(40)

@@ -11,7 +11,8 @@ def test_what_must_hold_holds_through_faults_of_every_link(tmp_path):
     # It would see two at one point, and two that meet.
     field.now, (one, other) = 1.0, field.uavs[:2]
     for uav, place in ((one, 0j), (other, 5j)):
-        uav.strayed, uav.air_since = False, 1.0
+        uav.strayed = False
+        uav.air_since = 1.0
         vars(uav.copter).update(place=place, landed=True, mode=4, velocity=5 + 0j)
     field.check()
     assert [*field.broken] == ["no two at one point"]

@@ -53,10 +53,13 @@ TASKS = {
 @pytest.mark.parametrize("task", TASKS)
 def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task):
     policy_of, changed = TASKS[task]
-    moved, n_steps, fraction = 0, 60 if "motion" in changed else 25, 0.7 * (task == "flights")
+    moved = 0
+    n_steps = 60 if "motion" in changed else 25
+    fraction = 0.7 * (task == "flights")
     scenario = scenario_of(**changed)
     for shown, field, action, ready, step in flights(scenario, policy_of, n_steps, fraction):
-        fleet, read = field.fleet, field.fleet.tracker.read(ready)
+        fleet = field.fleet
+        read = field.fleet.tracker.read(ready)
         for key in (keys.OBSERVATION, keys.ACTION_MASK, keys.TIMELINE):
             if key in shown.keys(True):
                 assert torch.equal(read[key], shown[key]), (step, key)

@@ -72,7 +72,9 @@ def test_a_service_that_is_not_there_is_no_answer():
 def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(
     served, tmp_path, monkeypatch
 ):
-    service, vehicle, now = Service(), Vehicle(), [0.0]
+    service = Service()
+    vehicle = Vehicle()
+    now = [0.0]
     service.command = "hold"
 
     def answer(method, path, body):
@@ -84,7 +86,9 @@ def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(
     own.setblocking(False)
 
     def fly():
-        parser, bridge, heard = mavlink.MAVLink(None), None, []
+        parser = mavlink.MAVLink(None)
+        bridge = None
+        heard = []
         while service.members != []:
             try:
                 data, bridge = own.recvfrom(2048)
@@ -98,7 +102,8 @@ def test_the_program_bridges_over_udp_and_http_until_it_is_interrupted(
             if service.facts and not done:
                 done.append(os.kill(os.getpid(), signal.SIGINT))
 
-    done, port = [], own.getsockname()[1]
+    done = []
+    port = own.getsockname()[1]
     words = [
         "--service",
         served(answer),

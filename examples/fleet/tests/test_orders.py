@@ -71,7 +71,8 @@ def test_an_order_goes_only_forward_whatever_is_said(field, said, status, moved)
 
 @pytest.mark.parametrize("says_so", [True, False])
 def test_whoever_has_landed_or_reports_to_be_there_chooses_again(field, says_so):
-    answer, there = field.ask("A", 1), field.east_of(200)
+    answer = field.ask("A", 1)
+    there = field.east_of(200)
     field.say("A", answer.answer, "accepted")
     field.now += 1
     field.report("A", 200)
@@ -241,7 +242,8 @@ def test_a_person_sends_uavs_home(field):
     answer = field.ask("A", 1)
     field.say("A", answer.answer, "accepted")
     field.command("return", ["A"])
-    recalled, home = field.ask("A", 2), field.fleet.ground.place(200)
+    recalled = field.ask("A", 2)
+    home = field.fleet.ground.place(200)
     assert (recalled.state, (recalled.lat, recalled.lon), recalled.heading) == (
         "return",
         home,
@@ -338,7 +340,8 @@ def stand(field: Field, x: float, y: float) -> None:
 def test_a_way_is_checked_from_where_the_uav_stands_with_a_margin(aside, bends):
     """Past the upper edge of a zone, whose margin is 10 m."""
     field, x, y = holed()
-    points, fleet = field.fleet.ground.points, field.fleet
+    points = field.fleet.ground.points
+    fleet = field.fleet
     goal = min(
         range(len(points)), key=lambda i: abs(points[i][0] - x - 90) + abs(points[i][1] - y - 41)
     )
@@ -356,8 +359,10 @@ def test_a_uav_is_led_home_around_a_zone_by_way_of_landing_points():
     stand(field, x + 70, y)  # its home
     stand(field, x - 70, y)
     field.command("return", ["A"])
-    region, zone = fleet.ground.region.polygon, box(x - 30, y - 30, x + 30, y + 30)
-    here, hops = (x - 70, y), 0
+    region = fleet.ground.region.polygon
+    zone = box(x - 30, y - 30, x + 30, y + 30)
+    here = (x - 70, y)
+    hops = 0
     while (told := field.ask("A", 11)).state == "return":
         goal = fleet.ground.local((told.lat, told.lon))
         way = LineString([here, goal])
@@ -365,7 +370,8 @@ def test_a_uav_is_led_home_around_a_zone_by_way_of_landing_points():
         assert way.distance(zone) > 0
         for word in ("accepted", "taken off", "landed"):
             field.say("A", told.answer, word, 1)
-        here, hops = goal, hops + 1
+        here = goal
+        hops = hops + 1
         stand(field, *here)
     assert math.dist(here, (x + 70, y)) < 20
     assert hops > 1

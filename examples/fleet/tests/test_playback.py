@@ -59,7 +59,8 @@ def flown(tmp_path_factory, scenario) -> tuple:
     reports."""
     env = make_env(scenario, 1, 3, extras=EXTRAS)
     rollout = env.rollout(N_STEPS, script_policy(env), break_when_any_done=False)
-    reporter, lines = Reporter(env, Node(scenario, 3).ground), []
+    reporter = Reporter(env, Node(scenario, 3).ground)
+    lines = []
     for step in range(N_STEPS + 1):
         reporter.send(
             rollout[:, step] if step < N_STEPS else rollout[:, -1]["next"], step, at_once=step == 0
@@ -159,7 +160,8 @@ def test_another_episode_begins_when_uavs_join_and_leave(tmp_path):
 
 
 def test_reports_of_a_wrong_clock_are_left_out_of_the_flight_and_named(tmp_path, capsys):
-    ground, lines = Node(SCENARIO, 3).ground, []
+    ground = Node(SCENARIO, 3).ground
+    lines = []
     for second in range(40):
         for uav in names_of(3):
             sets_back = 30.0 if uav == "uav-1" and second >= 15 else 0.0

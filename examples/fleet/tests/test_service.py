@@ -186,7 +186,8 @@ def test_a_report_is_refused_with_its_column_and_what_would_be_right(client, cha
 
 @pytest.mark.parametrize("path", ["reports", "acknowledgements", "command", "uavs"])
 def test_any_nonsense_is_refused_and_changes_nothing(client, path):
-    answer, draw = begin(client)["answer"], random.Random(3)
+    answer = begin(client)["answer"]
+    draw = random.Random(3)
     good = {
         "ID": "A",
         "answer": answer,

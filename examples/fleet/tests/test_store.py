@@ -59,10 +59,12 @@ def test_whatever_happens_a_restart_remembers_it_all(tmp_path, seed):
     for turn in range(70):
         field.now += draw.choice([0.0, 0.3, 1.0, 4.0, 30.0 if turn % 20 == 0 else 2.0])
         uavs = [*field.fleet.uavs]
-        uav, kind = draw.choice(uavs), draw.random()
+        uav = draw.choice(uavs)
+        kind = draw.random()
         if kind < 0.35:
             point = field.booked(uav) if draw.random() < 0.8 else draw.randrange(400)
-            battery, flies = draw.choice([90.0, 90.0, 90.0, 10.0]), draw.choice([0.0, 0.0, 20.0])
+            battery = draw.choice([90.0, 90.0, 90.0, 10.0])
+            flies = draw.choice([0.0, 0.0, 20.0])
             late = draw.choice([0.0, 0.0, 2.5])
             field.report(uav, point, battery=battery, time=field.now - late, fla=flies)
         elif kind < 0.65:
@@ -88,7 +90,8 @@ def test_whatever_happens_a_restart_remembers_it_all(tmp_path, seed):
             field.report("D", draw.randrange(400))
         if turn % 35 == 34:
             field.fleet.advance(field.now)
-            before, status = known(field.fleet), field.fleet.status(field.now)
+            before = known(field.fleet)
+            status = field.fleet.status(field.now)
             field.restart()
             field.fleet.advance(field.now)
             assert known(field.fleet) == before
@@ -169,7 +172,8 @@ def test_a_database_is_of_one_service_and_of_one_policy(tmp_path):
 
 def test_nothing_that_was_acknowledged_is_lost_by_kill(tmp_path):
     """The program is killed while it takes reports, twice."""
-    told, counted = {}, 0
+    told = {}
+    counted = 0
     words = ["region=llanbedr", "motion=polynomial", f"token={TOKEN}", "port=0"]
     code = [sys.executable, "-W", "ignore", "-c", "from damian_fleet.program import main; main()"]
     rows = [

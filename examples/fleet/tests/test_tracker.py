@@ -101,8 +101,12 @@ OTHERS = ["on time", "the last to arrive", "messages", "clocks", "a region of me
 def test_it_observes_what_the_simulation_does_bit_for_bit(task, fraction):
     scenario = scenario_of(**TASKS[task])
     env = make_env(scenario, 1, 3, extras=["message"])
-    node, policy, n_spotted, rows = Node(scenario, 3), script_policy(env), 0, []
-    seen, reporter = [env.reset()], Reporter(env, node.ground, fraction)
+    node = Node(scenario, 3)
+    policy = script_policy(env)
+    n_spotted = 0
+    rows = []
+    seen = [env.reset()]
+    reporter = Reporter(env, node.ground, fraction)
     reporter.send(seen[0], 0, at_once=True)
     for step in range(90 if task == "flights" else 40):
         now = reporter.time_of(step) + 0.2 * reporter.dt
@@ -127,8 +131,12 @@ def test_it_observes_what_the_simulation_does_bit_for_bit(task, fraction):
 def test_a_table_is_answered_as_the_policy_acts_in_the_simulation(policy_of):
     scenario = scenario_of(observation=BELIEF)
     env = make_env(scenario, 1, 3, extras=["message"])
-    node, policy, rows, n_moved = Node(scenario, 3), policy_of(env), [], 0
-    reporter, shown = Reporter(env, node.ground), env.reset()
+    node = Node(scenario, 3)
+    policy = policy_of(env)
+    rows = []
+    n_moved = 0
+    reporter = Reporter(env, node.ground)
+    shown = env.reset()
     reporter.send(shown, 0, at_once=True)
     for step in range(12):
         rows += [
@@ -172,7 +180,8 @@ FIRST = [told(uav, START, 200 + i) for i, uav in enumerate("abc")]
 def followed(*reports: dict[str, Any], until: float, **changed) -> Tracker:
     """What the server node knows at an instant [s] from the first reports of three UAVs and
     these."""
-    node, rows = Node(scenario_of(**changed), 3), []
+    node = Node(scenario_of(**changed), 3)
+    rows = []
     for said in [*FIRST, *reports]:
         lat, lon = node.ground.place(said["point"])
         more = {name: value for name, value in said.items() if name not in ("uav", "point")}
@@ -197,7 +206,8 @@ def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
         told("a", START - 3, 100, START + 6),  # before the start
     ]
     tracker = followed(*reports, until=START + 7)
-    held, log = tracker.held["a"], tracker.logs["a"].reports
+    held = tracker.held["a"]
+    log = tracker.logs["a"].reports
     assert (held.point, held.detected, held.detected_at, len(log)) == (210, 3, 205, 3)
 
 

@@ -12,7 +12,9 @@ class Field:
     """A copter, its ground station and virtual time."""
 
     def __init__(self, **copter):
-        self.now, self.copter, self.received = 0.0, Copter((52.8110, -4.1283), **copter), []
+        self.now = 0.0
+        self.copter = Copter((52.8110, -4.1283), **copter)
+        self.received = []
 
     def run(self, seconds, until=lambda: False):
         end = self.now + seconds
@@ -42,10 +44,8 @@ class Field:
         return self.long(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height)
 
     def reposition(self, place, flags=0, frame=6):
-        at, number = (
-            [round(each * 1e7) for each in self.copter.degrees(place)],
-            mavlink.MAV_CMD_DO_REPOSITION,
-        )
+        at = [round(each * 1e7) for each in self.copter.degrees(place)]
+        number = mavlink.MAV_CMD_DO_REPOSITION
         params = frame, number, 0, 0, -1, flags, 0, 0, *at, 20
         return self.ask(mavlink.MAVLink_command_int_message(1, 1, *params))
 
@@ -56,7 +56,8 @@ class Field:
 
 
 def test_it_takes_off_armed_and_guided_flies_there_lands_and_disarms_itself():
-    field, goal = Field(), 100 + 50j
+    field = Field()
+    goal = 100 + 50j
     copter = field.copter
     assert field.takeoff() == FAILED
     assert [field.mode(GUIDED), field.arm(), copter.change_mode(LOITER)] == [
@@ -117,7 +118,8 @@ def test_failsafes_land_it_and_forced_disarming_lets_it_fall():
     assert [field.mode(GUIDED), field.arm()] == [ACCEPTED, FAILED], "until it is restarted"
 
     field = Field().flying()
-    field.copter.fix, field.copter.wind = False, 3 + 0j
+    field.copter.fix = False
+    field.copter.wind = 3 + 0j
     field.run(2)
     assert (field.copter.mode, field.mode(GUIDED)) == (LAND, FAILED)
     assert field.run(60, lambda: field.copter.landed)
