@@ -29,10 +29,8 @@ class AgentGRU(TensorDictModuleBase):
 
     def __init__(self, encoder: nn.Module, n_features: int, n_hidden: int) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = (
-            [keys.OBSERVATION, keys.HIDDEN],
-            [keys.HIDDEN, keys.HIDDEN_BEFORE],
-        )  # type: ignore[assignment]
+        self.in_keys = [keys.OBSERVATION, keys.HIDDEN]  # type: ignore[assignment]
+        self.out_keys = [keys.HIDDEN, keys.HIDDEN_BEFORE]  # type: ignore[assignment]
         self.encoder = encoder
         self.cell = nn.GRUCell(n_features, n_hidden)
 

@@ -211,9 +211,11 @@ class Episode:
             ) from error
 
 
-COLUMNS = {
-    f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")
-}  # type: ignore[union-attr]
+COLUMNS: dict[str, str] = {
+    each.name: cast(Any, each.type).__metadata__[0]
+    for each in fields(Episode)
+    if hasattr(each.type, "__metadata__")
+}
 """What each column means, by its name."""
 
 OUTPUTS = (keys.STATE, keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY)

@@ -375,8 +375,8 @@ class Fleet:
                 is_same = fleet is self and name == uav
                 lease.seen = now if lease.seen is None else lease.seen
                 if is_same and lease.bridge == bridge:
-                    lease.seen = now
-                elif (is_same or (vehicle and vehicle == lease.vehicle)) and fleet.holds(name, now):
+                    continue
+                if (is_same or (vehicle and vehicle == lease.vehicle)) and fleet.holds(name, now):
                     one, other = (each[:6] or "without a name" for each in (lease.bridge, bridge))
                     what = (
                         f"UAV {name}"
@@ -388,6 +388,8 @@ class Fleet:
                     raise Held(
                         f"bridge: {one} speaks for {what}, not {other}: {remedy} for {LEASE:g} s"
                     )
+        if uav in self.leases and self.leases[uav].bridge == bridge:
+            self.leases[uav].seen = now
 
     def holds(self, uav: str, now: float) -> bool:
         """Whether the bridge that spoke for a UAV last still has it."""

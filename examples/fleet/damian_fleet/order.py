@@ -12,6 +12,8 @@ from typing import Any
 
 LATEST = 5.2
 """No message is later than this [s]; where one is, it may count as new."""
+LATE = 2.0
+"""After messages as late as this [s], a number that may be of two messages is of the older one."""
 _KEPT = 8.0  # how long messages with a time are remembered, by the vehicle's clock [s]
 _DRIFT = 1e-4  # how much clocks may differ, as a share of the time
 
@@ -88,10 +90,10 @@ class Order:
             return None
         self._newest[kind] = place, now
         late = max(now - self._ahead - sent, 0.0) if self._times else 0.0
-        if boot is not None and late > 256 / self._rate - 1.0:
+        if boot is not None and late > LATE:
             self._mixed_until = (
                 now + LATEST
-            )  # messages come so late that their count has begun again
+            )  # others may come so late that their count has begun again
         return late
 
     def _clock(self, boot: float, number: int, now: float) -> bool:
@@ -130,17 +132,20 @@ class Order:
             return place, vehicle
         newest = self._numbers[-1] + self._rate * (vehicle - self._times[-1]) + 8 + 0.2 * self._rate
         place = number + math.floor((newest - number) / 256) * 256
-        since = (newest - place) / self._rate
-        if now < self._mixed_until and since + 256 / self._rate < LATEST + 0.5:
+        if now < self._mixed_until and vehicle - self._time_at(place - 256) < LATEST + 0.5:
             place -= 256  # it may be as old as that
         self._number = max(self._number, place)
+        return place, self._time_at(place)
+
+    def _time_at(self, place: int) -> float:
+        """When a message of a number was sent, by the vehicle's clock, between those that tell
+        their time."""
         after = bisect.bisect_left(self._numbers, place)
-        if after == len(self._numbers):
-            return place, self._times[-1] + (place - self._numbers[-1]) / self._rate
-        if after == 0:
-            return place, self._times[0] + (place - self._numbers[0]) / self._rate
+        if after in (0, len(self._numbers)):
+            near = min(after, len(self._numbers) - 1)
+            return self._times[near] + (place - self._numbers[near]) / self._rate
         (one, other), (t, u) = (
             self._numbers[after - 1 : after + 1],
             self._times[after - 1 : after + 1],
         )
-        return place, t + (u - t) * (place - one) / max(other - one, 1)
+        return t + (u - t) * (place - one) / max(other - one, 1)

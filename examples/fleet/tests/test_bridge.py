@@ -8,7 +8,7 @@ from scripted import BEGIN, GOAL, HOME, Vehicle, World
 
 from damian_fleet.bridge import Answer, Bridge
 from damian_fleet.reports import Report, validated
-from damian_fleet.vehicles import GUIDED, LAND, LOITER, RTL, mavlink
+from damian_fleet.vehicles import BRAKE, GUIDED, LAND, LOITER, RTL, mavlink
 
 FLIGHT = ["ground", "accept", "guided", "arm", "climb", "cruise", "landing"]
 TOLD = ["accepted", "taken off", "landed"]
@@ -122,6 +122,17 @@ def test_another_station_may_send_it_elsewhere(state):
     assert abs(world.vehicle.place - world.vehicle.metres(HOME[0], HOME[1] + 0.001)) < 1
 
 
+def test_a_mode_of_another_station_in_the_climb_is_the_pilots():
+    world = in_state("arm").heal().until("climb")
+    assert world.run(10, lambda: world.bridge.in_air)
+    world.vehicle.enter(LOITER)
+    world.run(0.5)
+    before = len(world.vehicle.commands())
+    assert world.run(1, lambda: world.bridge.state == "watch")
+    assert watches(world)
+    assert len(world.vehicle.commands()) == before
+
+
 @pytest.mark.parametrize(
     "is_lost", [False, True], ids=["before its command", "whose own command got lost"]
 )
@@ -132,8 +143,16 @@ def test_a_landing_that_may_be_of_somebody_else_is_the_pilots(is_lost):
         world.vehicle.results = {TO_LAND: TEMPORARILY}
         world.until("landing")
         assert world.run(3, lambda: world.vehicle.commands(TO_LAND))
+    else:
+        world.run(2)
+        world.vehicle.mute = ("HEARTBEAT",)
+        world.run(2.5)
+        world.service.command = "hold"
+        assert world.run(2, lambda: world.bridge.state == "landing")
+        world.vehicle.mute = ()
     world.vehicle.enter(LAND)
     before = len(world.vehicle.commands(ARM, SET_MODE))
+    assert is_lost or world.run(1.5, lambda: world.bridge.state == "watch"), "at once"
     world.until("watch").run(60)
     assert len(world.vehicle.commands(ARM, SET_MODE)) == before
 
@@ -155,10 +174,11 @@ def test_nothing_is_commanded_by_a_mode_that_is_old():
     world = in_state("cruise")
     world.run(3)
     world.vehicle.mute = ("HEARTBEAT",)
-    world.run(3)
+    world.run(2.5)
     world.service.command = "hold"
     before = len(world.vehicle.commands())
-    assert world.run(1.9, lambda: world.bridge.state == "landing")
+    assert world.run(2, lambda: world.bridge.state == "landing")
+    world.run(0.5)
     assert len(world.vehicle.commands()) == before
     world.vehicle.mute = ()
     world.run(2)
@@ -184,12 +204,13 @@ def test_a_copter_that_nobody_commands_is_landed_by_its_failsafe(cause):
     assert world.vehicle.landed
 
 
-def test_a_pilot_who_flies_keeps_it_whoever_watches():
+@pytest.mark.parametrize("mode", [LOITER, BRAKE])
+def test_a_pilot_who_flies_keeps_it_whoever_watches(mode):
     world = in_state("cruise")
     world.vehicle.station = 255
-    world.vehicle.change_mode(LOITER)
+    world.vehicle.change_mode(mode)
     world.until("watch").run(90)
-    assert (world.vehicle.mode, world.vehicle.landed) == (LOITER, False)
+    assert (world.vehicle.mode, world.vehicle.landed) == (mode, False)
 
 
 def test_messages_up_to_five_seconds_late_are_no_boot_and_no_act():

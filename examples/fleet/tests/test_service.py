@@ -257,7 +257,12 @@ def test_one_bridge_speaks_for_a_uav_and_for_a_vehicle_until_it_is_gone(client):
     told = report("A", "first", "board 1").json()
     assert told["warning"].startswith("bridge "), "it is told as well"
     assert "warning" not in report("A", "first", "board 1").json()
-    assert report("A", "second", "board 2", after=LEASE + 1).status_code == 200
+    assert report("B", "third", "board 1", after=LEASE + 1).status_code == 200
+    assert "of UAV B, here called A" in says(report("A", "first", "board 1")), (
+        "which does not renew its own"
+    )
+    assert report("B", "third", "board 3").status_code == 200
+    assert report("A", "second", "board 2").status_code == 200
     assert says(report("A", "first", "board 1")).startswith("bridge: second speaks for UAV A")
     said = {"leave": ["A"], "bridge": "second"}
     assert client.post(f"{NORTH}/uavs", json=said).json() == {"uavs": ["B"]}
