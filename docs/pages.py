@@ -24,7 +24,6 @@ from damian.recipes.known import (
     help_text,
     known_settings,
 )
-from damian.server import surroundings  # noqa: F401 (it registers features)
 from damian.server.features import FEATURES
 
 ROOT = Path(__file__).parents[1]

@@ -25,7 +25,7 @@ TINY += ["region.lattice_step=60", "episode.max_steps=12"]
 @damian.reward_term(reads=["belief_moments"], scope="system")
 def certainty(features, counters):
     """How sure the server is of where the source is."""
-    return 1 - features["belief_moments"][..., -1]
+    return 1 - features["belief_moments"][..., 0, -1]
 
 
 @dataclass

@@ -93,16 +93,16 @@ class ServerNode(WorldTransform):
         own = server.observation.own
         timeline = server.observation.timeline > 0
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + own] if server.grid else []
-        heard = [keys.HEARD_STOPS] if heard_key else [keys.OWN_STOPS] if own else []
-        self.stop_keys = [keys.STOPS, *heard] if timeline else []
         is_late = message_key != keys.MESSAGE
         self.known_key = keys.MESSAGE if server.knows_requests and is_late else None
-        self.step_keys = [*self.required_keys, keys.SOURCE_OVER]
+        # Without them a timeline follows from the newest messages alone.
+        stops = [keys.STOPS, keys.OWN_STOPS, keys.HEARD_STOPS] if timeline else []
+        self.step_keys = [*self.required_keys, keys.SOURCE_OVER, *stops]
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
         read = [*self.in_keys, self.heard_key, self.own_key, self.known_key]
-        return existing([*read, *self.belief_keys, *self.stop_keys])
+        return existing([*read, *self.belief_keys])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])

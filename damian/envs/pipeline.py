@@ -310,8 +310,8 @@ def history_since_message(scenario: ScenarioConfig, delays: ScenarioDelays) -> b
 def has_server_node(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
     """Whether a ``ServerNode`` computes observations and rewards, instead of ``UavEnv``."""
     observation = scenario.observation
-    messages = scenario.delay.messages
-    remembers = bool(observation.belief) or messages > 0 or observation.timeline > 0
+    forgets = observation.timeline > observation.carried_stops  # one message does not tell it all
+    remembers = bool(observation.belief) or scenario.delay.messages > 0 or forgets
     return delays.obs.late or remembers or scenario.links.kind == "matrix"
 
 

@@ -99,9 +99,10 @@ class UavEnv(EnvBase):
         self.simulation = Simulation(of, of.clock.dt, of.observation.carried_stops, seed)
         self.server = Server(self.simulation, of.observation, of.reward, of.episode, of.time_scale)
         problem = "needs transforms before a ServerNode: build the environment by damian.make_env"
-        for name in ("belief", "timeline"):
-            value = getattr(of.observation, name)
-            checks.require(messages_only or not value, f"observation.{name}", value, problem)
+        belief, stops = of.observation.belief, of.observation.carried_stops
+        checks.require(messages_only or not belief, "observation.belief", belief, problem)
+        told = messages_only or stops >= of.observation.timeline
+        checks.require(told, "observation.stops", stops, problem)
         initial = self.simulation.initial
         features = checked_features(self.server, initial.sent, initial.steps)
         self.layout = self._layouts(features)

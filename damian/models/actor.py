@@ -24,11 +24,11 @@ the log."""
 def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
     """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``."""
     layout = layout_at(env, keys.OBSERVATION)
-    n_agents = env.observation_spec[keys.OBSERVATION].shape[-2]
+    shape = env.observation_spec[keys.OBSERVATION].shape
 
     def make(n_out: int, *out_keys: NestedKey) -> TensorDictModule:
         if not model.recurrent:
-            network = _network(model, layout, n_out, n_agents)
+            network = _network(model, layout, n_out, shape)
             return _module(network, keys.OBSERVATION, model, layout, out_keys)
         head = nn.Linear(model.hidden[-1], n_out)
         memory = AgentGRU(*model.make_encoder(layout), model.hidden[-1])
@@ -40,11 +40,11 @@ def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
     return actor
 
 
-def _network(model: ModelConfig, layout: Layout, n_out: int, n_agents: int) -> nn.Module:
+def _network(model: ModelConfig, layout: Layout, n_out: int, observed: torch.Size) -> nn.Module:
     """The network that all UAVs share, or one for each of them."""
     if model.shared:
         return model.make_network(layout, n_out)
-    return SeparateNetworks([model.make_network(layout, n_out) for _ in range(n_agents)])
+    return SeparateNetworks([model.make_network(layout, n_out) for _ in range(observed[-2])])
 
 
 def _module(

@@ -26,9 +26,10 @@ def make_critic(
     """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")``
     [*, N, 1]."""
     layout = layout_at(env, critic_key)
-    n_agents = env.observation_spec[critic_key].shape[-2]
     if model.shared_value:
-        network: nn.Module = SharedValue(model.make_network(joined([layout] * n_agents), 1))
+        network: nn.Module = SharedValue(
+            model.make_network(joined([layout] * env.observation_spec[critic_key].shape[-2]), 1)
+        )
     else:
         network = model.make_network(layout, 1)
     if normalize:

@@ -21,7 +21,7 @@ from damian.server.belief import SourceGrid
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext, feature_of, layout_of, observe, observe_own, stack
 from damian.server.features.base import check_features, source_grid
-from damian.server.features.timeline import first_timeline, stop_ages, stop_places
+from damian.server.features.timeline import stop_ages, stop_places
 from damian.server.layout import Layout
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.termination import Status, status
@@ -306,10 +306,6 @@ class Server:
     def stop_ages(self, rows: Tensor) -> Tensor:
         """How long ago those were when the message was generated [steps], [*, S]; -1 for none."""
         return stop_ages(self.messages(rows), self._context)
-
-    def first_timeline(self, rows: Tensor) -> Tensor:
-        """What first messages [*, M] tell of the stops of their senders, [*, slots, 3]."""
-        return first_timeline(self.messages(rows), self._context)
 
     def _known(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages now."""

@@ -73,7 +73,9 @@ class Module(NamedTuple):
 
 def read(name: str) -> Module:
     """A module of ``damian``, or of this folder."""
-    found = next(Path(damian.__file__).parent.rglob(f"{name}.py"))
+    rooms = ("transforms", "delays", "common", ".")
+    files = [Path(damian.__file__).parent / room / f"{name}.py" for room in rooms]
+    found = next(file for file in files if file.exists())
     text = (OWN / "laws.py" if name == "laws" else found).read_text(encoding="utf-8")
     for pattern, instead in SAYS.items():
         text = re.sub(pattern, instead, text)

@@ -93,7 +93,7 @@ def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(lear
     late = vars(
         everything(delay=DelayConfig(obs=UNIFORM, history=2), actions=ActionConfig(kind=kind))
     )
-    tiny = {"worlds": 4, "learner": learner, "model": MlpConfig([16])}
+    tiny = {"worlds": 4, "learner": learner, "model": MlpConfig(hidden=[16])}
     config = TrainConfig(**late, **tiny, critic="privileged")
     env = learning_env(config)
     actor = make_learner(config, env, replay_buffer(config, env)).actor

@@ -45,7 +45,8 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
 ):
     case = scenario(own and name != "links", stops, **CASES[name])
     env = make_env(case, 4, seed=1, extras=["message"])
-    env.transform[-1].dropped_keys = []
+    for drop in env.transform:
+        drop.dropped_keys = []
     torch.manual_seed(0)
     steps = env.rollout(25, break_when_any_done=False)
     server = env.server

@@ -222,9 +222,7 @@ def test_a_uav_observes_the_nearest_open_requests_by_the_newest_that_anybody_kno
         [[1.0, -1, -1], [-1, -1, 6], [-1, -1, -1]]
     )  # the one before `near`, and `done`
     messages = sent._replace(target=at[None], requests=requests[None], served=served[None])
-    seen = env.server.features(messages, torch.tensor([12]), ["requests"])["requests"][0].unflatten(
-        -1, (4, 4)
-    )
+    seen = env.server.features(messages, torch.tensor([12]), ["requests"])["requests"][0]
     for (east, _), rows, order in zip(
         at.tolist(), seen, [(near, far), (near, far), (far, near)], strict=True
     ):

@@ -25,10 +25,10 @@ def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
     return torch.where(messages.landed < 0, -1, ages)
 
 
-def first_timeline(messages: Messages, context: ServerContext) -> Tensor:
-    """What is known from first messages alone, [*, slots, 3], as ``ServerContext.timeline``."""
+def told_timeline(messages: Messages, context: ServerContext) -> Tensor:
+    """What these messages alone tell, [*, slots, 3], as ``ServerContext.timeline``."""
     facts = stop_places(messages, context)
-    ages = stop_ages(messages, context)
+    ages = stop_ages(messages._replace(time=context.now.unsqueeze(-1)), context)
     places, told = told_slots(facts, ages, context.observation.timeline)
     return torch.cat([places, told.unsqueeze(-1)], -1)
 
@@ -52,7 +52,7 @@ def _timeline(v: FeatureCache) -> Tensor:
     """
     messages = v.messages
     context = v.context
-    known = first_timeline(messages, context) if context.timeline is None else context.timeline
+    known = told_timeline(messages, context) if context.timeline is None else context.timeline
     flies = messages.in_flight.to(known.dtype).unsqueeze(-1)
     destination = torch.cat([messages.target, flies], -1).unsqueeze(-2)
     ways = ways_to_nearest(v, torch.cat([known, destination], -2))
