@@ -401,10 +401,11 @@ class Bridge:
         """Whether the vehicle may have been in the air in GUIDED for long while nobody commands it."""
         is_left = self.state == "watch" and self.mode == GUIDED and self.armed and self.in_air
         position = self.seen.get("GLOBAL_POSITION_INT")
-        if not is_left or math.hypot(position.vx, position.vy) > 100:  # somebody lets it fly on [cm/s]
+        flies_on = is_left and math.hypot(position.vx, position.vy) > 100  # somebody lets it [cm/s]
+        if self.state != "watch" or flies_on or not self.in_air:
             self._stood_since = self.now
         is_lost = (self.state in FLIGHT or is_left) and self.now > self._heard_at + ALONE
-        return is_lost or self.now > self._stood_since + ALONE
+        return is_lost or (is_left and self.now > self._stood_since + ALONE)
 
     def _warn(self, text: str) -> None:
         """Say something to the pilot's station as well."""
@@ -564,6 +565,8 @@ class Bridge:
         self._down, self._is_other, self._has_switched = math.inf, False, False
         if state == "join" and before == "watch":
             self._handed_at = self.now
+        elif state == "watch" and before == "connect":
+            self._stood_since = -math.inf  # who commands it in the air is heard by it without this bridge
         elif state == "guided":
             self.memory.lands = False
         elif state == "climb":

@@ -273,7 +273,12 @@ class Campaign:
             if link is uav:
                 for at, message in heard:
                     uav.hear(at, message, now)
+            before = link.bridge.state
             messages, requests = link.bridge.step(now + uav.epoch, [message for _, message in heard], answers)
+            is_told = before == "cruise" and "by somebody else" in link.bridge.why
+            is_told = is_told or "it has booted again" in link.bridge.why
+            if link is uav and uav.act is None and before != link.bridge.state == "watch" and is_told:
+                self.break_("no act that was none", f"{uav.name} {before}: {link.bridge.why}")
             for message in messages:
                 message.pack(self.station)
             link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
@@ -571,6 +576,7 @@ INVARIANTS = (
     "no command on an old picture",
     "no command after a pilot's act",
     "a pilot's act is heeded",
+    "no act that was none",
     "airborne is commanded",
     "an answer never changes",
     "no report is lost",
