@@ -135,12 +135,13 @@ class Uav(Link):
         super().__init__(name, Copter(ORIGIN, STARTS[number] + aside, system=number + 1, station=255), rng)
         self.memory, self.epoch, self.off_until = None, 0.0, 0.0
         self.act, self.seen_at, self.changed, self.shown = None, None, {}, {}
+        self.aim = None  # where another station has sent it
         self.second, self.second_until, self.ambush, self.others, self.wait = None, 0.0, None, 0, None
         self.strayed, self.known, self.confirmed, self.accepted, self.way = False, 0.0, 0.0, 0.0, None
         self.last_command = self.hover_since = self.air_since = self.idle_since = None
         self.commander, self.commanded = None, -np.inf
         self.commanded_at, self.heartbeat_at = -np.inf, -np.inf  # when those that have come were sent
-        self.flights = 0
+        self.flights, self.told_at = 0, -np.inf  # when the service has taken what its bridge says
 
     def stop_bridge(self, until):
         if self.bridge is not None:
@@ -181,6 +182,7 @@ class Uav(Link):
                 return
         for what, value in shows.items():
             is_new = what in self.changed and self.shown.get(what) != value
+            is_new = is_new and (what != "aim" or value == self.aim)  # not the goal that came after
             if self.act is not None and self.seen_at is None and at >= self.act[0] and is_new:
                 self.seen_at = now
             self.shown[what] = value
@@ -275,8 +277,9 @@ class Campaign:
                     uav.hear(at, message, now)
             before = link.bridge.state
             messages, requests = link.bridge.step(now + uav.epoch, [message for _, message in heard], answers)
-            is_told = before == "cruise" and "by somebody else" in link.bridge.why
-            is_told = is_told or "it has booted again" in link.bridge.why
+            why, is_as_told = link.bridge.why, copter.armed and copter.mode == GUIDED
+            is_told = before in ("climb", "cruise") and is_as_told and "by somebody else" in why
+            is_told |= why.startswith("it has booted again")
             if link is uav and uav.act is None and before != link.bridge.state == "watch" and is_told:
                 self.break_("no act that was none", f"{uav.name} {before}: {link.bridge.why}")
             for message in messages:
@@ -297,7 +300,7 @@ class Campaign:
             goal, level = copter.goal or (copter.place, 0.0)
             path = shapely.LineString([(end.real, end.imag) for end in (copter.place, goal)])
             uav.way = None if copter.landed else (level, path)
-            if uav.way and not uav.act and self.in_zone(copter.place, goal) > 1.0:
+            if uav.way and not uav.act and self.is_too_near_the_zone(copter.place, goal):
                 self.break_("no way through a zone", f"{uav.name} from {copter.place} to {goal}")
         if was_landed and not copter.landed:
             uav.flights, uav.air_since = uav.flights + 1, now
@@ -309,11 +312,12 @@ class Campaign:
             act()
         self.see_to(uav)
 
-    def in_zone(self, *places):
-        """How much of a way between places lies in the zone [m]."""
-        ground, copter = self.ground, self.uavs[0].copter
+    def is_too_near_the_zone(self, *places):
+        """Whether a way comes nearer to the zone than it begins and ends, and than CLEARANCE."""
+        ground, copter, zone = self.ground, self.uavs[0].copter, shapely.Polygon(ZONE)
         path = shapely.LineString([ground.local(copter.degrees(place)) for place in places])
-        return path.intersection(shapely.Polygon(ZONE)).length
+        ends = (zone.distance(shapely.Point(end)) for end in path.coords)
+        return zone.distance(path) < min(CLEARANCE, *ends) - 0.1
 
     def goes_through(self, uav, link, message):
         """Look at a message of a bridge; returns whether it goes on its way."""
@@ -350,10 +354,12 @@ class Campaign:
         status, body = self.service.ask(request.method, request.path, request.body)
         if status >= 500:
             self.break_("no error of the service", f"{request}: {status} {body}")
-        if link is not uav and status == 200 and link.name not in UAVS:
-            if "answer" in (request.body or {}) or request.path.endswith("/reports"):
-                self.break_("one bridge a UAV", f"{link.name} speaks for {uav.name}: {request}")
-        elif status == 200 and request.path.endswith("/reports"):
+        is_taken = status == 200 and request.path.endswith(("/reports", "/acknowledgements"))
+        if link is not uav and is_taken and (link.name not in UAVS or self.now < uav.told_at + APART):
+            self.break_("one bridge a UAV", f"{link.name} speaks for {uav.name}: {request}")
+        if link is uav and is_taken:
+            uav.told_at = self.now
+        if link.name in UAVS and status == 200 and request.path.endswith("/reports"):
             self.reported.setdefault(request.body["ID"], set()).add(request.body["number"])
             at = uav.copter.metres(request.body["lat"], request.body["lon"])
             if uav.copter.landed and uav.known > self.now and abs(at - uav.copter.place) < SAME_POINT:
@@ -518,6 +524,7 @@ class Faults:
         message.pack(mavlink.MAVLink(None, 255, 190))
         if copter.mode == GUIDED and not copter.landed:
             copter.receive(message)
+            uav.aim = tuple(round(each * 1e7) for each in copter.degrees(copter.goal[0]))
             uav.acted(field.now, "go-to", "aim")
 
     def pilot_takes_over(field, uav, seconds):

@@ -256,7 +256,7 @@ def test_many_rows_are_refused_before_others_wait_for_them(client, kind):
 
 def test_strangers_are_few_and_do_not_stay(monkeypatch):
     monkeypatch.setattr(door, "MOST_STRANGERS", 3)
-    monkeypatch.setattr(door, "PATIENCE", 0.3)
+    monkeypatch.setattr(door, "PATIENCE", 1.0)
     app = make_app(Fleets(made(), ":memory:", {}), TOKEN)
     config = uvicorn.Config(app, port=0, log_level="error", http=door.door(TOKEN), limit_concurrency=8)
     server = uvicorn.Server(config)
