@@ -301,7 +301,8 @@ class Bridge:
         self._say(f"the vehicle says (severity {message.severity}): {message.text}")
 
     def _hear_autopilot_version(self, message: Any) -> None:
-        self.memory.vehicle = bytes(message.uid2).hex().strip("0") or f"{message.uid:x}".strip("0")
+        board = bytes(message.uid2) if any(message.uid2) else message.uid.to_bytes(8, "little")
+        self.memory.vehicle = board.hex() if any(board) else ""
 
     def _is_copter(self, heartbeat: Any) -> bool:
         if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and heartbeat.type in COPTERS:
