@@ -46,6 +46,7 @@ PACKAGES = (
     "delays",
     "envs",
     "replay",
+    "models",
     "learners",
     "server",
     "world",
@@ -54,7 +55,6 @@ PACKAGES = (
     "compare",
     "show",
     "interop",
-    "field",
 )
 """Packages with a page of the API, the most used first."""
 PROGRAM_FUNCTIONS = {

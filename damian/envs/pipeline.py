@@ -41,8 +41,10 @@ from damian.transforms import (
 from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
+_STOPS = [keys.STOPS, keys.OWN_STOPS]
+"""Entries that only back-updating reads behind the server node."""
 _REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LOSS]
-_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, keys.STOPS, keys.OWN_STOPS]
+_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS]
 """Entries that only the extra ``message`` outputs."""
 _LINKED = [keys.LINKED, keys.LINK_DELAY, keys.HEARD_STOPS]
 """Entries from which UAVs that hear each other directly compute what they observe."""
@@ -90,6 +92,7 @@ def make_transforms(
     dropped = [
         *_LINKED * (scenario.links.kind == "matrix"),
         *_REPORTED * ("message" not in extras),
+        *_STOPS * (not delays.obs.late),
     ]
     if remote and dropped:
         transforms.append(Drop(dropped))

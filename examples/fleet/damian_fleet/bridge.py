@@ -343,7 +343,8 @@ class Bridge:
         self._say(f"the vehicle says (severity {message.severity}): {message.text}")
 
     def _hear_autopilot_version(self, message: Any) -> None:
-        self.memory.vehicle = bytes(message.uid2).hex().strip("0") or f"{message.uid:x}".strip("0")
+        board = bytes(message.uid2) if any(message.uid2) else message.uid.to_bytes(8, "little")
+        self.memory.vehicle = board.hex() if any(board) else ""
 
     def _is_copter(self, heartbeat: Any) -> bool:
         if heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and heartbeat.type in COPTERS:
@@ -476,12 +477,11 @@ class Bridge:
         it."""
         is_left = self.state == "watch" and self.mode == GUIDED and self.armed and self.in_air
         position = self.seen.get("GLOBAL_POSITION_INT")
-        if (
-            not is_left or math.hypot(position.vx, position.vy) > 100
-        ):  # somebody lets it fly on [cm/s]
+        flies_on = is_left and math.hypot(position.vx, position.vy) > 100  # somebody lets it [cm/s]
+        if self.state != "watch" or flies_on or not self.in_air:
             self._stood_since = self.now
         is_lost = (self.state in FLIGHT or is_left) and self.now > self._heard_at + ALONE
-        return is_lost or self.now > self._stood_since + ALONE
+        return is_lost or (is_left and self.now > self._stood_since + ALONE)
 
     def _warn(self, text: str) -> None:
         """Say something to the pilot's station as well."""
@@ -680,6 +680,10 @@ class Bridge:
         self._has_switched = False
         if state == "join" and before == "watch":
             self._handed_at = self.now
+        elif state == "watch" and before == "connect":
+            self._stood_since = (
+                -math.inf
+            )  # who commands it in the air is heard by it without this bridge
         elif state == "guided":
             self.memory.lands = False
         elif state == "climb":

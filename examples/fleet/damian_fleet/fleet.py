@@ -368,28 +368,25 @@ class Fleet:
     # Who speaks for a UAV.
 
     def require_lease(self, uav: str, bridge: str, now: float, vehicle: str = "") -> None:
-        """Refuse a bridge while another one speaks for the UAV, or for its vehicle by another
+        """Refuse a bridge while another one speaks for the UAV, or its vehicle is a UAV of another
         name."""
-        for fleet in self.others():
+        told = bridge[:6] or "without a name"
+        own = self.leases.get(uav)
+        if own is not None:
+            own.seen = now if own.seen is None else own.seen
+            if own.bridge != bridge and self.holds(uav, now):
+                own.warning = f"bridge {told} has tried to speak for UAV {uav}: end it"
+                remedy = f"end that one, or wait until it has not been heard for {LEASE:g} s"
+                raise Held(f"bridge: {own.bridge[:6]} speaks for UAV {uav}, not {told}: {remedy}")
+        for fleet in self.others() if vehicle else ():
             for name, lease in fleet.leases.items():
-                is_same = fleet is self and name == uav
-                lease.seen = now if lease.seen is None else lease.seen
-                if is_same and lease.bridge == bridge:
-                    continue
-                if (is_same or (vehicle and vehicle == lease.vehicle)) and fleet.holds(name, now):
-                    one, other = (each[:6] or "without a name" for each in (lease.bridge, bridge))
-                    what = (
-                        f"UAV {name}"
-                        if is_same
-                        else f"the vehicle of UAV {name}, here called {uav}"
-                    )
-                    lease.warning = f"bridge {other} has tried to speak for {what}: end it"
-                    remedy = "end that one, or wait until it has not been heard"
+                if lease.vehicle == vehicle and (fleet is not self or name != uav):
+                    lease.warning = f"bridge {told} has called its vehicle {uav}: end it"
                     raise Held(
-                        f"bridge: {one} speaks for {what}, not {other}: {remedy} for {LEASE:g} s"
+                        f"bridge: the vehicle of {uav} is UAV {name}: let that leave its fleet first"
                     )
-        if uav in self.leases and self.leases[uav].bridge == bridge:
-            self.leases[uav].seen = now
+        if own is not None and own.bridge == bridge:
+            own.seen = now
 
     def holds(self, uav: str, now: float) -> bool:
         """Whether the bridge that spoke for a UAV last still has it."""

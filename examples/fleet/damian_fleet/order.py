@@ -83,17 +83,17 @@ class Order:
             sent = boot / 1e3
         else:
             place, sent = self._place(number, now)
+        late = max(now - self._ahead - sent, 0.0) if self._times else 0.0
+        if boot is not None and late > LATE:
+            self._mixed_until = (
+                now + LATEST
+            )  # others may come so late that their count has begun again
         newest, came = self._newest.get(kind, (-math.inf, -math.inf))
         if now > came + LATEST:  # none is that late: it has counted anew
             self._number = self._number if boot is not None else round(place)
         elif place <= newest:
             return None
         self._newest[kind] = place, now
-        late = max(now - self._ahead - sent, 0.0) if self._times else 0.0
-        if boot is not None and late > LATE:
-            self._mixed_until = (
-                now + LATEST
-            )  # others may come so late that their count has begun again
         return late
 
     def _clock(self, boot: float, number: int, now: float) -> bool:

@@ -163,6 +163,7 @@ class Uav(Link):
         self.seen_at = None
         self.changed = {}
         self.shown = {}
+        self.aim = None  # where another station has sent it
         self.second = None
         self.second_until = 0.0
         self.ambush = None
@@ -180,7 +181,7 @@ class Uav(Link):
             -np.inf,
             -np.inf,
         )  # when those that have come were sent
-        self.flights = 0
+        self.flights, self.told_at = 0, -np.inf  # when the service has taken what its bridge says
 
     def stop_bridge(self, until):
         if self.bridge is not None:
@@ -226,6 +227,7 @@ class Uav(Link):
                 return
         for what, value in shows.items():
             is_new = what in self.changed and self.shown.get(what) != value
+            is_new = is_new and (what != "aim" or value == self.aim)  # not the goal that came after
             if self.act is not None and self.seen_at is None and at >= self.act[0] and is_new:
                 self.seen_at = now
             self.shown[what] = value
@@ -332,9 +334,21 @@ class Campaign:
             if link is uav:
                 for at, message in heard:
                     uav.hear(at, message, now)
+            before = link.bridge.state
             messages, requests = link.bridge.step(
                 now + uav.epoch, [message for _, message in heard], answers
             )
+            why = link.bridge.why
+            is_as_told = copter.armed and copter.mode == GUIDED
+            is_told = before in ("climb", "cruise") and is_as_told and "by somebody else" in why
+            is_told |= why.startswith("it has booted again")
+            if (
+                link is uav
+                and uav.act is None
+                and before != link.bridge.state == "watch"
+                and is_told
+            ):
+                self.break_("no act that was none", f"{uav.name} {before}: {link.bridge.why}")
             for message in messages:
                 message.pack(self.station)
             link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
@@ -358,7 +372,7 @@ class Campaign:
             goal, level = copter.goal or (copter.place, 0.0)
             path = shapely.LineString([(end.real, end.imag) for end in (copter.place, goal)])
             uav.way = None if copter.landed else (level, path)
-            if uav.way and not uav.act and self.in_zone(copter.place, goal) > 1.0:
+            if uav.way and not uav.act and self.is_too_near_the_zone(copter.place, goal):
                 self.break_("no way through a zone", f"{uav.name} from {copter.place} to {goal}")
         if was_landed and not copter.landed:
             uav.flights = uav.flights + 1
@@ -372,12 +386,14 @@ class Campaign:
             act()
         self.see_to(uav)
 
-    def in_zone(self, *places):
-        """How much of a way between places lies in the zone [m]."""
+    def is_too_near_the_zone(self, *places):
+        """Whether a way comes nearer to the zone than it begins and ends, and than CLEARANCE."""
         ground = self.ground
         copter = self.uavs[0].copter
+        zone = shapely.Polygon(ZONE)
         path = shapely.LineString([ground.local(copter.degrees(place)) for place in places])
-        return path.intersection(shapely.Polygon(ZONE)).length
+        ends = (zone.distance(shapely.Point(end)) for end in path.coords)
+        return zone.distance(path) < min(CLEARANCE, *ends) - 0.1
 
     def goes_through(self, uav, link, message):
         """Look at a message of a bridge; returns whether it goes on its way."""
@@ -415,10 +431,16 @@ class Campaign:
         status, body = self.service.ask(request.method, request.path, request.body)
         if status >= 500:
             self.break_("no error of the service", f"{request}: {status} {body}")
-        if link is not uav and status == 200 and link.name not in UAVS:
-            if "answer" in (request.body or {}) or request.path.endswith("/reports"):
-                self.break_("one bridge a UAV", f"{link.name} speaks for {uav.name}: {request}")
-        elif status == 200 and request.path.endswith("/reports"):
+        is_taken = status == 200 and request.path.endswith(("/reports", "/acknowledgements"))
+        if (
+            link is not uav
+            and is_taken
+            and (link.name not in UAVS or self.now < uav.told_at + APART)
+        ):
+            self.break_("one bridge a UAV", f"{link.name} speaks for {uav.name}: {request}")
+        if link is uav and is_taken:
+            uav.told_at = self.now
+        if link.name in UAVS and status == 200 and request.path.endswith("/reports"):
             self.reported.setdefault(request.body["ID"], set()).add(request.body["number"])
             at = uav.copter.metres(request.body["lat"], request.body["lon"])
             if (
@@ -607,6 +629,7 @@ class Faults:
         message.pack(mavlink.MAVLink(None, 255, 190))
         if copter.mode == GUIDED and not copter.landed:
             copter.receive(message)
+            uav.aim = tuple(round(each * 1e7) for each in copter.degrees(copter.goal[0]))
             uav.acted(field.now, "go-to", "aim")
 
     def pilot_takes_over(field, uav, seconds):
@@ -669,6 +692,7 @@ INVARIANTS = (
     "no command on an old picture",
     "no command after a pilot's act",
     "a pilot's act is heeded",
+    "no act that was none",
     "airborne is commanded",
     "an answer never changes",
     "no report is lost",
