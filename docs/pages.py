@@ -33,7 +33,11 @@ TEXTS |= {
     "CITATION.cff": "CITATION.cff",
     "SECURITY.md": "SECURITY.md",
 }
-TEXTS |= {"examples/fleet/README.md": "fleet.md", "examples/fleet/docs/mavlink.md": "mavlink.md"}
+TEXTS |= {
+    "examples/fleet/README.md": "fleet.md",
+    "examples/fleet/docs/first-flight.md": "first-flight.md",
+    "examples/fleet/docs/mavlink.md": "mavlink.md",
+}
 CARDS = ROOT.glob("damian/data/*/README.md")
 TEXTS |= {
     f"damian/data/{card.parent.name}/README.md": f"policies/{card.parent.name}.md" for card in CARDS
