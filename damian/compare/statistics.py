@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +44,10 @@ def recovery(scores: Floats, least: float = LEAST_GAP) -> Floats:
     random = means[..., 1]
     naive = means[..., 2:-1].max(-1)
     gap = undelayed - naive
-    enough = (gap > 0) & (undelayed > random) & (gap >= least * (undelayed - random))
-    return (means[..., -1] - naive) / np.where(enough, gap, np.nan)
+    span = undelayed - random
+    enough = (gap > 0) & (span > 0) & (gap >= least * span)
+    gain = means[..., -1] - naive
+    return gain / np.where(enough, gap, np.nan)
 
 
 def resampled(scores: Floats, draws: int) -> Floats:
@@ -63,9 +66,10 @@ def interval(values: Floats) -> tuple[Floats, Floats]:
     """
     unknown = np.isnan(values)
     tail = (1 - LEVEL) / 2
-    low = np.quantile(np.where(unknown, -np.inf, values), tail, 0, method="inverted_cdf")
-    high = np.quantile(np.where(unknown, np.inf, values), 1 - tail, 0, method="inverted_cdf")
-    return low, high
+    quantile = partial(np.quantile, axis=0, method="inverted_cdf")
+    lowest = np.where(unknown, -np.inf, values)
+    highest = np.where(unknown, np.inf, values)
+    return quantile(lowest, tail), quantile(highest, 1 - tail)
 
 
 def probability_of_improvement(scores: Floats, others: Floats) -> Floats:
@@ -76,7 +80,8 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Floats:
     half.
     """
     difference = scores[..., :, None] - others[..., None, :]
-    return ((np.sign(difference) + 1) / 2).mean((-2, -1))
+    wins = (np.sign(difference) + 1) / 2
+    return wins.mean((-2, -1))
 
 
 def improvement_interval(probability: float, n_seeds: int) -> tuple[float, float]:
@@ -91,13 +96,11 @@ def improvement_interval(probability: float, n_seeds: int) -> tuple[float, float
     if n_seeds < FEWEST or math.isnan(probability):
         return math.nan, math.nan
     truth = np.linspace(0, 1, 10_001)
-    variance = (
-        truth
-        * (1 - truth)
-        * (1 + (n_seeds - 1) * ((1 - truth) / (2 - truth) + truth / (1 + truth)))
-    )
+    shared = (1 - truth) / (2 - truth) + truth / (1 + truth)
+    variance = truth * (1 - truth) * (1 + (n_seeds - 1) * shared)
     chance = NORMAL * np.sqrt(variance) / n_seeds
-    likely = truth[np.abs(truth - probability) <= chance]
+    distance = np.abs(truth - probability)
+    likely = truth[distance <= chance]
     return float(likely.min()), float(likely.max())
 
 
@@ -121,7 +124,14 @@ def bootstrap(
     value = np.asarray(statistic(scores), dtype=float)
     n_seeds = scores.shape[-1]
     if n_seeds < FEWEST:
-        return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
-    factor = math.sqrt(n_seeds / (n_seeds - 1)) * stdtrit(n_seeds - 1, (1 + LEVEL) / 2) / NORMAL
-    low, high = interval(statistic(resampled(scores, draws)))
-    return value, value - factor * (value - low), value + factor * (high - value)
+        unknown = np.full_like(value, np.nan)
+        return value, unknown, unknown
+    degrees = n_seeds - 1
+    bias = math.sqrt(n_seeds / degrees)
+    student = stdtrit(degrees, (1 + LEVEL) / 2)
+    factor = bias * student / NORMAL
+    drawn = resampled(scores, draws)
+    low, high = interval(statistic(drawn))
+    below = factor * (value - low)
+    above = factor * (high - value)
+    return value, value - below, value + above

@@ -49,76 +49,96 @@ def fit_laws(steps: Integers) -> tuple[LawFit, LawFit]:
     codes = np.where(steps >= 0, steps, steps.max() - steps)  # K + 1 is lost, K + 2 none
     counts = np.bincount(codes.ravel(), minlength=int(steps.max()) + 3)[:-1]
     n = int(counts.sum())
+    chances = counts / n
+    n_outcomes = np.count_nonzero(counts)
+    own = LawFit(OWN[0], chances, _likelihood(counts, chances), n_outcomes, n)
+
     size = len(counts)
-    chances = counts / counts.sum()
-    pairs, often = np.unique(
-        (codes[:, :-1] * size + codes[:, 1:])[codes[:, 1:] < size], return_counts=True
-    )
-    after = often / np.bincount(pairs // size, often, size)[pairs // size]
-    starts = _likelihood(np.bincount(codes[:, 0], minlength=size), chances)
-    own = LawFit(OWN[0], chances, _likelihood(counts, chances), int((counts > 0).sum()), n)
-    paired = LawFit(OWN[1], chances, _likelihood(often, after) + starts, len(pairs), n)
-    laws = [_memoryless(counts), *([_burst(codes, counts)] if (counts > 0).sum() > 1 else [])]
-    return min(laws, key=attrgetter("bic")), min(own, paired, key=attrgetter("bic"))
+    later = codes[:, 1:]
+    of_pairs = codes[:, :-1] * size + later
+    pairs, often = np.unique(of_pairs[later < size], return_counts=True)
+    before = pairs // size
+    after = often / np.bincount(before, often, size)[before]
+    starts = np.bincount(codes[:, 0], minlength=size)
+    likelihood = _likelihood(often, after) + _likelihood(starts, chances)
+    paired = LawFit(OWN[1], chances, likelihood, len(pairs), n)
+
+    laws = [_memoryless(counts)]
+    if n_outcomes > 1:
+        laws.append(_burst(codes, counts))
+    return _best(laws), _best([own, paired])
+
+
+def _best(fits: list[LawFit]) -> LawFit:
+    return min(fits, key=attrgetter("bic"))
 
 
 def _likelihood(counts: NDArray[Any], chances: Floats) -> float:
     """Logarithm of the likelihood of counts of independent outcomes [nats]."""
+    occurs = counts > 0
     with np.errstate(divide="ignore"):
-        return float(counts[counts > 0] @ np.log(chances[counts > 0]))
+        return float(counts[occurs] @ np.log(chances[occurs]))
 
 
 def _memoryless(counts: Integers) -> LawFit:
     """The best law without memory, for counts of the delays 0, 1, ..., K and, last, of losses
     [K + 2]."""
     n = int(counts.sum())
-    arrived = int(counts[:-1].sum())
-    delays = np.flatnonzero(counts[:-1]).tolist()
+    of_delays = counts[:-1]
+    arrived = int(of_delays.sum())
+    delays = np.flatnonzero(of_delays).tolist()
     loss = 1 - arrived / n
     low = min(delays, default=0)
     high = max(delays, default=0)
     fits = list[LawFit]()
     laws: list[tuple[Any, int]] = [(high, min(arrived, 1))]
     if low < high:
-        mean = (
-            counts[:-1] @ np.arange(len(counts) - 1) / (arrived - counts[high])
-        )  # the longest are cut
-        late = {
-            "low": delays[low == 0],
-            "high": high,
-            "probability": round(1 - int(counts[0]) / arrived, 5),
-        }
-        laws = [({"law": "uniform", "low": low, "high": high}, 2), ({"law": "uniform", **late}, 3)]
-        laws.append(({"law": "geometric", "mean": round(float(mean), 5), "longest": high}, 2))
+        uniform = {"law": "uniform", "low": low, "high": high}
+        lowest_late = delays[low == 0]
+        share_late = round(1 - int(counts[0]) / arrived, 5)
+        often_late = uniform | {"low": lowest_late, "probability": share_late}
+        sum_of_delays = of_delays @ np.arange(len(of_delays))
+        mean = sum_of_delays / (arrived - counts[high])  # the longest are cut
+        geometric = {"law": "geometric", "mean": round(float(mean), 5), "longest": high}
+        laws = [(uniform, 2), (often_late, 3), (geometric, 2)]
     for law, k in laws:
         sampler = cast(TableSampler, sampler_of(law, loss=loss))
+        *late, lost = sampler.chances[0].numpy()
         chances = np.zeros(len(counts))
-        table = sampler.chances[0].numpy()
-        chances[: len(table) - 1], chances[-1] = table[:-1], table[-1]
-        fits.append(
-            LawFit(
-                law, chances, _likelihood(counts, chances), k + (0 < loss < 1), n, round(loss, 5)
-            )
-        )
-    return min(fits, key=attrgetter("bic"))
+        chances[: len(late)] = late
+        chances[-1] = lost
+        likelihood = _likelihood(counts, chances)
+        n_parameters = k + (0 < loss < 1)
+        fits.append(LawFit(law, chances, likelihood, n_parameters, n, round(loss, 5)))
+    return _best(fits)
 
 
 def _burst(codes: Integers, counts: Integers) -> LawFit:
     """Bursts whose messages tell the state of the channel: bad ones are lost, or later than the
     mean."""
-    late = np.arange(len(counts)) > counts @ np.arange(len(counts)) / counts.sum()
+    delays = np.arange(len(counts))
+    late = delays > counts @ delays / counts.sum()
     bad = np.append(late, True)[codes]
-    pairs = (2 * bad[:, :-1] + bad[:, 1:])[codes[:, 1:] < len(counts)]
-    moves = np.bincount(pairs, minlength=4).reshape(2, 2) + 0.5  # so that none is impossible
-    (_, enter), (leave, _) = move = moves / moves.sum(1, keepdims=True)
+    goes_on = codes[:, 1:] < len(counts)
+    pairs = 2 * bad[:, :-1] + bad[:, 1:]
+    n_moves = np.bincount(pairs[goes_on], minlength=4).reshape(2, 2)
+    moves = n_moves + 0.5  # so that none is impossible
+    move = moves / moves.sum(1, keepdims=True)
+    (_, enter), (leave, _) = move
     share = np.array([leave, enter]) / (enter + leave)
-    path = _likelihood(moves, move) + _likelihood(np.bincount(bad[:, 0], minlength=2), share)
+    starts = np.bincount(bad[:, 0], minlength=2)
+    path = _likelihood(moves, move) + _likelihood(starts, share)
     good = _memoryless(counts * ~late)
     worse = _memoryless(counts * late)
-    written = {"law": "burst", "enter": round(float(enter), 5), "leave": round(float(leave), 5)}
-    written |= {"good": good.written, "bad": worse.written, "bad_loss": worse.loss}
+    written = {
+        "law": "burst",
+        "enter": round(float(enter), 5),
+        "leave": round(float(leave), 5),
+        "good": good.written,
+        "bad": worse.written,
+        "bad_loss": worse.loss,
+    }
     chances = share @ [good.chances, worse.chances]
     likelihood = good.likelihood + worse.likelihood + path
-    return LawFit(
-        written, chances, likelihood, 2 + good.n_parameters + worse.n_parameters, worse.n + good.n
-    )
+    n_parameters = 2 + good.n_parameters + worse.n_parameters
+    return LawFit(written, chances, likelihood, n_parameters, worse.n + good.n)
