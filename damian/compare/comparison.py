@@ -4,6 +4,7 @@ intervals."""
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -50,9 +51,10 @@ def regime(methods: Mapping[str, Method], name: str) -> str:
     method = methods[name]
     if not method.delayed:
         return NO_DELAY
+    simulated = bool(method.simulator)
     if method.simulator is None and method.source:
-        return LATE_DATA if regime(methods, method.source) == LATE_DATA else SIMULATOR
-    return SIMULATOR if method.simulator else LATE_DATA
+        simulated = regime(methods, method.source) != LATE_DATA
+    return SIMULATOR if simulated else LATE_DATA
 
 
 def shown(line: Mapping[Any, Any], name: str) -> str:
@@ -60,8 +62,8 @@ def shown(line: Mapping[Any, Any], name: str) -> str:
     value, low, high = (line[name + end] for end in ENDS)
     if np.isnan(value):
         return "-"
-    numbers = (f"{x:.3f}" if abs(x) < 10 else f"{x:.1f}" for x in (value, low, high))
-    return "{} [{}, {}]".format(*numbers) if not np.isnan(low) else next(numbers)
+    texts = [f"{x:.3f}" if abs(x) < 10 else f"{x:.1f}" for x in (value, low, high)]
+    return texts[0] if np.isnan(low) else "{} [{}, {}]".format(*texts)
 
 
 def _estimates(
@@ -69,26 +71,32 @@ def _estimates(
 ) -> dict[str, float]:
     """Columns (``ENDS``) of a statistic from ``scores`` [methods, seeds] to a number for each
     name."""
-    triples = zip(names, *(np.ravel(x).tolist() for x in bootstrap(statistic, scores)), strict=True)
-    return {name + end: x for name, *triple in triples for end, x in zip(ENDS, triple, strict=True)}
+    estimates = {}
+    for end, values in zip(ENDS, bootstrap(statistic, scores), strict=True):
+        columns = [name + end for name in names]
+        estimates |= zip(columns, np.ravel(values).tolist(), strict=True)
+    return estimates
 
 
 def means_over_seeds(runs: pd.DataFrame) -> dict[str, float]:
     """Columns (``ENDS``) of the mean of each measure, from a column of ``runs``, with a row for
     each seed."""
-    found = _estimates([*map(str, runs)], lambda drawn: drawn.mean(-1), _scores(runs))
-    shares = [
-        n + end for n in map(str, runs) for end in ENDS if declared(n).share or n == CORRECTED
-    ]
-    return found | {name: float(np.clip(found[name], 0, 1)) for name in shares}
+    names = [*map(str, runs)]
+    found = _estimates(names, lambda drawn: drawn.mean(-1), _scores(runs))
+    for name in names:
+        if not (declared(name).share or name == CORRECTED):
+            continue
+        for end in ENDS:
+            found[name + end] = float(np.clip(found[name + end], 0, 1))
+    return found
 
 
 def improvement(scores: Floats, others: Floats) -> dict[str, float]:
     """Columns (``ENDS``) of the probability that a run beats another, from scores by seed, [seeds]
     each."""
     probability = float(probability_of_improvement(scores, others))
-    ends = (probability, *improvement_interval(probability, len(scores)))
-    return {f"improvement{end}": x for end, x in zip(ENDS, ends, strict=True)}
+    values = (probability, *improvement_interval(probability, len(scores)))
+    return {f"improvement{end}": x for end, x in zip(ENDS, values, strict=True)}
 
 
 def sign_of(score: str) -> int:
@@ -129,7 +137,8 @@ class Comparison:
 
     def delays(self, task: str) -> list[str]:
         """Delays of a task with a finished run, without ``NOT_LATE``."""
-        found = self.rows.loc[self.rows["task"] == task, "delay"].unique()
+        of_task = self.rows["task"] == task
+        found = self.rows.loc[of_task, "delay"].unique()
         return [name for name in found if name != NOT_LATE]
 
     @property
@@ -157,26 +166,37 @@ class Comparison:
         Behind the columns ``LABELLED`` stand those of ``measured`` and ``COMPARED``, three each
         (``ENDS``).
         """
-        columns = [name + end for name in (*self.measured, *COMPARED) for end in ENDS]
+        names = (*self.measured, *COMPARED)
+        columns = [name + end for name in names for end in ENDS]
         return pd.DataFrame(self._lines(), columns=[*LABELLED, *columns])
 
     def _lines(self) -> Iterator[dict[str, Any]]:
         for task in self.tasks():
             for delay in (NOT_LATE, *self.delays(task)):
-                scores = self.scores(task, delay)
-                methods = self._present(task, delay)
-                names = [(method, method, policy) for method in methods for policy in OF_METHOD]
-                names += [(policy, method, policy) for policy in SCRIPTED for method in methods[:1]]
-                for name, method, policy in names:
-                    runs = self._runs.get((task, delay, method, policy))
-                    if runs is None:
-                        continue  # a method may have no untrained network, and a task no script
-                    line = {"task": task, "delay": delay, "method": name, "policy": policy}
-                    known = regime(self.methods, method) if name == method else ""
-                    line |= {"seeds": len(runs), "regime": known, "compared_seeds": 0}
-                    if name == method and policy == self.policy_of(method) and delay != NOT_LATE:
-                        line |= self._compared(scores, method)
-                    yield line | means_over_seeds(runs[self.measured])
+                yield from self._lines_of(task, delay)
+
+    def _lines_of(self, task: str, delay: str) -> Iterator[dict[str, Any]]:
+        scores = self.scores(task, delay)
+        methods = self._present(task, delay)
+        flown = [*product(methods, OF_METHOD), *product(methods[:1], SCRIPTED)]
+        for method, policy in flown:
+            runs = self._runs.get((task, delay, method, policy))
+            if runs is None:
+                continue  # a method may have no untrained network, and a task no script
+            line = {
+                "task": task,
+                "delay": delay,
+                "method": method,
+                "policy": policy,
+                "regime": regime(self.methods, method),
+                "seeds": len(runs),
+                "compared_seeds": 0,
+            }
+            if policy in SCRIPTED:
+                line |= {"method": policy, "regime": ""}
+            elif policy == self.policy_of(method) and delay != NOT_LATE:
+                line |= self._compared(scores, method)
+            yield line | means_over_seeds(runs[self.measured])
 
     @cached_property
     def _runs(self) -> dict[tuple[Any, ...], pd.DataFrame]:
@@ -190,37 +210,42 @@ class Comparison:
 
         The first columns are the undelayed method and the random policy, without delay.
         """
+        undelayed = self.undelayed
         of = {
-            self.undelayed: (NOT_LATE, self.undelayed, TRAINED),
-            RANDOM: (NOT_LATE, self.undelayed, RANDOM),
+            undelayed: (task, NOT_LATE, undelayed, TRAINED),
+            RANDOM: (task, NOT_LATE, undelayed, RANDOM),
         }
-        of |= {
-            method: (delay, method, self.policy_of(method)) for method in self._present(task, delay)
-        }
+        for method in self._present(task, delay):
+            of[method] = (task, delay, method, self.policy_of(method))
         none = pd.DataFrame({self.score: []}, dtype=float)
-        found = {name: self._runs.get((task, *key), none)[self.score] for name, key in of.items()}
-        return pd.DataFrame(found).sort_index() * sign_of(self.score)
+        found = {name: self._runs.get(run, none)[self.score] for name, run in of.items()}
+        scores = pd.DataFrame(found).sort_index()
+        return scores * sign_of(self.score)
 
     def _present(self, task: str, delay: str) -> list[str]:
         """Methods that have a finished run of a task under a delay."""
-        return [m for m in self.methods if (task, delay, m, self.policy_of(m)) in self._runs]
+        runs = {name: (task, delay, name, self.policy_of(name)) for name in self.methods}
+        return [name for name, run in runs.items() if run in self._runs]
 
     def _compared(self, scores: pd.DataFrame, method: str) -> dict[str, Any]:
         """``COMPARED`` of a delayed method, over the seeds that it and its rivals have finished."""
         undelayed, random, *delayed = scores.columns
-        tracks = {name: regime(self.methods, name) == LATE_DATA for name in (*delayed, method)}
-        others = [name for name in delayed if tracks[name] == tracks[method]]
-        naive = [name for name in others if self.methods[name].naive]
-        paired = scores[
-            [undelayed, random, *(name for name in naive if name != method), method]
-        ].dropna()
+        naive = [name for name in delayed if self.methods[name].naive]
+        from_late_data = {name for name in delayed if regime(self.methods, name) == LATE_DATA}
+        rivals = [name for name in naive if (name in from_late_data) == (method in from_late_data)]
+        is_rival = method in rivals
+        if is_rival:
+            rivals.remove(method)
+        paired = scores[[undelayed, random, *rivals, method]].dropna()
         if paired.empty:
             return {}
         array = _scores(paired)
-        found = {"compared_seeds": len(paired), **_estimates(["J_norm"], _norms, array)}
-        if naive and method not in naive:
-            _, _, *of_naive, own = array
-            found |= improvement(own, max(of_naive, key=np.mean))
+        found = {"compared_seeds": len(paired)}
+        found |= _estimates(["J_norm"], _norms, array)
+        if rivals and not is_rival:
+            _, _, *of_rivals, own = array
+            strongest = max(of_rivals, key=np.mean)
+            found |= improvement(own, strongest)
             if not np.isnan(recovery(array)):
                 found |= _estimates(["recovery"], lambda drawn: recovery(drawn, 0.0), array)
         return found

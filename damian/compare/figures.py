@@ -35,6 +35,8 @@ METHOD_COLOURS += ("#1E2DFF", "#FF87FF", "#0000A5")
 """Colours of methods: each pair is far apart in OKLab, for readers without green receptors too."""
 _POINTS = 200
 """Number of points of a learning curve."""
+_LINE = ["task", "delay", "method", "policy"]
+"""Columns that name a line of the table of a comparison."""
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
@@ -49,8 +51,10 @@ def plot_training(
     table = pd.DataFrame(rows).set_index("frames")
 
     def panel(axis: Axes, measure: str) -> None:
-        levels = {policy: row[_flown(measure)] for policy, row in evaluations.items()}
-        points = pd.concat([pd.Series({0: levels[UNTRAINED]}), table[measure].dropna()])
+        flown = _flown(measure)
+        levels = {policy: row[flown] for policy, row in evaluations.items()}
+        untrained = pd.Series({0: levels[UNTRAINED]})
+        points = pd.concat([untrained, table[measure].dropna()])
         axis.plot(points, color=METHOD_COLOURS[2], marker="o", markevery=[0], label="training")
         _over_steps(axis, measure, levels, SCRIPT)
         axis.set(title=title)
@@ -58,7 +62,8 @@ def plot_training(
     # In hindsight, which is close to what truly happened; what is perceived may rank policies
     # wrongly.
     succeeds = (table["perceived_success_rate"] > 0).any()
-    save(path, [*LABELS][: 1 + succeeds], panel, (4.4, 3.2), width=2)
+    measures = [*LABELS][: 1 + succeeds]
+    save(path, measures, panel, (4.4, 3.2), width=2)
 
 
 def plot_curves(comparison: Comparison, path: Path) -> None:
@@ -70,15 +75,14 @@ def plot_curves(comparison: Comparison, path: Path) -> None:
     dotted: methods without a curve, such as those that train nothing.
     """
     succeeds = comparison.points["perceived_success_rate"].notna().any()
+    # Without success, episodes end at their limit.
+    measures = LABELS if succeeds else ["hindsight_return"]
+    trained = {run[:2] for run in comparison.curves}
     panels = [
-        (task, delay, measure)
-        for task in comparison.tasks()
-        if HELD_OUT_MARK not in task
-        for delay in comparison.delays(task) or [NOT_LATE]
-        if {(task, delay), (task, NOT_LATE)} & {run[:2] for run in comparison.curves}
-        for measure in (
-            LABELS if succeeds else ["hindsight_return"]
-        )  # else episodes end at their limit
+        (*place, measure)
+        for place in _places(comparison, [NOT_LATE])
+        if trained & {place, (place[0], NOT_LATE)}
+        for measure in measures
     ]
     save(path, panels, partial(_curve_panel, comparison), (3.2, 2.6), width=3)
 
@@ -89,42 +93,42 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
     Dashed: the undelayed method; dotted: random actions; shaded: what the delay costs the strongest
     naive method. Held-out tasks are in the table only.
     """
-    table: Any = comparison.table.set_index(["task", "delay", "method", "policy"])
     score = comparison.score
+    columns = [score + end for end in ENDS]
+    scores = comparison.table.set_index(_LINE)[columns].astype(float)
+    estimates = dict(zip(scores.index, scores.to_numpy(), strict=True))
+    methods = comparison.methods
+    undelayed = comparison.undelayed
+    policies = {name: comparison.policy_of(name) for name in methods} | {SCRIPT: SCRIPT}
 
     def panel(axis: Axes, place: tuple[str, str]) -> None:
         task, delay = place
-        shown = [(name, comparison.policy_of(name)) for name in comparison.methods] + [
-            (SCRIPT, SCRIPT)
-        ]
-        shown = [key for key in shown if (*place, *key) in table.index]
+        lines = {name: (task, delay, name, policy) for name, policy in policies.items()}
+        shown = [name for name, line in lines.items() if line in estimates]
         naive = []
-        for row, (name, policy) in enumerate(shown):
-            value, low, high = table.loc[
-                (*place, name, policy), [score + end for end in ENDS]
-            ].astype(float)
+        for row, name in enumerate(shown):
+            value, low, high = estimates[lines[name]]
             error = np.nan_to_num([[value - low], [high - value]], posinf=0.0)
             style: dict[str, Any] = {"color": "0.5", "marker": "o"}
-            style |= look(comparison.methods, name) if name != SCRIPT else {}
+            if name != SCRIPT:
+                style |= look(methods, name)
+                naive += [value] if methods[name].naive else []
             axis.errorbar([value], [row], xerr=error, markersize=4, **style)
-            if name != SCRIPT and comparison.methods[name].naive:
-                naive.append(value)
-        for name, policy, line in ((comparison.undelayed, TRAINED, "--"), (RANDOM, RANDOM, ":")):
-            if (task, NOT_LATE, name, policy) not in table.index:
+        for name, policy, dashes in ((undelayed, TRAINED, "--"), (RANDOM, RANDOM, ":")):
+            line = (task, NOT_LATE, name, policy)
+            if line not in estimates:
                 continue
-            level = table.loc[(task, NOT_LATE, name, policy), score]
-            style = _LEVEL | {"linestyle": line}
+            level = estimates[line][0]
+            style = _LEVEL | {"linestyle": dashes}
             axis.axvline(level, **style)
-            if name == comparison.undelayed and naive:
+            if name == undelayed and naive:
                 best = min(naive) if sign_of(score) < 0 else max(naive)
                 axis.axvspan(best, level, color="0.92", zorder=0)
-        axis.set_yticks(range(len(shown)), [name for name, _ in shown])
+        axis.set_yticks(range(len(shown)), shown)
         axis.invert_yaxis()
         axis.set(title=f"{task}, delay {delay}", xlabel=score)
 
-    tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
-    panels = [(task, delay) for task in tasks for delay in comparison.delays(task)]
-    save(path, panels, panel, (3.4, 2.8), width=3)
+    save(path, _places(comparison), panel, (3.4, 2.8), width=3)
 
 
 def plot_profiles(comparison: Comparison, path: Path) -> None:
@@ -134,20 +138,20 @@ def plot_profiles(comparison: Comparison, path: Path) -> None:
     Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice". A
     method without runs of some task or delay is left out.
     """
-    tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
-    scores = [comparison.scores(task, delay) for task in tasks for delay in comparison.delays(task)]
+    scores = [comparison.scores(*place) for place in _places(comparison)]
     names = [name for name in comparison.methods if all(name in found for found in scores)]
 
     def panel(axis: Axes, _: str) -> None:
-        places = np.linspace(-0.1, 1.1, _POINTS)
+        levels = np.linspace(-0.1, 1.1, _POINTS)
         for name in names:
-            # A method, and what comes first in each table: undelayed and random.
-            columns: list[Any] = [found[[name, *found.columns[:2]]] for found in scores]
-            runs = [normalised(found.iloc[:, 0], *found.iloc[:, 1:].mean()) for found in columns]
+            runs = []
+            for found in scores:
+                undelayed, random, *_ = found.mean()
+                runs.append(normalised(found[name], undelayed, random))
             values = np.concatenate(runs)
-            share = (values[~np.isnan(values), None] > places).mean(0)
-            style: dict[str, Any] = look(comparison.methods, name) | {"marker": "", "label": name}
-            axis.plot(places, share, **style)
+            known = values[~np.isnan(values)]
+            share = (known[:, None] > levels).mean(0)
+            axis.plot(levels, share, **_line_of(comparison, name))
         axis.set(xlabel="J_norm (random 0, undelayed 1)", ylabel="share of runs above")
 
     save(path, ["all"] if len(scores) > 1 else [], panel, (4.0, 3.0))
@@ -160,31 +164,27 @@ def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
     The setting along the axis has most values, and numbers if any has. The trained policy stands
     with its 95 % intervals before those of the other panels, in grey. There are 40 panels at most.
     """
-    along = max(
-        groups, key=lambda k: (is_numeric_dtype(lines[k]), lines[k].nunique()), default="policy"
-    )
-    names = [] if is_numeric_dtype(lines[along]) else [*lines[along].unique()]
-    places = lines[along].map(names.index) if names else lines[along]
+    fitness = {key: (is_numeric_dtype(lines[key]), lines[key].nunique()) for key in groups}
+    along = max(groups, key=fitness.__getitem__, default="policy")
+    places: Any = lines[along]
+    names = [] if is_numeric_dtype(places) else [*places.unique()]
+    if names:
+        places = places.map(names.index)
+    others = [key for key in groups if key != along]
     titles = [
-        "\n".join(f"{k}={line[k]}" for k in groups if k != along)
-        for line in lines.to_dict("records")
+        "\n".join(f"{key}={line[key]}" for key in others) for line in lines.to_dict("records")
     ]
-    found = (
-        lines.assign(x=places, title=titles)
-        .sort_values("x")
-        .groupby(["title", "policy"], sort=False)
-    )
-    curves = {
-        key: each[["x", *("return" + end for end in ENDS)]].to_numpy().T for key, each in found
-    }
+    placed = lines.assign(x=places, title=titles).sort_values("x")
+    columns = ["x", *("return" + end for end in ENDS)]
+    found = placed.groupby(["title", "policy"], sort=False)
+    curves = {key: each[columns].to_numpy().T for key, each in found}
 
     def panel(axis: Axes, title: str) -> None:
         for (place, policy), (x, value, low, high) in curves.items():
             style: dict[str, Any] = {"color": METHOD_COLOURS[0], "marker": "o", "markersize": 4}
             if policy == TRAINED and place == title:
-                axis.errorbar(
-                    x, value, np.nan_to_num([value - low, high - value]), label=policy, **style
-                )
+                error = np.nan_to_num([value - low, high - value])
+                axis.errorbar(x, value, error, label=policy, **style)
             elif policy == TRAINED:
                 axis.plot(x, value, color="0.85", zorder=0, label="other panels")
             elif place == title and policy in (SCRIPT, RANDOM):
@@ -230,12 +230,14 @@ def save(
     width = min(width, len(panels))
     height = math.ceil(len(panels) / width)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(size[0] * width + 1.2, size[1] * height), layout="constrained")
+        whole = (size[0] * width + 1.2, size[1] * height)
+        figure = Figure(figsize=whole, layout="constrained")
         axes = figure.subplots(height, width, squeeze=False, sharey=sharey).flat
         drawn: dict[str, Any] = {}
         for axis, panel in zip(axes, panels, strict=False):
             draw(axis, panel)
-            drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+            handles, labels = axis.get_legend_handles_labels()
+            drawn |= zip(labels, handles, strict=True)
         for axis in axes[len(panels) :]:
             axis.set_axis_off()
         if drawn:
@@ -246,10 +248,10 @@ def save(
 def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, str]) -> None:
     """Draw a measure of all methods in a task under a delay."""
     task, delay, measure = content
-    table = comparison.table.set_index(["task", "delay", "method", "policy"])[_flown(measure)]
+    table = comparison.table.set_index(_LINE)[_flown(measure)]
     for name, method in comparison.methods.items():
         run = (task, delay if method.delayed else NOT_LATE, name)
-        style: dict[str, Any] = look(comparison.methods, name) | {"marker": "", "label": name}
+        style = _line_of(comparison, name)
         if run in comparison.curves:
             place, values = curve(comparison.curves[run], measure)
             mean, low, high = bootstrap(lambda drawn: drawn.mean(-1), values, draws=500)
@@ -261,6 +263,17 @@ def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, st
     levels = {policy: table.get((task, NOT_LATE, policy, policy)) for policy in (RANDOM, SCRIPT)}
     _over_steps(axis, measure, levels, f"{SCRIPT}, undelayed")
     axis.set(title=f"{task}, delay {delay}")
+
+
+def _places(comparison: Comparison, undelayed: Sequence[str] = ()) -> list[tuple[str, str]]:
+    """Tasks but held-out ones, with each of their delays; ``undelayed`` where a task has none."""
+    tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
+    return [(task, delay) for task in tasks for delay in comparison.delays(task) or undelayed]
+
+
+def _line_of(comparison: Comparison, name: str) -> dict[str, Any]:
+    """Style of the line of a method, with its entry in the legend."""
+    return look(comparison.methods, name) | {"marker": "", "label": name}
 
 
 def _flown(measure: str) -> str:
@@ -281,11 +294,12 @@ def _over_steps(axis: Axes, measure: str, levels: Mapping[str, float | None], sc
 
 def curve(runs: Sequence[pd.DataFrame], name: str) -> tuple[Floats, Floats]:
     """Environment steps that all seeds reached, [points]; a measure there, [points, seeds]."""
-    points = [run[["frames", name]].dropna(subset=name).to_numpy() for run in runs]
-    points = [run for run in points if len(run)]
-    first = max((run[0, 0] for run in points), default=np.inf)
-    last = min((run[-1, 0] for run in points), default=-np.inf)
+    tables = [run[["frames", name]].dropna(subset=name) for run in runs]
+    points = [table.to_numpy().T for table in tables if len(table)]
+    first = max((frames[0] for frames, _ in points), default=np.inf)
+    last = min((frames[-1] for frames, _ in points), default=-np.inf)
     if first > last:
         return np.full(_POINTS, np.nan), np.full((_POINTS, 1), np.nan)
     place = np.linspace(first, last, _POINTS)
-    return place, np.stack([np.interp(place, run[:, 0], run[:, 1]) for run in points], -1)
+    values = [np.interp(place, frames, value) for frames, value in points]
+    return place, np.stack(values, -1)

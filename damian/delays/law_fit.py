@@ -50,7 +50,7 @@ def fit_laws(steps: Integers) -> tuple[LawFit, LawFit]:
     counts = np.bincount(codes.ravel(), minlength=int(steps.max()) + 3)[:-1]
     n = int(counts.sum())
     chances = counts / n
-    n_outcomes = np.count_nonzero(counts)
+    n_outcomes = int(np.count_nonzero(counts))
     own = LawFit(OWN[0], chances, _likelihood(counts, chances), n_outcomes, n)
 
     size = len(counts)

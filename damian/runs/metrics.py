@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -82,36 +83,37 @@ def evaluation(rollout: TensorDictBase, server: Server, metrics: Sequence[str] =
     found = Evaluation(episodes=len(rollout))
     for name in dict.fromkeys((*BUILT_IN, *metrics)):
         with naming_errors(f"metric {name}"):
-            found[name] = (
-                torch.as_tensor(METRICS.get(name, "metrics").compute(flights)).float().mean().item()
-            )
+            metric = METRICS.get(name, "metrics")
+            values = torch.as_tensor(metric.compute(flights))
+            found[name] = values.float().mean().item()
     return found
 
 
 def flights_of(rollout: TensorDictBase, server: Server) -> Flights:
     """The first episode of each world in a rollout [B, T], and what has come of its messages."""
     next_step = cast(TensorDictBase, rollout["next"])
-    elapsed = torch.arange(1, rollout.shape[1] + 1, device=rollout.device).expand(rollout.shape)
+    steps = torch.arange(1, rollout.shape[1] + 1, device=rollout.device)
+    elapsed = steps.expand(rollout.shape)
     message = next_step[keys.MESSAGE]
     over = next_step.get(keys.SOURCE_OVER, None)
     belief = _true_belief(rollout, server, elapsed)
     truth = server(server.messages(message), elapsed, over, belief=belief)
-    done, success, reward = (
-        next_step[k].squeeze(-1) for k in (keys.DONE, keys.SUCCESS, keys.REWARD)
-    )
+    perceived = (keys.DONE, keys.SUCCESS, keys.REWARD)
+    done, success, reward = (next_step[key].squeeze(-1) for key in perceived)
     in_episode = _up_to_first_end(done)
     true_end = in_episode & _up_to_first_end(truth.status.terminated)
     held = server.messages(next_step.get(keys.RECEIVED, message))
     sent = cast(Tensor, next_step[keys.MESSAGE_SENT])[in_episode]
     delay = torch.zeros(1)
     if sent.any() and keys.DELAY in next_step.keys(True):
-        delay = cast(Tensor, next_step[keys.DELAY]).squeeze(-1)[in_episode][sent]
-    can_succeed = server.episode.can_succeed
+        delays = cast(Tensor, next_step[keys.DELAY]).squeeze(-1)
+        delay = delays[in_episode][sent]
+    episodes = partial(_episodes, can_succeed=server.episode.can_succeed)
     return Flights(
         rollout,
         server,
-        true=_episodes(truth.status.success, truth.reward, true_end, can_succeed),
-        perceived=_episodes(success, reward, in_episode, can_succeed),
+        true=episodes(truth.status.success, truth.reward, true_end),
+        perceived=episodes(success, reward, in_episode),
         in_episode=in_episode,
         age=held.age(elapsed * server.dt) / server.dt,
         delay=delay,
@@ -124,7 +126,8 @@ def _episodes(success: Tensor, reward: Tensor, counted: Tensor, can_succeed: boo
     steps = counted.sum(-1)
     if can_succeed:
         steps = torch.where(succeeded, steps, counted.shape[1])
-    return Episodes(succeeded, steps, (reward.mean(-1) * counted).sum(-1))
+    returns = (reward.mean(-1) * counted).sum(-1)
+    return Episodes(succeeded, steps, returns)
 
 
 def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Tensor | None:
@@ -136,12 +139,15 @@ def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Te
     sent = cast(Tensor, rollout[next_key(keys.MESSAGE_SENT)])
     steps[next_key(keys.DELAY)] = sent.long().unsqueeze(-1) - 1  # 0, or -1 where none was sent
     steps[keys.STEP_COUNT] = elapsed.unsqueeze(-1) - 1
-    return beliefs_in_hindsight(server, steps.transpose(0, 1)).transpose(0, 1)
+    beliefs = beliefs_in_hindsight(server, steps.transpose(0, 1))
+    return beliefs.transpose(0, 1)
 
 
 def _up_to_first_end(ended: Tensor) -> Tensor:
     """Mask of the steps up to and including the first end, [B, T] bool."""
-    return ended.int().cumsum(-1) - ended.int() == 0
+    ends = ended.int()
+    ends_before = ends.cumsum(-1) - ends
+    return ends_before == 0
 
 
 class EpisodeLog:
@@ -160,21 +166,26 @@ class EpisodeLog:
     def __init__(self, worlds: int, hindsight: "HindsightReturns | None" = None) -> None:
         self.finished = 0
         self.hindsight = hindsight
-        parts = [(worlds, len(self.NAMES)), *([(hindsight.worlds, 1)] if hindsight else [])]
-        self._known = [
-            torch.full((b, math.ceil(self.EPISODES / b), n), torch.nan) for b, n in parts
-        ]
+        self._known = [self._nothing(worlds, len(self.NAMES))]
+        if hindsight:
+            self._known.append(self._nothing(hindsight.worlds, 1))
         """Numbers of the latest episodes of each world [B, K, N], perceived and in hindsight."""
+
+    def _nothing(self, worlds: int, n_numbers: int) -> Tensor:
+        """Numbers of no episode, [B, K, N]."""
+        episodes = math.ceil(self.EPISODES / worlds)
+        return torch.full((worlds, episodes, n_numbers), torch.nan)
 
     def add(self, batch: TensorDictBase) -> None:
         """Add the episodes that end in a batch [B, T], with the entries of ``EpisodeTotals``."""
         steps = cast(TensorDictBase, batch["next"])
         done = steps[keys.DONE].to("cpu")
-        of_episodes = (cast(Tensor, steps[key]) for key in _TOTALS)
-        totals = torch.stack([each.flatten(2).float().mean(2) for each in of_episodes], -1)
+        of_episodes = (cast(Tensor, steps[key]).flatten(2) for key in _TOTALS)
+        totals = torch.stack([each.float().mean(2) for each in of_episodes], -1)
         ended = [totals.to("cpu").masked_fill(~done, torch.nan)]
         if self.hindsight:
-            ended.append(self.hindsight.add(batch).to("cpu").unsqueeze(-1))
+            settled = self.hindsight.add(batch).to("cpu")
+            ended.append(settled.unsqueeze(-1))
         self._known = [*map(_latest, self._known, ended)]
         self.finished += int(done.sum())
 
@@ -191,8 +202,9 @@ class EpisodeLog:
     def means(self) -> dict[str, float]:
         """Mean returns, success rate and steps; nan before an episode has ended in each world."""
         perceived, *settled = (known.nanmean(1).mean(0).tolist() for known in self._known)
-        names = dict(zip(self.NAMES, perceived, strict=True))
-        return {"hindsight_return": (settled or [perceived])[0][0], **names}
+        in_hindsight = settled[0] if settled else perceived
+        means = {"hindsight_return": in_hindsight[0]}
+        return means | dict(zip(self.NAMES, perceived, strict=True))
 
 
 def _latest(known: Tensor, ended: Tensor) -> Tensor:
@@ -203,14 +215,12 @@ def _latest(known: Tensor, ended: Tensor) -> Tensor:
         ended: those of the episodes that end in some later steps, nan where none does, [B, T, N].
     """
     both = torch.cat([known, ended], 1)
-    when = torch.arange(both.shape[1]).where(~both[..., 0].isnan(), -1)
-    latest = (
-        when.topk(known.shape[1], 1)
-        .indices.sort(1)
-        .values.unsqueeze(-1)
-        .expand(-1, -1, both.shape[2])
-    )
-    return both.gather(1, latest)
+    _, n_all, n_numbers = both.shape
+    is_known = ~both[..., 0].isnan()
+    when = torch.arange(n_all).where(is_known, -1)
+    latest = when.topk(known.shape[1], 1).indices
+    in_order = latest.sort(1).values.unsqueeze(-1)
+    return both.gather(1, in_order.expand(-1, -1, n_numbers))
 
 
 class HindsightReturns:
@@ -246,31 +256,34 @@ class HindsightReturns:
         self._store(steps)
         self._waiting += len(steps)
         n_settled = max(self._waiting - self.storage.longest, 0)
-        settled: Any = self.storage.steps[self.storage.latest(self._waiting)[:n_settled]]
+        rows = self.storage.latest(self._waiting)[:n_settled]
+        settled: Any = self.storage.steps[rows]
         self._waiting -= n_settled
         if not n_settled:
             return torch.full((self.worlds, 0), torch.nan)
         valid, over = (settled[key].squeeze(-1).cpu() for key in (keys.VALID, keys.RESET_AFTER))
-        reward = settled[next_key(keys.REWARD)].squeeze(-1).double().mean(-1).cpu()
-        total = torch.cat(
-            [self._running[None], self._running + (reward * valid).cumsum(0)]
-        )  # [T' + 1, W]
-        step = torch.arange(n_settled).view(-1, 1)
-        ended = (
-            torch.where(over, step + 1, 0).cummax(0).values
-        )  # the end of the latest episode before
-        before = torch.cat([torch.zeros_like(ended[:1]), ended])
-        begun = torch.where(before > 0, total.gather(0, before), 0.0)
+        rewards = settled[next_key(keys.REWARD)].squeeze(-1)
+        reward = rewards.double().mean(-1).cpu()
+        so_far = self._running + (reward * valid).cumsum(0)
+        total = torch.cat([self._running[None], so_far])  # [T' + 1, W]
+        n_steps = torch.arange(1, n_settled + 1).view(-1, 1)
+        ends = torch.where(over, n_steps, 0)
+        latest_end = ends.cummax(0).values
+        begin = torch.cat([torch.zeros_like(ends[:1]), latest_end])
+        begun = torch.where(begin > 0, total.gather(0, begin), 0.0)
         self._running = total[-1] - begun[-1]
-        return torch.where(over, total[1:] - begun[:-1], torch.nan).T.float()
+        returns = torch.where(over, so_far - begun[:-1], torch.nan)
+        return returns.T.float()
 
     def _store(self, steps: TensorDictBase, corrected: bool = False) -> None:
         """Write steps [T, W] behind the latest ones, and correct all unless they are
         ``corrected``."""
-        index = torch.arange(self._written, self._written + len(steps))
+        begin = self._written
         self._written += len(steps)
-        write: Any = super(BackupdateStorage, self.storage).set if corrected else self.storage.set
-        write(index % (self.storage.max_size // self.worlds), steps)
+        index = torch.arange(begin, self._written)
+        n_rows = self.storage.max_size // self.worlds
+        storage: Any = super(BackupdateStorage, self.storage) if corrected else self.storage
+        storage.set(index % n_rows, steps)
 
     def state_dict(self) -> dict[str, Any]:
         rows = self.storage.steps[self.storage.latest()] if self._written else None
