@@ -146,8 +146,8 @@ def plot_profiles(comparison: Comparison, path: Path) -> None:
         for name in names:
             runs = []
             for found in scores:
-                undelayed, random, *_ = found.mean()
-                runs.append(normalised(found[name], undelayed, random))
+                undelayed, random = found.iloc[:, :2].mean().to_numpy()
+                runs.append(normalised(found[name].to_numpy(), undelayed, random))
             values = np.concatenate(runs)
             known = values[~np.isnan(values)]
             share = (known[:, None] > levels).mean(0)
