@@ -201,8 +201,10 @@ class Simulation:
         in_reach = self.in_reach(state, emits, on_ground)
         detected = self._reported(state, in_reach, on_ground.unsqueeze(-1))
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
-        trail, landed = self._stops(state, times, on_ground, action_valid)
-        state, served, serves = self._serve(state, now, on_ground, action_valid)
+        stops = self.vehicles.new_stop(state, on_ground, action_valid)
+        trail, landed = self._stops(state, times, stops)
+        lands = on_ground if stops is None else stops
+        state, served, serves = self._serve(state, now, lands)
         sent = state.sent
         position = state.position[..., :2]
         known = sent.detected_time, sent.detected_position
@@ -283,23 +285,18 @@ class Simulation:
         false_alarm = listens & (share < alarm)
         return torch.where(in_reach, share >= miss, false_alarm)
 
-    def _stops(
-        self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _stops(self, state: State, now: Tensor, added: Tensor | None) -> tuple[Tensor, Tensor]:
         """Landing points and times [s] of each UAV's latest stops, newest first, [B, N, S] each."""
         sent = state.sent
         trail = _prepended(state.goal, sent.trail)
         landed = _prepended(now, sent.landed)
-        added = self.vehicles.new_stop(state, on_ground, action_valid)
         if added is not None:
             added = added.unsqueeze(-1)
             trail = torch.where(added, trail, sent.trail)
             landed = torch.where(added, landed, sent.landed)
         return trail, landed
 
-    def _serve(
-        self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
-    ) -> tuple[State, Tensor, Tensor]:
+    def _serve(self, state: State, now: Tensor, lands: Tensor) -> tuple[State, Tensor, Tensor]:
         """Let requests appear, and the UAVs that land serve some, as in ``Messages``."""
         served = state.sent.served
         serves = state.sent.serves
@@ -307,9 +304,6 @@ class Simulation:
             return state, served, serves
         counters = state.seed, state.episode, state.steps, state.region
         requests = appear(state.requests, served, self.arrivals, counters, now)
-        lands = self.vehicles.new_stop(state, on_ground, action_valid)
-        if lands is None:
-            lands = on_ground
         radius = self.radius
         drawn = self.radii(state)
         if drawn is not None:
@@ -554,8 +548,7 @@ def _draw_starts(
     places = local_places(key, given, home)
     points = airspace.nearest(places, region)
     problem = (
-        f"lead to the same landing point of {home.name}: "
-        "take others, or region.start_together=true"
+        f"lead to the same landing point of {home.name}: take others, or region.start_together=true"
     )
     distinct = len(points.unique()) == len(points)
     checks.require(together or distinct, key, given, problem)
