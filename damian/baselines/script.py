@@ -37,9 +37,10 @@ ground."""
 WORTH = 0.3
 """Least share of the highest probability of a detection for which a UAV flies to a landing
 point."""
-SEARCH_STEPS, GOLDEN = 4, (math.sqrt(5) - 1) / 2
-"""A UAV that searches several sources flies to another place after so many steps, by the golden
-ratio."""
+SEARCH_STEPS = 4
+"""A UAV that searches several sources flies to another place after so many steps."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""The golden ratio, by which it chooses this place."""
 MAX_PAIRS = 400_000_000
 """Most pairs of landing points: the script weighs each of them against every other one of its
 region."""
@@ -47,20 +48,31 @@ region."""
 
 def script_policy(env: DelayedEnv) -> TensorDictModule:
     """Build the stateless scripted policy, for an environment with ``message`` among its extras."""
-    n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
+    worlds = env.uav_env
+    n_regions, n_points = worlds.simulation.airspace.points.shape[:2]
+    n_pairs = n_regions * n_points**2
     shown = f"{n_points} landing points"
     should = "are too many for the scripted policy: take a larger step"
-    checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
+    checks.require(n_pairs <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
-    scenario = env.uav_env.scenario
-    believes = keys.BELIEF in available and scenario.seeks_source
-    message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
-    own_messages = keys.OWN_BELIEF in available if believes else scenario.observation.own
-    script = Searcher if believes else Seeker if scenario.seeks_source else Coverer
-    if scenario.source.count > 1 and scenario.seeks_source:
-        script = Rescuer
+    scenario = worlds.scenario
+    seeks = scenario.seeks_source
+    believes = seeks and keys.BELIEF in available
+    own_messages = scenario.observation.own
+    if believes:
+        own_messages = keys.OWN_BELIEF in available
+    script = Coverer
     if scenario.requests.slots:
         script = Dispatcher
+    elif seeks and scenario.source.count > 1:
+        script = Rescuer
+    elif believes:
+        script = Searcher
+    elif seeks:
+        script = Seeker
+    message = keys.MESSAGE
+    if keys.RECEIVED in available:
+        message = keys.RECEIVED
     arguments: dict[str, NestedKey] = {"message": message, "mask": keys.ACTION_MASK}
     if script is Searcher:
         arguments |= {"belief": keys.BELIEF, "own_belief": keys.OWN_BELIEF}
@@ -69,7 +81,7 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
     elif own_messages:
         arguments |= {"own_message": keys.MESSAGE}
     in_keys = {name: key for name, key in arguments.items() if key in available}
-    return TensorDictModule(script(env.uav_env), in_keys, [keys.ACTION])
+    return TensorDictModule(script(worlds), in_keys, [keys.ACTION])
 
 
 class Seeker:
@@ -90,14 +102,20 @@ class Seeker:
         self.dt = scenario.clock.dt
         self.candidates = simulation.candidates
         self.actions = scenario.actions
-        self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
+        self.speed = 0.0
+        if source.motion == "dynamic":
+            self.speed = max(source.speed, source.local_speed)
         self.emits = source.emits
         self.hears_all = scenario.requests.range is None
-        self.real = simulation.airspace.points[..., 0].isfinite()
-        self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
-        near = distances(self.points, self.points) <= self.radius
+        points = simulation.airspace.points
+        self.real = points[..., 0].isfinite()
+        self.points = points.nan_to_num(posinf=0.0)
+        self.n_points = points.shape[1]
+        between = distances(self.points, self.points)
+        near = between <= self.radius
         # A row is a landing point to cover, a column the one in whose footprint it lies.
-        self.near = (near & self.real.unsqueeze(-1)).float()
+        real_rows = self.real.unsqueeze(-1)
+        self.near = (near & real_rows).float()
 
     def __call__(
         self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None
@@ -107,39 +125,53 @@ class Seeker:
         held = self.unpack(message)
         region = self.region_of(held)
         ground = self.points[region]
-        time = held.time if age is None else held.time + age.squeeze(-1) * self.dt
-        likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
-        weight = torch.where(recent, likely, self.fresh(held, ground) * likely)
-        return self.choose_landing(held, weight @ self.footprints(region), region, mask)[0]
+        time = held.time
+        if age is not None:
+            time = time + age.squeeze(-1) * self.dt
+        now = time.amax(-1, keepdim=True)
+        likely, recent = self.believe(held, ground, now)
+        fresh = self.fresh(held, ground)
+        weight = torch.where(recent, likely, fresh * likely)
+        gain = weight @ self.footprints(region)
+        action, _ = self.choose_landing(held, gain, region, mask)
+        return action
 
     def footprints(self, region: Tensor) -> Tensor:
         """1 for landing points (rows) in the footprints of others (columns), [B or 1, L, L]."""
-        return self.near if len(self.near) == 1 else self.near[region]
+        if len(self.near) == 1:
+            return self.near
+        return self.near[region]
 
     def choose_landing(
         self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Actions, and the landing points [B, N] to which they lead, as indices in their region."""
         ground = self.points[region]
-        gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
+        real = self.real[region].unsqueeze(1)
+        gain = gain.where(real, -torch.inf)
         flown = distances(held.target, ground)
         goal = (gain - _FLIGHT_COST * flown).argmax(-1)
-        left = distances(_places_at(ground, goal), ground)
+        goal_place = _places_at(ground, goal)
+        left = distances(goal_place, ground)
         if self.actions.kind == "discrete":
             # A UAV that the server has last heard of at its takeoff stands on its target when it
             # chooses.
-            standing = flown.argmin(-1) + region.unsqueeze(-1) * self.points.shape[1]
-            return self.best_action(standing, gain, left, mask)
+            nearest = flown.argmin(-1)
+            base = region.unsqueeze(-1) * self.n_points
+            return self.best_action(nearest + base, gain, left, mask)
         return self.best_move(held, gain, flown, left, ground)
 
     def fresh(self, held: Messages, ground: Tensor) -> Tensor:
         """1 for landing points [B, L, 2] nearest to the UAV and outside its latest footprints,
         [B, N, L]."""
         distance = distances(held.target, ground)
-        own = distance <= distance.amin(1, keepdim=True)
-        landed = gather_rows(self.points.flatten(0, 1), self.counted(held))
+        nearest = distance.amin(1, keepdim=True)
+        own = distance <= nearest
+        points = self.points.flatten(0, 1)
+        landed = gather_rows(points, self.counted(held))
         from_trail = distances(landed, ground.unsqueeze(1))
-        return (own & (from_trail > self.radius).all(-2)).float()
+        outside = (from_trail > self.radius).all(-2)
+        return (own & outside).float()
 
     def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
         """How likely the source is at each landing point [B, L, 2], relative to the best one,
@@ -153,18 +185,26 @@ class Seeker:
         detected = held.detected_time.squeeze(-1)
         has_detection = detected >= 0
         since = torch.where(has_detection, now - detected, torch.inf).unsqueeze(-1)
-        outside = (distances(held.detected_position.squeeze(-2), ground) - self.radius).clamp(min=0)
-        log_detected = -(outside / (BLUR_M + self.speed * since / 2)).square() / 2
-        log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0).sum(
-            1, keepdim=True
-        )
-        silent = ~held.spotted & ~held.in_flight & (held.time > now - self.dt / 2)
-        covered = (distances(held.position, ground) <= self.radius) & silent.unsqueeze(-1)
+        from_detection = distances(held.detected_position.squeeze(-2), ground)
+        outside = (from_detection - self.radius).clamp(min=0)
+        deviation = BLUR_M + self.speed * since / 2
+        log_detected = -(outside / deviation).square() / 2
+        log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0)
+        half_step = self.dt / 2
+        heard_now = held.time > now - half_step
+        silent = ~held.spotted & ~held.in_flight & heard_now
+        inside = distances(held.position, ground) <= self.radius
+        covered = inside & silent.unsqueeze(-1)
+        anyone_covers = covered.any(1, keepdim=True)
         latest = since.amin(1, keepdim=True)
-        confidence = TRUST * torch.where(latest < self.dt / 2, 1.0, self.emits)
-        log = log_detected + torch.log1p(-confidence * covered.any(1, keepdim=True))
+        emits = torch.where(latest < half_step, 1.0, self.emits)
+        confidence = TRUST * emits
+        log_silent = torch.log1p(-confidence * anyone_covers)
+        log = log_detected.sum(1, keepdim=True) + log_silent
+        highest = log.amax(-1, keepdim=True)
         moved = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
-        return (log - log.amax(-1, keepdim=True)).exp(), moved <= RECENT * self.radius
+        recent = moved <= RECENT * self.radius
+        return (log - highest).exp(), recent
 
     def best_action(
         self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None
@@ -173,20 +213,29 @@ class Seeker:
         leads."""
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = standing.unsqueeze(-1) * len(action) + action
-        point, flown = (gather_rows(table[:, 0], row) for table in self.candidates.ranking)
-        gain, left = (values.gather(-1, point.long()) for values in (gain, left))
-        best = _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
-        return best, point.long().gather(-1, best.unsqueeze(-1)).squeeze(-1)
+        ranking = self.candidates.ranking
+        point = gather_rows(ranking.point[:, 0], row).long()
+        flown = gather_rows(ranking.distance[:, 0], row)
+        gain = gain.gather(-1, point)
+        left = left.gather(-1, point)
+        if mask is not None:
+            gain = gain.where(mask, -torch.inf)
+        best = _best(gain, flown, left)
+        return best, _entry(point, best)
 
     def best_move(
         self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Distance and heading in [0, 1] to the best landing point in reach, [B, N, 2], and this
         point."""
-        best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
-        east, north = (_places_at(ground, best) - held.target).unbind(-1)
-        heading = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
-        distance = flown.gather(-1, best.unsqueeze(-1)).squeeze(-1) / self.candidates.max_distance
+        longest = self.candidates.max_distance
+        gain = gain.where(flown <= longest, -torch.inf)
+        best = _best(gain, flown, left)
+        way = _places_at(ground, best) - held.target
+        east, north = way.unbind(-1)
+        turns = torch.atan2(east, north) / (2 * math.pi)
+        heading = torch.remainder(turns, 1.0)
+        distance = _entry(flown, best) / longest
         return torch.stack([distance, heading], -1), best
 
 
@@ -194,9 +243,14 @@ def _best(gain: Tensor, flown: Tensor, left: Tensor) -> Tensor:
     """Index of the choice of most gain, the nearest of equals, or nearest the goal if none gains,
     [B, N]."""
     gains = gain.amax(-1, keepdim=True) > _LEAST_GAIN
-    return torch.where(
-        gains, gain - _FLIGHT_COST * flown, -left.where(gain.isfinite(), torch.inf)
-    ).argmax(-1)
+    net_gain = gain - _FLIGHT_COST * flown
+    way_left = left.where(gain.isfinite(), torch.inf)
+    return torch.where(gains, net_gain, -way_left).argmax(-1)
+
+
+def _entry(values: Tensor, index: Tensor) -> Tensor:
+    """The entry of each row [*, A] at its index [*], [*]."""
+    return values.gather(-1, index.unsqueeze(-1)).squeeze(-1)
 
 
 def _places_at(ground: Tensor, index: Tensor) -> Tensor:
@@ -221,26 +275,35 @@ class Searcher(Seeker):
         ``own_belief`` [B, N, K, C] follows from them.
         """
         known = self.unpack(message)
-        own = known if own_message is None else self.unpack(own_message)
+        own = known
+        if own_message is not None:
+            own = self.unpack(own_message)
+        belief = belief.unsqueeze(1)
+        if own_belief is not None:
+            belief = own_belief
         region = self.region_of(known)
         level = self.level(known)
-        belief = belief.unsqueeze(1) if own_belief is None else own_belief
-        assert self.grid is not None
-        place = places(self.grid, region, level).unsqueeze(1).expand(belief.shape[:3])
-        ground = self.points[region]
-        chance = any_of(detection_chance(self.grid, belief, place)).expand(
-            -1, known.time.shape[1], -1
-        )
-        here = own.trail[..., :1] % self.points.shape[1]
-        rows = report_rows(self.grid, own, level).movedim(-1, -2)
+        grid = self.grid
+        assert grid is not None
+        place = places(grid, region, level).unsqueeze(1)
+        place = place.expand(belief.shape[:3])
+        chance = any_of(detection_chance(grid, belief, place))
+        chance = chance.expand(-1, known.time.shape[1], -1)
+        here = own.trail[..., :1] % self.n_points
+        rows = report_rows(grid, own, level).movedim(-1, -2)
         each = belief.expand(*rows.shape, -1)
-        stays = any_of(chance_of_staying(self.grid, each, rows.unsqueeze(-1)))
-        chance = chance.scatter(-1, here, stays).masked_fill(self.taken(known), 0.0)
-        near = distances(own.target, ground) <= self.from_others(known, ground)
+        stays = any_of(chance_of_staying(grid, each, rows.unsqueeze(-1)))
+        chance = chance.scatter(-1, here, stays)
+        chance = chance.masked_fill(self.taken(known), 0.0)
+        ground = self.points[region]
+        flown = distances(own.target, ground)
+        near = flown <= self.from_others(known, ground)
         probable = chance.amax(-1, keepdim=True) >= PROBABLE
         chance = torch.where(probable | near, chance, 0.0)
-        worth = chance >= WORTH * chance.amax(-1, keepdim=True)
-        return self.choose_landing(own, torch.where(worth, chance, 0.0), region, mask)[0]
+        highest = chance.amax(-1, keepdim=True)
+        gain = torch.where(chance >= WORTH * highest, chance, 0.0)
+        action, _ = self.choose_landing(own, gain, region, mask)
+        return action
 
     def from_others(self, known: Messages, ground: Tensor) -> Tensor:
         """Distance from the nearest other UAV to each landing point [m], [B, N, L]; infinite for
@@ -252,9 +315,11 @@ class Searcher(Seeker):
 
     def taken(self, known: Messages) -> Tensor:
         """Landing points on which the latest known messages place another UAV, [B, N, L] bool."""
-        point = known.trail[..., :1] % self.points.shape[1]
-        stands = point.new_zeros(*point.shape[:2], self.points.shape[1]).scatter(-1, point, 1)
-        return stands.sum(1, keepdim=True) > stands
+        point = known.trail[..., :1] % self.n_points
+        nowhere = point.new_zeros(*point.shape[:2], self.n_points)
+        stands = nowhere.scatter(-1, point, 1)
+        everyone = stands.sum(1, keepdim=True)
+        return everyone > stands
 
 
 class Coverer(Seeker):
@@ -277,17 +342,22 @@ class Coverer(Seeker):
         region = self.region_of(held)
         actions = []
         near = self.footprints(region)
-        claimed = torch.zeros(len(region), near.shape[-1], device=message.device)
-        for uav in range(message.shape[1]):  # what a UAV chooses depends on those before it
-            legal = None if mask is None else mask[:, uav : uav + 1]
+        claimed = torch.zeros(len(region), self.n_points, device=message.device)
+        uavs = torch.arange(message.shape[1], device=message.device)
+        for uav in range(len(uavs)):  # what a UAV chooses depends on those before it
+            legal = mask
+            if mask is not None:
+                legal = mask[:, uav : uav + 1]
             if own_message is not None:
-                itself = torch.arange(message.shape[1], device=message.device) == uav
-                own = self.unpack(torch.where(itself.unsqueeze(-1), own_message, message))
+                itself = (uavs == uav).unsqueeze(-1)
+                packed = torch.where(itself, own_message, message)
+                own = self.unpack(packed)
             action, point = self.choose_new(own, uav, claimed, near, legal)
             actions.append(action)
             if own_message is not None:  # the others do not know where it is
                 _, point = self.choose_new(held, uav, claimed, near, None)
-            claimed = torch.maximum(claimed, _footprints_of(point, near).squeeze(1))
+            footprint = _footprints_of(point, near).squeeze(1)
+            claimed = torch.maximum(claimed, footprint)
         return torch.cat(actions, 1)
 
     def choose_new(
@@ -295,13 +365,14 @@ class Coverer(Seeker):
     ) -> tuple[Tensor, Tensor]:
         """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by
         others."""
-        alone = tree_map(lambda field: field[:, uav : uav + 1], known)
+        alone = _only(known, uav)
         # The next landing replaces the oldest one.
-        latest = self.counted(alone)[:, 0, :-1] % self.points.shape[1]
-        covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(
-            1, keepdim=True
-        )
-        return self.choose_landing(alone, (1 - covered) @ near, self.region_of(known), mask)
+        latest = self.counted(alone)[:, 0, :-1] % self.n_points
+        own = _footprints_of(latest, near)
+        footprints = torch.cat([own, claimed.unsqueeze(1)], 1)
+        new = 1 - footprints.amax(1, keepdim=True)
+        region = self.region_of(known)
+        return self.choose_landing(alone, new @ near, region, mask)
 
 
 class Rescuer(Coverer):
@@ -313,22 +384,26 @@ class Rescuer(Coverer):
     ) -> tuple[Tensor, Tensor]:
         heard = known.detected_time >= 0  # [B, N, K]
         times = heard.sum(1).clamp(min=1).unsqueeze(-1)
-        place = (known.detected_position * heard.unsqueeze(-1)).sum(1) / times
+        heard_places = known.detected_position * heard.unsqueeze(-1)
+        place = heard_places.sum(1) / times
         goal, assigned = _assigned(known.target, place, heard.any(1), uav)
-        alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        goal = torch.where(assigned.unsqueeze(-1), goal, self.searched(known, uav))
+        searched = self.searched(known, uav)
+        goal = torch.where(assigned.unsqueeze(-1), goal, searched)
         region = self.region_of(known)
-        close = (-distances(goal.unsqueeze(1), self.points[region]) / self.radius).exp()
-        return self.choose_landing(alone, close, region, mask)
+        from_goal = distances(goal.unsqueeze(1), self.points[region])
+        close = (-from_goal / self.radius).exp()
+        return self.choose_landing(_only(known, uav), close, region, mask)
 
     def searched(self, known: Messages, uav: int) -> Tensor:
         """Where a UAV that searches flies next, [B, 2]."""
         region = self.region_of(known)
         # A sequence of landing points that leaves no gap: each lies far from those before it.
-        turn = (known.time[:, uav : uav + 1] / self.dt / SEARCH_STEPS).floor() * known.time.shape[
-            1
-        ] + uav
-        point = (turn * GOLDEN % 1 * self.real[region].sum(-1, keepdim=True)).long()
+        n_uavs = known.time.shape[1]
+        steps = known.time[:, uav : uav + 1] / self.dt
+        turn = (steps / SEARCH_STEPS).floor() * n_uavs + uav
+        share = turn * GOLDEN % 1
+        n_real = self.real[region].sum(-1, keepdim=True)
+        point = (share * n_real).long()
         return _places_at(self.points[region], point).squeeze(1)
 
 
@@ -342,12 +417,16 @@ class Dispatcher(Rescuer):
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         requests, unserved = known_requests(known)
-        goal, assigned = _assigned(known.target, requests[..., :2], unserved, uav)
-        alone = tree_map(lambda field: field[:, uav : uav + 1], known)
-        other = alone.target[:, 0] if self.hears_all else self.searched(known, uav)
+        places = requests[..., :2]
+        goal, assigned = _assigned(known.target, places, unserved, uav)
+        alone = _only(known, uav)
+        other = alone.target[:, 0]
+        if not self.hears_all:
+            other = self.searched(known, uav)
         goal = torch.where(assigned.unsqueeze(-1), goal, other)
         region = self.region_of(known)
-        inside = distances(goal.unsqueeze(1), self.points[region]) <= self.radius
+        from_goal = distances(goal.unsqueeze(1), self.points[region])
+        inside = from_goal <= self.radius
         return self.choose_landing(alone, inside.float(), region, mask)
 
 
@@ -358,22 +437,29 @@ def _assigned(uavs: Tensor, places: Tensor, wanted: Tensor, uav: int) -> tuple[T
     UAVs are at ``uavs`` [B, N, 2], places at [B, K, 2] m; of those left, the nearest pair is
     assigned first.
     """
-    cost = distances(uavs, places).masked_fill(~wanted.unsqueeze(1), torch.inf)
+    unwanted = ~wanted.unsqueeze(1)
+    cost = distances(uavs, places).masked_fill(unwanted, torch.inf)
+    n_uavs, n_places = cost.shape[1:]
+    row = torch.arange(n_uavs, device=uavs.device)
+    column = torch.arange(n_places, device=uavs.device)
     goal = places[:, 0].clone()
     assigned = torch.zeros(len(uavs), dtype=torch.bool, device=uavs.device)
-    for _ in range(min(cost.shape[1:])):
+    for _ in range(min(n_uavs, n_places)):
         least, pair = cost.flatten(1).min(-1)
-        one = pair // cost.shape[2]
-        place = pair % cost.shape[2]
-        own = (one == uav) & least.isfinite()
-        goal = torch.where(
-            own.unsqueeze(-1), _places_at(places, place.unsqueeze(1)).squeeze(1), goal
-        )
-        assigned = assigned | own
-        rows = torch.arange(cost.shape[1], device=uavs.device) == one.unsqueeze(-1)
-        columns = torch.arange(cost.shape[2], device=uavs.device) == place.unsqueeze(-1)
-        cost = cost.masked_fill(rows.unsqueeze(-1) | columns.unsqueeze(1), torch.inf)
+        one = (pair // n_places).unsqueeze(-1)
+        place = (pair % n_places).unsqueeze(-1)
+        own = (one == uav) & least.isfinite().unsqueeze(-1)
+        goal = torch.where(own, _places_at(places, place).squeeze(1), goal)
+        assigned = assigned | own.squeeze(-1)
+        in_row = (row == one).unsqueeze(-1)
+        in_column = (column == place).unsqueeze(1)
+        cost = cost.masked_fill(in_row | in_column, torch.inf)
     return goal, assigned
+
+
+def _only(known: Messages, uav: int) -> Messages:
+    """What is known of one UAV, [B, 1, ...]."""
+    return tree_map(lambda field: field[:, uav : uav + 1], known)
 
 
 def _footprints_of(point: Tensor, near: Tensor) -> Tensor:

@@ -91,7 +91,9 @@ class Airspace(NamedTuple):
         points = self.points.flatten(0, 1)
         if self.detours is not None:
             return self.detours.way(origin, goal, points)
-        return torch.stack([gather_rows(points, origin), gather_rows(points, goal)], -2)
+        start = gather_rows(points, origin)
+        end = gather_rows(points, goal)
+        return torch.stack([start, end], -2)
 
     def length(self, origin: Tensor, goal: Tensor) -> Tensor:
         """Lengths of the ways between landing points, flat ids [*], in m [*]; infinite if there is
@@ -99,15 +101,15 @@ class Airspace(NamedTuple):
         points = self.points.flatten(0, 1)
         if self.detours is not None:
             return self.detours.length(origin, goal, points)
-        return torch.linalg.vector_norm(
-            gather_rows(points, goal) - gather_rows(points, origin), dim=-1
-        )
+        way = gather_rows(points, goal) - gather_rows(points, origin)
+        return torch.linalg.vector_norm(way, dim=-1)
 
     def nearest(self, places: Floats, region: int) -> Tensor:
         """The landing points nearest to places [P, 2] m, as ids within their region, [P]."""
         regions = torch.full((len(places),), region)
         target = torch.as_tensor(places)
-        return nearest_points(self.cells, self.exact_points, regions, target, 1).squeeze(-1)
+        nearest = nearest_points(self.cells, self.exact_points, regions, target, 1)
+        return nearest.squeeze(-1)
 
 
 def build_airspace(
@@ -121,24 +123,27 @@ def build_airspace(
     step = config.lattice_step
     degrees = config.lattice_angle
     n_points = config.n_landing_points
-    lattices = [landing_lattice(r.polygon, step, degrees, n_points) for r in regions]
-    for region, lattice in zip(regions, lattices, strict=True):
-        problem = f"UAVs are more than the {len(lattice)} landing points of {region.name}"
-        checks.require(len(lattice) >= n_agents, "agents", n_agents, problem)
+    polygons = [region.polygon for region in regions]
+    lattices = [landing_lattice(polygon, step, degrees, n_points) for polygon in polygons]
+    sizes = [len(lattice) for lattice in lattices]
+    for region, size in zip(regions, sizes, strict=True):
+        problem = f"UAVs are more than the {size} landing points of {region.name}"
+        checks.require(size >= n_agents, "agents", n_agents, problem)
     points = _padded(lattices, torch.inf)
+    edges = [_edges(polygon) for polygon in polygons]
+    scales = [largest_vertex_distance(polygon) for polygon in polygons]
+    offsets = [region.offset for region in regions]
     return Airspace(
         points=points.float(),
         exact_points=points,
-        cells=build_cells(lattices, [region.polygon for region in regions], 2 * n_agents - 1),
-        n_points=torch.tensor([len(lattice) for lattice in lattices]),
+        cells=build_cells(lattices, polygons, 2 * n_agents - 1),
+        n_points=torch.tensor(sizes),
         # A padded edge has zero length, so the inside test never counts it.
-        edges=_padded([_edges(region.polygon) for region in regions], 0.0),
-        scale=torch.tensor(
-            [largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32
-        ),
-        offset=torch.tensor([r.offset for r in regions], dtype=torch.float32),
+        edges=_padded(edges, 0.0),
+        scale=torch.tensor(scales, dtype=torch.float32),
+        offset=torch.tensor(offsets, dtype=torch.float32),
         regions=tuple(regions),
-        detours=detours([region.polygon for region in regions], lattices, 2 * longest + step),
+        detours=detours(polygons, lattices, 2 * longest + step),
     )
 
 
@@ -150,7 +155,9 @@ def inside(edges: Tensor, target: Tensor) -> Tensor:
     straddles = (y1 > y) != (y2 > y)
     # A horizontal edge divides by zero here, but it never straddles, so the result is not used.
     crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
-    return ((straddles & (x < crossing)).sum(-1) % 2).bool()
+    crossed = straddles & (x < crossing)
+    odd = crossed.sum(-1) % 2
+    return odd.bool()
 
 
 def nearest_points(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: int) -> Tensor:
@@ -168,20 +175,27 @@ def nearest_points(cells: Cells, points: Tensor, region: Tensor, target: Tensor,
 
 def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: int) -> Tensor:
     """As ``nearest_points``, all targets at once."""
-    corner, side, shape, first = (
-        gather_rows(t, region) for t in (cells.corner, cells.side, cells.shape, cells.first)
-    )
-    column, row = ((target - corner) / side).long().clamp(min=0).minimum(shape - 1).unbind(-1)
-    point = gather_rows(
-        cells.point, gather_rows(cells.row, first + row * shape[:, 0] + column)
-    ).long()
-    flat = point.clamp(min=0) + (region * points.shape[1]).unsqueeze(-1)
-    east, north = (gather_rows(points.flatten(0, 1), flat) - target.unsqueeze(1)).unbind(-1)
+    corner = gather_rows(cells.corner, region)
+    side = gather_rows(cells.side, region)
+    shape = gather_rows(cells.shape, region)
+    first = gather_rows(cells.first, region)
+    place = ((target - corner) / side).long()
+    column, row = place.clamp(min=0).minimum(shape - 1).unbind(-1)
+    cell = first + row * shape[:, 0] + column
+    used = gather_rows(cells.row, cell)
+    point = gather_rows(cells.point, used).long()
+    base = region * points.shape[1]
+    flat = point.clamp(min=0) + base.unsqueeze(-1)
+    way = gather_rows(points.flatten(0, 1), flat) - target.unsqueeze(1)
+    east, north = way.unbind(-1)
+    distance = (east * east + north * north).sqrt()
     # Half a centimetre is rounded up: the small term is far above rounding errors.
-    centimetres = (100 * (east * east + north * north).sqrt() + 0.500001).long()
-    order = ((centimetres << _ID_BITS) + point).masked_fill_(point < 0, _NEVER)
+    centimetres = (100 * distance + 0.500001).long()
+    order = (centimetres << _ID_BITS) + point
+    order = order.masked_fill_(point < 0, _NEVER)
     best = order.topk(n, largest=False).values
-    return torch.where(best == _NEVER, -1, best & (1 << _ID_BITS) - 1)
+    ids = best & (1 << _ID_BITS) - 1
+    return torch.where(best == _NEVER, -1, ids)
 
 
 def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], n: int) -> Cells:
@@ -199,31 +213,48 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
     n_used = 0
     for lattice, polygon in zip(lattices, polygons, strict=True):
         west, south, east, north = polygon.bounds
-        # The second term bounds the number of cells of a long and narrow polygon.
-        side = max(
-            math.sqrt(polygon.area / len(lattice)), max(east - west, north - south) / _MOST_CELLS
-        )
+        width = east - west
+        height = north - south
+        usual = math.sqrt(polygon.area / len(lattice))
+        # Otherwise a long and narrow polygon would have too many cells.
+        side = max(usual, max(width, height) / _MOST_CELLS)
         half = side * math.sqrt(0.5) + RESOLUTION
-        columns, rows = (int(length / side) + 1 for length in (east - west, north - south))
+        columns = int(width / side) + 1
+        rows = int(height / side) + 1
         row, column = np.divmod(np.arange(columns * rows), columns)
-        centre = np.stack([west + (column + 0.5) * side, south + (row + 0.5) * side], -1)
+        x = west + (column + 0.5) * side
+        y = south + (row + 0.5) * side
+        centre = np.stack([x, y], -1)
         used = shapely.dwithin(polygon, shapely.points(centre), half)
-        cell, point = _within_reach(lattice, centre[used], min(n, len(lattice)), side, 2 * half)
+        most = min(n, len(lattice))
+        cell, point = _within_reach(lattice, centre[used], most, side, 2 * half)
         slot = np.arange(len(cell)) - np.searchsorted(cell, cell)
         table = np.full((used.sum(), slot.max() + 1), -1)
         table[cell, slot] = point
         tables.append(table)
-        rows_of_cells.append(np.where(used, n_used + np.cumsum(used) - 1, 0))
+        number = n_used + np.cumsum(used) - 1
+        rows_of_cells.append(np.where(used, number, 0))
         n_used += len(table)
         shapes.append((columns, rows))
         corners.append((west, south))
         sides.append([side])
     widest = max(table.shape[1] for table in tables)
-    padded = [np.pad(t, ((0, 0), (0, widest - t.shape[1])), constant_values=-1) for t in tables]
-    first = np.cumsum([0, *map(len, rows_of_cells)])[:-1]
-    ids, row_of_cell = (np.concatenate(parts).astype(np.int32) for parts in (padded, rows_of_cells))
-    tables = (ids, row_of_cell, first, np.array(shapes), np.array(corners), np.array(sides))
-    return Cells(*map(torch.as_tensor, tables))
+    padded = []
+    for table in tables:
+        missing = widest - table.shape[1]
+        padded.append(np.pad(table, ((0, 0), (0, missing)), constant_values=-1))
+    ids = np.concatenate(padded).astype(np.int32)
+    row_of_cell = np.concatenate(rows_of_cells).astype(np.int32)
+    n_cells = [len(rows) for rows in rows_of_cells]
+    first = np.cumsum([0, *n_cells])[:-1]
+    return Cells(
+        point=torch.as_tensor(ids),
+        row=torch.as_tensor(row_of_cell),
+        first=torch.as_tensor(first),
+        shape=torch.tensor(shapes),
+        corner=torch.tensor(corners, dtype=torch.float64),
+        side=torch.tensor(sides, dtype=torch.float64),
+    )
 
 
 def _within_reach(
@@ -245,13 +276,20 @@ def _within_reach(
 
 def _edges(polygon: shapely.Geometry) -> np.ndarray:
     """Every edge of every ring, [E, 4] metres."""
-    rings = map(shapely.get_coordinates, shapely.get_rings(shapely.get_parts(polygon)))
-    return np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in rings])
+    rings = shapely.get_rings(shapely.get_parts(polygon))
+    edges = []
+    for ring in rings:
+        corners = shapely.get_coordinates(ring)
+        start = corners[:-1]
+        end = corners[1:]
+        edges.append(np.hstack([start, end]))
+    return np.concatenate(edges)
 
 
 def _padded(arrays: list[np.ndarray], value: float) -> Tensor:
     """Stack arrays of different lengths, [R, longest, ...]."""
-    stacked = np.full((len(arrays), max(map(len, arrays)), *arrays[0].shape[1:]), value)
+    longest = max(map(len, arrays))
+    stacked = np.full((len(arrays), longest, *arrays[0].shape[1:]), value)
     for row, array in zip(stacked, arrays, strict=True):
         row[: len(array)] = array
     return torch.as_tensor(stacked)

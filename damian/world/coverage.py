@@ -23,9 +23,10 @@ from damian.common.tensors import gather_rows
 
 _GRID = 321
 """Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact."""
-_CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**18, 2**24
-"""Words and table rows computed at once: 2 MiB on a CPU; 128 MiB on a GPU and in compiled
-graphs."""
+_CHUNK_WORDS = 2**18
+"""Words and table rows computed at once on a CPU: 2 MiB."""
+_CHUNK_WORDS_LARGE = 2**24
+"""The same on a GPU and in compiled graphs: 128 MiB."""
 _POINTS_AT_ONCE = 1024
 """Landing points whose samples are tested at once, which bounds the memory: arrays of 16 MiB."""
 
@@ -57,9 +58,12 @@ def build_tables(
     search has found gives 1.1 %. Points of NaN are padding, where nothing counts as covered.
     """
     offsets = radius * _unit_disc_samples(64 * words)
-    outside = [_outside(*pair, offsets) for pair in zip(polygons, points, strict=True)]
-    masks = torch.cat([_overlap(words), *map(_packed, outside)])
-    return FootprintTables(masks, (_GRID - 1) / (4 * radius))
+    masks = [_overlap(words)]
+    for polygon, places in zip(polygons, points, strict=True):
+        outside = _outside(polygon, places, offsets)
+        masks.append(_packed(outside))
+    cells_per_metre = (_GRID - 1) / (4 * radius)
+    return FootprintTables(torch.cat(masks), cells_per_metre)
 
 
 def tables_of_all(
@@ -72,9 +76,9 @@ def tables_of_all(
     Their positions are to be given in the unit of the first radius: times this one, over their own.
     """
     first, *others = [build_tables(polygons, points, radius) for radius in radii]
-    return first._replace(
-        masks=torch.cat([first.masks, *(each.masks[_GRID**2 :] for each in others)])
-    )
+    of_points = [each.masks[_GRID**2 :] for each in others]
+    masks = torch.cat([first.masks, *of_points])
+    return first._replace(masks=masks)
 
 
 def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
@@ -85,13 +89,15 @@ def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor)
     footprint of UAV i itself. Shares are fractions of pi R^2 (paper, Table 2). ``point_ids``
     ``[*, N, n]`` are the landing points of the ``positions`` ``[*, N, n, 2]`` [m].
     """
-    lead, (n_uavs, n_last) = point_ids.shape[:-2], point_ids.shape[-2:]
-    cells = (positions * tables.cells_per_metre).reshape(-1, n_uavs, n_last, 2)
+    n_uavs, n_last = point_ids.shape[-2:]
+    ids = point_ids.reshape(-1, n_uavs, n_last)
+    cells = positions * tables.cells_per_metre
+    cells = cells.reshape(*ids.shape, 2)
     # Windows that slide over the UAVs: i, i + 1, i + 2, ... (modulo N), without index tensors.
-    fleets = torch.cat([cells, cells[:, :-1]], 1).unfold(1, n_uavs, 1)
-    return _share_of_first(tables, point_ids.reshape(-1, n_uavs, n_last), fleets).reshape(
-        *lead, n_uavs
-    )
+    twice = torch.cat([cells, cells[:, :-1]], 1)
+    fleets = twice.unfold(1, n_uavs, 1)
+    share = _share_of_first(tables, ids, fleets)
+    return share.reshape(point_ids.shape[:-1])
 
 
 class KnownCoverage(NamedTuple):
@@ -108,11 +114,14 @@ def updated_share(
 ) -> Tensor:
     """As ``covered_share``, from all ``points`` [m], but computed only for worlds that have
     changed."""
-    changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
+    moved = (point_ids != known.trail).flatten(-2).any(-1)
+    unknown = known.share[..., 0] < 0
+    changed = (moved | unknown).reshape(-1)
     n_uavs, n_last = point_ids.shape[-2:]
     ids = point_ids.reshape(-1, n_uavs, n_last)
     share = known.share.reshape(-1, n_uavs)
-    return _update_share(*tables, ids, points, share, changed.reshape(-1)).view(known.share.shape)
+    updated = _update_share(*tables, ids, points, share, changed)
+    return updated.view(known.share.shape)
 
 
 @torch.library.custom_op("damian::update_share", mutates_args=())
@@ -130,7 +139,9 @@ def _update_share(
     if len(worlds):
         ids = ids.index_select(0, worlds)
         tables = FootprintTables(masks, cells_per_metre)
-        updated.index_copy_(0, worlds, covered_share(tables, ids, gather_rows(points, ids)))
+        positions = gather_rows(points, ids)
+        shares = covered_share(tables, ids, positions)
+        updated.index_copy_(0, worlds, shares)
     return updated
 
 
@@ -142,33 +153,44 @@ def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need on
 def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
     """The diagonal of ``covered_share`` of what each UAV knows, ``[*, N, N, ...]``
     (receiver, sender)."""
-    lead, (n_uavs, n_last) = point_ids.shape[:-3], point_ids.shape[-2:]
+    n_uavs, n_last = point_ids.shape[-2:]
     uav = torch.arange(n_uavs, device=point_ids.device)
+    receiver = uav.unsqueeze(-1)
     # The receiver i itself, then i + 1, i + 2, ... (modulo N).
-    known = (uav.unsqueeze(-1) * n_uavs + (uav.unsqueeze(-1) + uav) % n_uavs).flatten()
-    own = point_ids.reshape(-1, n_uavs**2, n_last).index_select(1, uav * (n_uavs + 1))
-    cells = (
-        (positions * tables.cells_per_metre)
-        .reshape(-1, n_uavs**2, n_last, 2)
-        .index_select(1, known)
-    )
+    sender = (receiver + uav) % n_uavs
+    pair = (receiver * n_uavs + sender).flatten()
+    itself = uav * (n_uavs + 1)
+    ids = point_ids.reshape(-1, n_uavs**2, n_last)
+    own = ids.index_select(1, itself)
+    cells = positions * tables.cells_per_metre
+    cells = cells.reshape(*ids.shape, 2).index_select(1, pair)
     fleets = cells.view(-1, n_uavs, n_uavs, n_last, 2).movedim(2, -1)
-    return _share_of_first(tables, own, fleets).reshape(*lead, n_uavs)
+    share = _share_of_first(tables, own, fleets)
+    return share.reshape(point_ids.shape[:-2])
 
 
 def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleets: Tensor) -> Tensor:
     """Coverage of the first UAV of each fleet, ``[b, N]``, from positions in cells,
     ``[b, N, n, 2, N]``."""
     n_uavs, n_last = point_ids.shape[1:]
-    words_per_world = n_uavs * n_last * (n_uavs + n_last - 1 + tables.masks.shape[-1])
-    large = point_ids.device.type != "cpu" or torch.compiler.is_compiling()
-    at_once = max(1, (_CHUNK_WORDS_LARGE if large else _CHUNK_WORDS) // words_per_world)
+    words = tables.masks.shape[-1]
+    n_masks = n_uavs + n_last - 1
+    words_per_world = n_uavs * n_last * (n_masks + words)
+    n_words = _CHUNK_WORDS
+    if point_ids.device.type != "cpu" or torch.compiler.is_compiling():
+        n_words = _CHUNK_WORDS_LARGE
+    at_once = max(1, n_words // words_per_world)
+    n_samples = 64 * n_last * words
     shares = []
     for ids, fleet in zip(point_ids.split(at_once), fleets.split(at_once), strict=True):
-        rows = torch.cat([(ids + _GRID**2).unsqueeze(0), _overlap_rows(fleet).movedim(-1, 0)])
-        counts = _bit_count(_or_rows(tables.masks, rows.flatten(1)).view(*ids.shape[:-1], -1))
+        outside = (ids + _GRID**2).unsqueeze(0)
+        overlaps = _overlap_rows(fleet).movedim(-1, 0)
+        rows = torch.cat([outside, overlaps])
+        masks = _or_rows(tables.masks, rows.flatten(1))
+        counts = _bit_count(masks.view(*ids.shape[:-1], -1))
         # Summed as floats (exact: small integers), which compiles to a much faster loop than int64.
-        shares.append(1 - counts.sum(-1, dtype=fleet.dtype) / (64 * counts.shape[-1]))
+        lost = counts.sum(-1, dtype=fleet.dtype)
+        shares.append(1 - lost / n_samples)
     return torch.cat(shares)
 
 
@@ -179,11 +201,14 @@ def _overlap_rows(fleet: Tensor) -> Tensor:
     # slides over the indices leaves out all other pairs, without index tensors.
     cells = fleet[..., 0]
     n_last = fleet.shape[-3]
-    past = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf).unfold(-2, n_last, 1)
+    padded = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf)
+    past = padded.unfold(-2, n_last, 1)
     other = torch.cat([fleet[..., 1:], past[..., 1:]], -1)
     # Adding half a cell before truncation rounds to the nearest one.
-    cell = (other - (cells - (_GRID / 2)).unsqueeze(-1)).clamp(0, _GRID - 1).long()
-    return cell[..., 0, :] * _GRID + cell[..., 1, :]
+    corner = cells - _GRID / 2
+    offset = other - corner.unsqueeze(-1)
+    x, y = offset.clamp(0, _GRID - 1).long().unbind(-2)
+    return x * _GRID + y
 
 
 def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
@@ -199,9 +224,12 @@ def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
 def _bit_count(words: Tensor) -> Tensor:
     """Number of 1 bits of each int64 (H. S. Warren, Hacker's Delight, 2nd ed., 5-1)."""
     # The shift repeats the sign bit, hence a mask after each.
-    twos = words - (words >> 1).bitwise_and_(0x5555555555555555)
-    fours = (twos >> 2).bitwise_and_(0x3333333333333333).add_(twos & 0x3333333333333333)
-    eights = (fours >> 4).add_(fours).bitwise_and_(0x0F0F0F0F0F0F0F0F)
+    upper_ones = (words >> 1).bitwise_and_(0x5555555555555555)
+    twos = words - upper_ones
+    upper_twos = (twos >> 2).bitwise_and_(0x3333333333333333)
+    fours = upper_twos.add_(twos & 0x3333333333333333)
+    sums = (fours >> 4).add_(fours)
+    eights = sums.bitwise_and_(0x0F0F0F0F0F0F0F0F)
     return eights.mul_(0x0101010101010101) >> 56
 
 
@@ -210,7 +238,9 @@ def _unit_disc_samples(count: int) -> np.ndarray:
     k = np.arange(count)
     r = np.sqrt((k + 0.5) / count)
     angle = k * np.pi * (3 - math.sqrt(5))
-    return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
+    x = r * np.cos(angle)
+    y = r * np.sin(angle)
+    return np.stack([x, y], -1)
 
 
 def _outside(polygon: shapely.Geometry, points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -218,13 +248,18 @@ def _outside(polygon: shapely.Geometry, points: np.ndarray, offsets: np.ndarray)
     boundary = shapely.boundary(polygon)
     radius = np.hypot(*offsets.T).max()
     shapely.prepare([polygon, boundary])
-    real = np.flatnonzero(np.isfinite(points).all(-1))
     # Far from the boundary all samples lie on the side of their centre.
-    outside = np.repeat(~shapely.contains_xy(polygon, points)[:, None], len(offsets), axis=1)
-    near = real[shapely.dwithin(boundary, shapely.points(points[real]), radius)]
-    for part in np.array_split(near, len(near) // _POINTS_AT_ONCE + 1):
+    centre_outside = ~shapely.contains_xy(polygon, points)
+    outside = np.repeat(centre_outside[:, None], len(offsets), axis=1)
+    real = np.flatnonzero(np.isfinite(points).all(-1))
+    centres = shapely.points(points[real])
+    near = real[shapely.dwithin(boundary, centres, radius)]
+    n_parts = len(near) // _POINTS_AT_ONCE + 1
+    for part in np.array_split(near, n_parts):
         samples = points[part, None] + offsets
-        outside[part] = ~shapely.contains_xy(polygon, samples[..., 0], samples[..., 1])
+        x = samples[..., 0]
+        y = samples[..., 1]
+        outside[part] = ~shapely.contains_xy(polygon, x, y)
     return outside
 
 
@@ -233,12 +268,16 @@ def _overlap(words: int) -> Tensor:
     """Overlap masks for every offset of two discs, ``[G * G, words]``, for any R and region."""
     samples = _unit_disc_samples(64 * words).astype(np.float32)
     axis = np.linspace(-2, 2, _GRID, dtype=np.float32)
-    dx2, dy2 = np.square(samples.T[:, None] - axis[:, None])  # [G, S] each
+    offsets = samples.T[:, None] - axis[:, None]
+    dx2, dy2 = np.square(offsets)  # [G, S] each
     table = torch.stack([_packed(row + dy2 < 1) for row in dx2])
-    table[[0, -1]] = table[:, [0, -1]] = 0
+    border = [0, -1]
+    table[border] = 0
+    table[:, border] = 0
     return table.view(-1, words)
 
 
 def _packed(bits: np.ndarray) -> Tensor:
     """Booleans, 64 packed into one int64: ``[*, 64 * W]`` -> ``[*, W]``."""
-    return torch.from_numpy(np.packbits(bits, axis=-1, bitorder="little").view(np.int64))
+    packed = np.packbits(bits, axis=-1, bitorder="little")
+    return torch.from_numpy(packed.view(np.int64))

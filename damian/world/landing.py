@@ -34,7 +34,8 @@ def action_table(actions: ActionConfig, dtype: torch.dtype = torch.float32) -> T
 def displacement(distance: Tensor, heading: Tensor) -> Tensor:
     """Displacement east and north, [*, 2] metres, of flights by distance [*] metres and heading [*]
     rad."""
-    return distance.unsqueeze(-1) * torch.stack([heading.sin(), heading.cos()], -1)
+    direction = torch.stack([heading.sin(), heading.cos()], -1)
+    return distance.unsqueeze(-1) * direction
 
 
 class Ranking(NamedTuple):
@@ -66,22 +67,23 @@ class Candidates:
         [B, N]."""
         if self.config.kind == "discrete":
             return self.ranking, flat * self.config.n_actions + action
-        action = action.double().clamp(0, 1)
-        move = displacement(
-            action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi
-        ).flatten(0, 1)
-        own = flat.flatten()
-        base = (flat - flat % self.airspace.max_points).flatten()
-        exact_points = self.airspace.exact_points
-        target = gather_rows(exact_points.flatten(0, 1), own) + move
-        where = region.unsqueeze(-1).expand_as(flat).flatten(), target, own - base
-        edges = self.airspace.edges
-        cells = [*self.airspace.cells]
-        nearest = _nearest_inside(edges, cells, exact_points, *where, self.n_candidates)
-        distance = self.airspace.length(
-            own.unsqueeze(1).expand_as(nearest), nearest + base.unsqueeze(-1)
-        )
-        return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
+        length, turns = action.double().clamp(0, 1).unbind(-1)
+        move = displacement(length * self.max_distance, turns * 2 * math.pi)
+        airspace = self.airspace
+        origin = flat.flatten()
+        own = origin % airspace.max_points
+        base = origin - own
+        exact_points = airspace.exact_points
+        start = gather_rows(exact_points.flatten(0, 1), origin)
+        target = start + move.flatten(0, 1)
+        regions = region.unsqueeze(-1).expand_as(flat).flatten()
+        where = regions, target, own, self.n_candidates
+        nearest = _nearest_inside(airspace.edges, [*airspace.cells], exact_points, *where)
+        goal = nearest + base.unsqueeze(-1)
+        origins = origin.unsqueeze(1).expand_as(goal)
+        ranking = Ranking(nearest, airspace.length(origins, goal))
+        row = torch.arange(len(origin), device=origin.device)
+        return ranking, row.view_as(flat)
 
     def goals(self) -> Tensor:
         """The two nearest landing points to which each discrete action may lead, [C, R*L, A]
@@ -91,51 +93,52 @@ class Candidates:
 
     def _rank_all(self) -> None:
         """Tabulate the candidates of every (landing point, action): R*L*A lists."""
-        table = action_table(self.config, torch.float64)
-        shape = (*self.airspace.points.shape[:2], len(table))
-        self.distance = torch.zeros(
-            shape
-        )  # to the nearest candidate; infinite if the target lies outside
-        distance = torch.zeros(*shape, self.n_candidates)
-        self.ranking = Ranking(torch.zeros_like(distance, dtype=torch.int32), distance)
+        length, heading = action_table(self.config, torch.float64).unbind(-1)
+        move = displacement(length, heading)
+        n_actions = len(length)
         counts = self.airspace.n_points.tolist()
-        parts = [
-            (r, own) for r, n in enumerate(counts) for own in torch.arange(n).split(_POINTS_AT_ONCE)
-        ]
-        for region, own in parts:
-            ranked, within = self._rank_from(region, own, displacement(table[:, 0], table[:, 1]))
-            for table_of_all, part in zip(self.ranking, ranked, strict=True):
-                table_of_all[region, own] = part.to(table_of_all.dtype)
-            self.distance[region, own] = ranked.distance[..., 0].where(within, torch.inf)
-        base = torch.arange(len(counts)).view(-1, 1, 1) * self.airspace.max_points
-        self.nearest = (self.ranking.point[..., 0] + base).flatten(0, 1)  # flat ids, [R*L, A]
-        self.ranking = Ranking(*(each.flatten(0, 2) for each in self.ranking))
-        self.distance = self.distance.flatten(0, 1)
-        holds = table[:, 0] == 0
+        max_points = self.airspace.max_points
+        shape = (len(counts), max_points, n_actions)
+        # To the nearest candidate; infinite if the target lies outside.
+        shortest = torch.zeros(shape)
+        distance = torch.zeros(*shape, self.n_candidates)
+        point = torch.zeros_like(distance, dtype=torch.int32)
+        for region, count in enumerate(counts):
+            for own in torch.arange(count).split(_POINTS_AT_ONCE):
+                ranked, within = self._rank_from(region, own, move)
+                point[region, own] = ranked.point.int()
+                distance[region, own] = ranked.distance
+                nearest = ranked.distance[..., 0]
+                shortest[region, own] = nearest.where(within, torch.inf)
+        base = torch.arange(len(counts)) * max_points
+        nearest = point[..., 0] + base.view(-1, 1, 1)
+        self.nearest = nearest.flatten(0, 1)  # flat ids, [R*L, A]
+        self.ranking = Ranking(point.flatten(0, 2), distance.flatten(0, 2))
+        self.distance = shortest.flatten(0, 1)
+        holds = length == 0
         self.can_hold = bool(holds.any())
-        self.hold = torch.arange(len(table)) == int(
-            holds.int().argmax()
-        )  # the first one that holds, if any
+        first = int(holds.int().argmax())
+        self.hold = torch.arange(n_actions) == first  # the first one that holds, if any
 
     def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
         """Candidates [P, A, K] of moves from the points ``own`` [P], and whether these end inside
         [P, A]."""
-        polygon = self.airspace.regions[region].polygon
-        base = region * self.airspace.max_points
-        target = self.airspace.exact_points[region, own].unsqueeze(1) + move
+        airspace = self.airspace
+        exact_points = airspace.exact_points
+        target = exact_points[region, own].unsqueeze(1) + move
+        polygon = airspace.regions[region].polygon
         shapely.prepare(polygon)
-        within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
-        where = (
-            torch.full((within.numel(),), region),
-            target.flatten(0, 1),
-            own.repeat_interleave(len(move)),
-        )
-        cells = self.airspace.cells
-        exact_points = self.airspace.exact_points
-        nearest = _nearest_or_own(cells, exact_points, *where, within.flatten(), self.n_candidates)
+        east, north = target.unbind(-1)
+        within = torch.as_tensor(shapely.contains_xy(polygon, east.numpy(), north.numpy()))
+        regions = torch.full((within.numel(),), region)
+        each = own.repeat_interleave(len(move))
+        where = regions, target.flatten(0, 1), each, within.flatten()
+        nearest = _nearest_or_own(airspace.cells, exact_points, *where, self.n_candidates)
         nearest = nearest.view(*within.shape, -1)
-        origin = (own + base).view(-1, 1, 1).expand_as(nearest)
-        return Ranking(nearest, self.airspace.length(origin, nearest + base)), within
+        base = region * airspace.max_points
+        origin = (own + base).view(-1, 1, 1)
+        distance = airspace.length(origin.expand_as(nearest), nearest + base)
+        return Ranking(nearest, distance), within
 
 
 @torch.library.custom_op("damian::nearest_inside", mutates_args=())
@@ -151,8 +154,8 @@ def _nearest_inside(
     """Landing points nearest to targets, [M, n]; ``own`` [M] instead of missing ones or outside."""
     at_once = max(_EDGES_AT_ONCE // edges.shape[1], 1)
     parts = zip(region.split(at_once), target.split(at_once), strict=True)
-    within = torch.cat([inside(edges.index_select(0, r), t) for r, t in parts])
-    return _nearest_or_own(Cells(*cells), points, region, target, own, within, n)
+    within = [inside(edges.index_select(0, r), t) for r, t in parts]
+    return _nearest_or_own(Cells(*cells), points, region, target, own, torch.cat(within), n)
 
 
 @_nearest_inside.register_fake
@@ -171,14 +174,14 @@ def _nearest_or_own(
 ) -> Tensor:
     """As ``_nearest_inside``, where ``within`` [M] says which targets lie inside."""
     nearest = own.unsqueeze(-1).repeat(1, n)
-    if not devices.data_dependent(
-        own.device
-    ):  # the number of targets inside is not known without waiting
-        found = nearest_points(cells, points, region, target, n)
-        return torch.where(within.unsqueeze(-1) & (found >= 0), found, nearest)
-    found = nearest_points(cells, points, region[within], target[within], n)
-    nearest[within] = torch.where(found < 0, nearest[within], found)
-    return nearest
+    # Elsewhere, the number of targets inside is not known without waiting.
+    if devices.data_dependent(own.device):
+        found = nearest_points(cells, points, region[within], target[within], n)
+        nearest[within] = torch.where(found < 0, nearest[within], found)
+        return nearest
+    found = nearest_points(cells, points, region, target, n)
+    replaces = within.unsqueeze(-1) & (found >= 0)
+    return torch.where(replaces, found, nearest)
 
 
 def assign_landing_points(
@@ -200,15 +203,17 @@ def assign_landing_points(
 def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
     """Each UAV takes its first free candidate, one after the other in all worlds."""
     reached = gather_rows(ranking.distance, row) <= reach.unsqueeze(-1)
-    wishes = torch.where(reached, gather_rows(ranking.point, row).long(), standing.unsqueeze(-1))
+    points = gather_rows(ranking.point, row).long()
+    wishes = torch.where(reached, points, standing.unsqueeze(-1))
     taken = standing.t().unsqueeze(-1)
     goals = []
     for own, wish in zip(standing.split(1, 1), wishes.unbind(1), strict=True):
-        free = (wish == own) | ~(wish == taken).any(0)
-        goals.append(
-            wish.gather(-1, free.byte().argmax(-1, keepdim=True))
-        )  # of several, the first one
-        taken = torch.cat([taken, goals[-1].unsqueeze(0)])
+        clash = (wish == taken).any(0)
+        free = (wish == own) | ~clash
+        first = free.byte().argmax(-1, keepdim=True)
+        goal = wish.gather(-1, first)
+        goals.append(goal)
+        taken = torch.cat([taken, goal.unsqueeze(0)])
     return torch.cat(goals, 1)
 
 
@@ -225,7 +230,8 @@ def _assign_in_rounds(
     distances = distance.flatten()
     first = row * point.shape[1]
     parts = zip(*(each.split(at_once) for each in (first, standing, reach)), strict=True)
-    return torch.cat([_rounds(points, distances, f, s, r, n_points) for f, s, r in parts])
+    goals = [_rounds(points, distances, f, s, r, n_points) for f, s, r in parts]
+    return torch.cat(goals)
 
 
 @_assign_in_rounds.register_fake
@@ -243,11 +249,11 @@ def _rounds(
     reach = reach.flatten()
     # A world's first point, and the UAV that each point keeps, as a flat number; those of a world
     # count up in index order.
-    base = (torch.arange(len(first), device=first.device) * n_points).repeat_interleave(
-        first.shape[1]
-    )
+    n_worlds, n_uavs = first.shape
+    world = torch.arange(n_worlds, device=first.device)
+    base = (world * n_points).repeat_interleave(n_uavs)
     nobody = first.numel()
-    keeper = torch.full((len(first) * n_points,), nobody, device=first.device)
+    keeper = torch.full((n_worlds * n_points,), nobody, device=first.device)
     keeper.index_fill_(0, base + stands, -1)
     booked = stands.clone()
     asking = torch.arange(nobody, device=first.device)
@@ -255,10 +261,11 @@ def _rounds(
         candidate = asked.index_select(0, asking)
         own = stands.index_select(0, asking)
         point = points.index_select(0, candidate).long()
-        flies = (distances.index_select(0, candidate) <= reach.index_select(0, asking)) & (
-            point != own
-        )
-        booked.index_copy_(0, asking, torch.where(flies, point, own))
+        distance = distances.index_select(0, candidate)
+        in_reach = distance <= reach.index_select(0, asking)
+        flies = in_reach & (point != own)
+        goal = torch.where(flies, point, own)
+        booked.index_copy_(0, asking, goal)
         asking = asking[flies]
         point = point[flies]
         wanted = base.index_select(0, asking) + point
@@ -266,6 +273,7 @@ def _rounds(
         keeper.scatter_reduce_(0, wanted, asking, "amin")
         kept = keeper.index_select(0, wanted) == asking
         displaced = before[kept]
-        asking = torch.cat([asking[~kept], displaced[displaced < nobody]])
+        displaced = displaced[displaced < nobody]
+        asking = torch.cat([asking[~kept], displaced])
         asked.index_add_(0, asking, torch.ones_like(asking))
     return booked.view_as(standing)

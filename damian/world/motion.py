@@ -19,16 +19,18 @@ _PEAK_ACCELERATION = {3: 6.0, 5: 10 * math.sqrt(3) / 3, 7: 84 * math.sqrt(5) / 2
 def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> list[float]:
     """One flight level per UAV [m], from the lowest upward; if ``shared``, UAVs may have the same
     one."""
-    room = (config.max_level - config.min_level) / config.level_separation
+    lowest = config.min_level
+    apart = config.level_separation
+    room = (config.max_level - lowest) / apart
     n_fit = math.floor(room + _TINY) + 1
-    checks.require(
-        shared or n_agents <= n_fit,
-        "motion.max_level",
-        f"{config.max_level:g} m",
-        f"leaves room for {n_fit} flight levels from min_level={config.min_level:g} m, "
-        f"level_separation={config.level_separation:g} m apart, but there are {n_agents} UAVs",
+    fits = shared or n_agents <= n_fit
+    shown = f"{config.max_level:g} m"
+    problem = (
+        f"leaves room for {n_fit} flight levels from min_level={lowest:g} m, "
+        f"level_separation={apart:g} m apart, but there are {n_agents} UAVs"
     )
-    return [config.min_level + i % n_fit * config.level_separation for i in range(n_agents)]
+    checks.require(fits, "motion.max_level", shown, problem)
+    return [lowest + i % n_fit * apart for i in range(n_agents)]
 
 
 def time_law(tau: Tensor, degree: int) -> Tensor:
@@ -41,8 +43,10 @@ def time_law(tau: Tensor, degree: int) -> Tensor:
     if degree == 3:
         return t.square() * (3 - 2 * t)
     if degree == 5:
-        return t.pow(3) * ((6 * t - 15) * t + 10)
-    return t.pow(4) * (((70 - 20 * t) * t - 84) * t + 35)
+        rest = (6 * t - 15) * t + 10
+        return t.pow(3) * rest
+    rest = ((70 - 20 * t) * t - 84) * t + 35
+    return t.pow(4) * rest
 
 
 def minimum_time(length: Tensor, degree: int, max_speed: Value, max_acceleration: Value) -> Tensor:
@@ -59,14 +63,22 @@ def place_on(way: Tensor, share: Tensor) -> Tensor:
     """Places [*, 2] m after a share [*] of the ways over places [*, W, 2] m."""
     if way.shape[-2] == 2:
         return torch.lerp(way[..., 0, :], way[..., 1, :], share.unsqueeze(-1))
+    legs, length = _legs(way)
+    flown = share * length.sum(-1)
+    begins = length.cumsum(-1) - length
+    since = flown.unsqueeze(-1) - begins  # since each leg began [m]
+    done = (since / length.clamp_min(_TINY)).clamp(0, 1)
+    done = done * (length > 0)
+    displaced = (done.unsqueeze(-1) * legs).sum(-2)
+    place = way[..., 0, :] + displaced
+    flies = share.unsqueeze(-1) < 1
+    return torch.where(flies, place, way[..., -1, :])  # there, to the bit
+
+
+def _legs(way: Tensor) -> tuple[Tensor, Tensor]:
+    """Legs of ways [*, W, 2] m, [*, W - 1, 2], and their lengths, [*, W - 1]."""
     legs = way.diff(dim=-2)
-    length = torch.linalg.vector_norm(legs, dim=-1)
-    since = (share * length.sum(-1)).unsqueeze(-1) - (
-        length.cumsum(-1) - length
-    )  # since each leg began [m]
-    done = (since / length.clamp_min(_TINY)).clamp(0, 1) * (length > 0)
-    place = way[..., 0, :] + (done.unsqueeze(-1) * legs).sum(-2)
-    return torch.where(share.unsqueeze(-1) < 1, place, way[..., -1, :])  # there, to the bit
+    return legs, torch.linalg.vector_norm(legs, dim=-1)
 
 
 def air_length(way: Tensor, wind: Tensor, airspeed: Tensor, least: float) -> tuple[Tensor, Tensor]:
@@ -78,14 +90,17 @@ def air_length(way: Tensor, wind: Tensor, airspeed: Tensor, least: float) -> tup
     [*, 2] m/s: the way in which it blows, east and north; ground speeds below ``least`` count as
     this.
     """
-    legs = way.diff(dim=-2)
-    length = torch.linalg.vector_norm(legs, dim=-1)  # [*, W - 1]
-    along = (legs * wind.unsqueeze(-2)).sum(-1) / length.clamp_min(_TINY)
-    cross = (wind.square().sum(-1, keepdim=True) - along.square()).clamp_min(0)
+    legs, length = _legs(way)
+    scaled = (legs * wind.unsqueeze(-2)).sum(-1)
+    along = scaled / length.clamp_min(_TINY)
+    wind_squared = wind.square().sum(-1, keepdim=True)
+    cross_squared = (wind_squared - along.square()).clamp_min(0)
     speed = airspeed.unsqueeze(-1)
-    ground = (speed.square() - cross).clamp_min(0).sqrt() + along
+    heading_speed = (speed.square() - cross_squared).clamp_min(0).sqrt()
+    ground = heading_speed + along
     slowest = torch.where(length > 0, ground, torch.inf).amin(-1)
-    return (length * speed / ground.clamp_min(least)).sum(-1), slowest
+    air = length * speed / ground.clamp_min(least)
+    return air.sum(-1), slowest
 
 
 def poses(
@@ -107,4 +122,6 @@ def poses(
     cruising = (elapsed - vertical) / cruise.clamp_min(_TINY)
     shares = torch.stack([climbing, cruising]).to(way.dtype)
     climbed, crossed = time_law(shares, degree).unbind(0)
-    return torch.cat([place_on(way, crossed), (level * climbed).unsqueeze(-1)], dim=-1), crossed
+    place = place_on(way, crossed)
+    height = (level * climbed).unsqueeze(-1)
+    return torch.cat([place, height], dim=-1), crossed

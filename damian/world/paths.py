@@ -45,8 +45,10 @@ class Detours(NamedTuple):
         """The detour from each landing point to another, flat ids [*], or P for a straight way,
         [*]."""
         wanted = origin * self.n_points + goal
-        found = torch.searchsorted(self.pair, wanted).clamp(max=len(self.pair) - 1)
-        return torch.where(self.pair.take(found) == wanted, found, len(self.pair))
+        n_pairs = len(self.pair)
+        found = torch.searchsorted(self.pair, wanted).clamp(max=n_pairs - 1)
+        listed = self.pair.take(found) == wanted
+        return torch.where(listed, found, n_pairs)
 
     def way(self, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
         """Places on the ways between landing points, from one to the other, [*, C + 2, 2]
@@ -57,16 +59,20 @@ class Detours(NamedTuple):
         first = gather_rows(points, origin).unsqueeze(-2)
         last = gather_rows(points, goal).unsqueeze(-2)
         corners = gather_rows(self.corners, row)
-        return torch.cat([first, torch.where(corners.isnan(), last, corners), last], -2)
+        between = torch.where(corners.isnan(), last, corners)
+        return torch.cat([first, between, last], -2)
 
     def length(self, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
         """Lengths of the ways between landing points [m], [*]; infinite where none leads to the
         goal."""
         row = self.row(origin, goal)
         way = self._along(row, origin, goal, points)
-        straight = torch.linalg.vector_norm(way[..., -1, :] - way[..., 0, :], dim=-1)
-        leads = gather_rows(self.reached, row) & (straight <= self.longest)
-        return torch.linalg.vector_norm(way.diff(dim=-2), dim=-1).sum(-1).where(leads, torch.inf)
+        legs = torch.linalg.vector_norm(way.diff(dim=-2), dim=-1)
+        between = way[..., -1, :] - way[..., 0, :]
+        straight = torch.linalg.vector_norm(between, dim=-1)
+        near = straight <= self.longest
+        leads = near & gather_rows(self.reached, row)
+        return legs.sum(-1).where(leads, torch.inf)
 
 
 def detours(
@@ -77,34 +83,45 @@ def detours(
     Only pairs are looked at that are at most ``longest`` [m] apart.
     """
     most = max(map(len, points))
-    found = []
+    n_points = most * len(points)
+    pairs = []
+    corners = []
+    reached = []
     for region, (polygon, places) in enumerate(zip(polygons, points, strict=True)):
-        if shapely.convex_hull(polygon).area - polygon.area <= _CONVEX * polygon.area:
+        lacking = shapely.convex_hull(polygon).area - polygon.area
+        if lacking <= _CONVEX * polygon.area:
             continue
         near = KDTree(places).query_pairs(longest, output_type="ndarray")
         shapely.prepare(polygon)
-        near = near[~_visible(polygon, places[near[:, 0]], places[near[:, 1]])]
+        one, other = near.T
+        near = near[~_visible(polygon, places[one], places[other])]
         if len(near):
-            blocked = np.concatenate([near, near[:, ::-1]])
-            blocked = blocked[np.lexsort(blocked.T[::-1])]
-            found.append((blocked + region * most, *_shortest(polygon, places, blocked)))
-    if not found:
+            back = near[:, ::-1]
+            blocked = np.concatenate([near, back])
+            one, other = blocked.T
+            blocked = blocked[np.lexsort((other, one))]
+            bends, leads = _shortest(polygon, places, blocked)
+            origin, goal = (blocked + region * most).T
+            pairs.append(origin * n_points + goal)
+            corners.append(bends)
+            reached.append(leads)
+    if not pairs:
         return None
-    widest = max(corners.shape[1] for _, corners, _ in found)
-    n_points = most * len(points)
-    padded = [
-        np.pad(each, ((0, 0), (0, widest - each.shape[1]), (0, 0)), constant_values=np.nan)
-        for _, each, _ in found
-    ]
-    pairs, reached = (np.concatenate([each[i] for each in found]) for i in (0, 2))
+    widest = max(each.shape[1] for each in corners)
+    # The last row is that of a straight way.
+    rows = sum(map(len, corners)) + 1
+    padded = np.full((rows, widest, 2), np.nan)
+    start = 0
+    for each in corners:
+        end = start + len(each)
+        padded[start:end, : each.shape[1]] = each
+        start = end
     return Detours(
-        torch.as_tensor(pairs[:, 0] * n_points + pairs[:, 1]),
-        torch.as_tensor(
-            np.concatenate([*padded, np.full((1, widest, 2), np.nan)]), dtype=torch.float32
-        ),
-        torch.as_tensor(np.append(reached, True)),
-        n_points,
-        longest,
+        pair=torch.as_tensor(np.concatenate(pairs)),
+        corners=torch.as_tensor(padded, dtype=torch.float32),
+        reached=torch.as_tensor(np.concatenate([*reached, [True]])),
+        n_points=n_points,
+        longest=longest,
     )
 
 
@@ -114,48 +131,64 @@ def _shortest(
     """Corners [P, C, 2] of the shortest paths between pairs [P, 2], NaN after the last; which
     exist."""
     corners = _dents(polygon)
+    n_corners = len(corners)
     ends, index = np.unique(pairs, return_inverse=True)
-    origin, goal = index.reshape(pairs.shape).T + len(corners)
+    origin, goal = index.reshape(pairs.shape).T + n_corners
     places = np.concatenate([corners, points[ends]])
+    n_places = len(places)
     # Straight ways from each corner to each place; others than corners are never passed.
-    straight = np.full((len(corners), len(places)), np.inf)
-    one, other = np.divmod(np.arange(straight.size), len(places))
+    straight = np.full((n_corners, n_places), np.inf)
+    one, other = np.divmod(np.arange(straight.size), n_places)
     seen = (one != other) & _visible(polygon, places[one], places[other])
-    one, other = (
-        each[seen].astype(np.int32) for each in (one, other)
-    )  # scipy 1.14 takes no others
-    straight[one, other] = np.linalg.norm(places[one] - places[other], axis=1)
-    graph = csr_array((straight[one, other], (one, other)), shape=(len(places),) * 2)
-    along, before = dijkstra(graph, indices=np.arange(len(corners)), return_predecessors=True)
+    one = one[seen].astype(np.int32)  # scipy 1.14 takes no others
+    other = other[seen].astype(np.int32)
+    ways = np.linalg.norm(places[one] - places[other], axis=1)
+    straight[one, other] = ways
+    graph = csr_array((ways, (one, other)), shape=(n_places, n_places))
+    along, before = dijkstra(graph, indices=np.arange(n_corners), return_predecessors=True)
     first = np.zeros(len(pairs), int)
     length = np.full(len(pairs), np.inf)
-    for corner in range(len(corners)):
+    for corner in range(n_corners):
         by = straight[corner, origin] + along[corner, goal]
         first = np.where(by < length, corner, first)
         length = np.minimum(by, length)
+    reached = np.isfinite(length)
     # Each path is followed from its goal back to its first corner.
     path = []
-    here = np.where(np.isfinite(length), goal, first)
-    while ((here := np.where(here == first, first, before[first, here])) != first).any():
-        path.append(np.where(here == first, -1, here))
-    passed = np.stack([np.where(np.isfinite(length), first, -1), *path[::-1]], 1)
-    passed = np.take_along_axis(passed, np.argsort(passed < 0, axis=1, kind="stable"), 1)
-    return np.where(passed[..., None] < 0, np.nan, places[passed]), np.isfinite(length)
+    here = np.where(reached, goal, first)
+    while True:
+        here = np.where(here == first, first, before[first, here])
+        arrived = here == first
+        if arrived.all():
+            break
+        path.append(np.where(arrived, -1, here))
+    path.append(np.where(reached, first, -1))
+    passed = np.stack(path[::-1], 1)
+    order = np.argsort(passed < 0, axis=1, kind="stable")
+    passed = np.take_along_axis(passed, order, 1)
+    none = passed[..., None] < 0
+    return np.where(none, np.nan, places[passed]), reached
 
 
 def _visible(polygon: shapely.Geometry, origin: Floats, goal: Floats) -> NDArray[np.bool_]:
     """Whether the straight ways between places [Q, 2] m stay in the polygon, [Q]."""
-    return np.asarray(shapely.covers(polygon, shapely.linestrings(np.stack([origin, goal], 1))))
+    ends = np.stack([origin, goal], 1)
+    ways = shapely.linestrings(ends)
+    return np.asarray(shapely.covers(polygon, ways))
 
 
 def _dents(polygon: shapely.Geometry) -> Floats:
     """The corners about which a shortest path may bend, those that point into the polygon, [V, 2]
     metres."""
     found = []
-    for ring in shapely.get_rings(
-        shapely.get_parts(shapely.orient_polygons(polygon))
-    ):  # inside on the left
+    oriented = shapely.orient_polygons(polygon)  # inside on the left
+    parts = shapely.get_parts(oriented)
+    for ring in shapely.get_rings(parts):
         corner = shapely.get_coordinates(ring)[:-1]
-        (x, y), (u, v) = (corner - np.roll(corner, 1, 0)).T, (np.roll(corner, -1, 0) - corner).T
-        found.append(corner[x * v - y * u < 0])
+        before = np.roll(corner, 1, 0)
+        after = np.roll(corner, -1, 0)
+        x, y = (corner - before).T
+        u, v = (after - corner).T
+        turn = x * v - y * u
+        found.append(corner[turn < 0])
     return np.concatenate(found)

@@ -39,13 +39,16 @@ def poisson_arrivals(
     regions: Sequence[Region], slots: int, mean: float, rng: np.random.Generator
 ) -> Arrivals:
     """Poisson numbers of requests, ``mean`` in a step, for worlds with M ``slots``."""
-    places = np.stack([sample_interior(region.polygon, _PLACES, rng) for region in regions])
+    places = [sample_interior(region.polygon, _PLACES, rng) for region in regions]
     # That at least k appear has the probability P(k, mean), the regularised lower incomplete gamma
     # function.
     at_least = torch.arange(1, slots + 1, dtype=torch.float64)
-    chance = torch.special.gammainc(at_least, torch.full_like(at_least, mean))
+    means = torch.full_like(at_least, mean)
+    chance = torch.special.gammainc(at_least, means)
     return Arrivals(
-        chance.float(), torch.as_tensor(places, dtype=torch.float32), torch.arange(slots)
+        chance=chance.float(),
+        places=torch.as_tensor(np.stack(places), dtype=torch.float32),
+        slots=torch.arange(slots),
     )
 
 
@@ -53,7 +56,8 @@ def is_open(requests: Tensor, served: Tensor) -> Tensor:
     """Which requests [*, M, 3] no UAV has served, as far as its memory [*, N, M] tells, [*, M]
     bool."""
     time = requests[..., 2]
-    return (time >= 0) & (time > served.amax(-2))
+    last_served = served.amax(-2)
+    return (time >= 0) & (time > last_served)
 
 
 def appear(
@@ -67,15 +71,21 @@ def appear(
     in seconds.
     """
     seed, episode, step, region = (each.unsqueeze(-1) for each in counters)
-    share = counter_rng.uniform(seed, torch.full_like(step, _APPEARS), episode, step)
-    number = ((share < arrivals.chance) & (step > 0)).sum(-1, keepdim=True)
-    drawn = counter_rng.bits(seed, torch.full_like(step, _PLACE), episode, step, arrivals.slots)
+    appears = torch.full_like(step, _APPEARS)
+    share = counter_rng.uniform(seed, appears, episode, step)
+    at_least = (share < arrivals.chance) & (step > 0)
+    number = at_least.sum(-1, keepdim=True)
+    where = torch.full_like(step, _PLACE)
+    drawn = counter_rng.bits(seed, where, episode, step, arrivals.slots)
     n_places = arrivals.places.shape[1]
-    place = gather_rows(arrivals.places.flatten(0, 1), region * n_places + drawn % n_places)
-    new = torch.cat([place, now[:, None, None].expand_as(place[..., :1])], -1)
-    age = requests[..., 2].masked_fill(is_open(requests, served), torch.inf)
-    rank = age.argsort(dim=-1, stable=True).argsort(-1)
-    taken = (rank < number) & age.isfinite()
+    row = region * n_places + drawn % n_places
+    place = gather_rows(arrivals.places.flatten(0, 1), row)
+    time = now[:, None, None].expand_as(place[..., :1])
+    new = torch.cat([place, time], -1)
+    waits = is_open(requests, served)
+    appeared = requests[..., 2].masked_fill(waits, torch.inf)
+    rank = appeared.argsort(dim=-1, stable=True).argsort(-1)
+    taken = (rank < number) & ~waits
     return torch.where(taken.unsqueeze(-1), new, requests)
 
 
@@ -89,9 +99,13 @@ def serve(
     of its ``position`` [B, N, 2]; of several UAVs that would serve the same one, the first does.
     """
     time = requests[..., 2].unsqueeze(-2)  # [B, 1, M]
-    near = (position.unsqueeze(-2) - requests[..., None, :, :2]).square().sum(-1) <= radius**2
-    wanted = near & lands.unsqueeze(-1) & is_open(requests, served).unsqueeze(-2)
+    ways = position.unsqueeze(-2) - requests[..., None, :, :2]
+    near = ways.square().sum(-1) <= radius**2
+    waits = is_open(requests, served).unsqueeze(-2)
+    wanted = near & lands.unsqueeze(-1) & waits
     oldest = time.where(wanted, torch.inf).argmin(-1, keepdim=True)
-    chosen = (torch.arange(time.shape[-1], device=time.device) == oldest) & wanted  # [B, N, M]
-    serves = chosen & (chosen.int().cumsum(-2) == 1)
+    slot = torch.arange(time.shape[-1], device=time.device)
+    chosen = (slot == oldest) & wanted  # [B, N, M]
+    earliest = chosen.int().cumsum(-2) == 1
+    serves = chosen & earliest
     return torch.where(serves, time, served), serves.any(-1)

@@ -37,37 +37,39 @@ class Simulation:
         self.dt = dt
         self.sensors = sensors_of(config.sensors)
         self.sources = config.source.all
-        self.reach = torch.tensor([footprint_radius(source) for source in self.sources])
+        radii = [footprint_radius(source) for source in self.sources]
+        self.reach = torch.tensor(radii)
         """Largest distance at which UAVs detect each source [m], [K]."""
         self.radius = footprint_radius(config.source)
         """Radius of a footprint [m]."""
         n_readings = sum(each.width for each in self.sensors.values())
         n_sources = len(self.sources)
+        n_requests = config.requests.slots
         n_truths = n_sources if config.tells_truth else 0
-        self.widths = Widths(n_sources, n_readings, config.requests.slots, n_truths)
+        self.widths = Widths(n_sources, n_readings, n_requests, n_truths)
         regions = regions_of(config.region, rng)
         longest = max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         region, start, self.walks = _draw_initial_conditions(config, self.airspace, rng)
-        self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(
-            config, self.airspace, dt
-        )
+        model = MOTION_MODELS.get(config.motion.kind, "motion.kind")
+        self.vehicles = model(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
-        if self.widths.requests:
+        if n_requests:
             mean = config.requests.rate * dt / 60
-            self.arrivals = poisson_arrivals(regions, self.widths.requests, mean, rng)
-        self.misses, self.false_alarms = (
-            torch.tensor([getattr(source, name) for source in self.sources])
-            for name in ("miss", "false_alarm")
-        )
-        """Probabilities of the reports about each source, [K]."""
-        self.pairs = torch.arange(config.agents * len(self.sources)).view(config.agents, -1)
+            self.arrivals = poisson_arrivals(regions, n_requests, mean, rng)
+        self.misses = torch.tensor([source.miss for source in self.sources])
+        """Probability that a UAV in reach of each source does not report it, [K]."""
+        self.false_alarms = torch.tensor([source.false_alarm for source in self.sources])
+        """Probability that a UAV out of its reach does, [K]."""
+        pairs = torch.arange(config.agents * n_sources)
+        self.pairs = pairs.view(config.agents, -1)
         """Numbers of the pairs of a UAV and a source, [N, K]; made within a step, they would not
         compile."""
         self.unsure = any(each.miss or each.false_alarm for each in self.sources)
         """Whether reports about a source may be wrong."""
-        self.draws = bool(self.sensors or self.vehicles.values.choices or self.unsure)
+        choices = self.vehicles.values.choices
+        self.draws = bool(self.sensors or choices or self.unsure)
         """Whether first messages differ from episode to episode that begins alike."""
         shortest = self._shortest_flights()  # refuses actions that lead nowhere
         self.shortest_flight = shortest if config.battery.enabled else None
@@ -94,23 +96,28 @@ class Simulation:
     def reset(self, worlds: PackedState, mask: Tensor) -> PackedState:
         """Begin a new episode in the worlds of the mask [B]; the others stay as they are."""
         chosen = mask.nonzero().squeeze(-1)  # usually few worlds
-        fresh = self.next_episode(tree_map(lambda rows: rows.index_select(0, chosen), worlds))
+        ended = tree_map(lambda rows: rows.index_select(0, chosen), worlds)
+        fresh = self.next_episode(ended)
         return tree_map(lambda old, new: old.index_copy(0, chosen, new), worlds, fresh)
 
     def next_episode(self, worlds: PackedState) -> PackedState:
         """Begin a new episode in all of the given worlds."""
         seed = worlds.integers[:, SEED]
         episode = worlds.integers[:, EPISODE] + 1
-        condition = counter_rng.bits(seed, episode) % len(self.initial.initial_condition)
+        n_conditions = len(self.initial.initial_condition)
+        condition = counter_rng.bits(seed, episode) % n_conditions
         kept = torch.stack([seed, episode, condition], 1)  # the first three columns
         condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
-        fresh = fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
+        others = fresh.integers[:, kept.shape[1] :]
+        integers = torch.cat([kept, others], 1)
+        fresh = fresh._replace(integers=integers)
         if not self.draws:
             return fresh
         state = self.layout.unpack(fresh)  # the first messages tell what is drawn for this episode
         drawn = self.vehicles.values.draw(state.seed, state.episode)
-        return self.layout.pack(self._first_messages(state._replace(drawn=drawn)))
+        state = self._first_messages(state._replace(drawn=drawn))
+        return self.layout.pack(state)
 
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
         """Simulate one step; actions of UAVs that are not ready change nothing.
@@ -120,17 +127,19 @@ class Simulation:
         """
         state = self.decide(state, action, action_valid)
         state = self.vehicles.move(state)
-        return self._sense(state._replace(steps=state.steps + 1), action_valid)
+        state = state._replace(steps=state.steps + 1)
+        return self._sense(state, action_valid)
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
         reach = self.vehicles.reach(state).unsqueeze(-1)
         valid = self._action_distances(state) <= reach
         if not self.candidates.can_hold:
-            valid = valid | ~valid.any(-1, keepdim=True)
-        return (
-            valid if self.vehicles.instant else torch.where(reach >= 0, valid, self.candidates.hold)
-        )
+            stuck = ~valid.any(-1, keepdim=True)
+            valid = valid | stuck
+        if self.vehicles.instant:
+            return valid
+        return torch.where(reach >= 0, valid, self.candidates.hold)
 
     def _action_distances(self, state: State) -> Tensor:
         """Lengths of the discrete actions for the batteries [m], infinite outside the region,
@@ -139,17 +148,21 @@ class Simulation:
         if not self.vehicles.is_windy:
             return distance
         nearest = gather_rows(self.candidates.nearest, state.goal)
-        in_wind = self.vehicles.distance(
-            state, state.goal.unsqueeze(-1).expand_as(nearest), nearest
-        )
+        in_wind = self._distance_to(state, nearest)
         return in_wind.where(distance.isfinite(), torch.inf)
+
+    def _distance_to(self, state: State, goals: Tensor) -> Tensor:
+        """Lengths for the batteries of flights to these flat ids [m], [B, N, K]."""
+        origin = state.goal.unsqueeze(-1).expand_as(goals)
+        return self.vehicles.distance(state, origin, goals)
 
     # The stages of one step, in order.
 
     def decide(self, state: State, action: Tensor, action_valid: Tensor | None) -> State:
         """Assign landing points to the UAVs that may choose, and start their flights, as in
         ``step``."""
-        base = state.region.unsqueeze(-1) * self.airspace.max_points
+        n_points = self.airspace.max_points
+        base = state.region.unsqueeze(-1) * n_points
         standing = state.goal - base
         ranking, row = self.candidates.rank(state.goal, state.region, action)
         if self.vehicles.is_windy:
@@ -158,24 +171,26 @@ class Simulation:
         if action_valid is not None:
             reach = torch.where(action_valid, reach, -1.0)
         ready = reach >= 0
-        goal = assign_landing_points(ranking, row, standing, reach, self.airspace.max_points) + base
+        assigned = assign_landing_points(ranking, row, standing, reach, n_points)
+        goal = assigned + base
         departs = goal != state.goal
-        east, north = (
-            gather_rows(self.points, goal) - gather_rows(self.points, state.goal)
-        ).unbind(-1)
+        way = gather_rows(self.points, goal) - gather_rows(self.points, state.goal)
+        east, north = way.unbind(-1)
         heading = torch.remainder(torch.atan2(east, north), 2 * math.pi)
-        state = state._replace(
-            track=torch.where(departs, heading, state.track), motions=state.motions + ready
-        )
+        track = torch.where(departs, heading, state.track)
+        motions = state.motions + ready
+        state = state._replace(track=track, motions=motions)
         return self.vehicles.take_off(state, goal, ready, departs)
 
     def _in_wind(self, state: State, ranking: Ranking, row: Tensor) -> tuple[Ranking, Tensor]:
         """The ranking of each UAV with distances as the wind makes them."""
         point = gather_rows(ranking.point, row).long()  # [B, N, K]
-        flat = point + (state.region * self.airspace.max_points).view(-1, 1, 1)
-        distance = self.vehicles.distance(state, state.goal.unsqueeze(-1).expand_as(flat), flat)
-        own = torch.arange(row.numel(), device=row.device).view_as(row)
-        return Ranking(point.flatten(0, 1), distance.flatten(0, 1)), own
+        base = state.region * self.airspace.max_points
+        flat = point + base.view(-1, 1, 1)
+        distance = self._distance_to(state, flat)
+        ranking = Ranking(point.flatten(0, 1), distance.flatten(0, 1))
+        own = torch.arange(row.numel(), device=row.device)
+        return ranking, own.view_as(row)
 
     def _sense(self, state: State, action_valid: Tensor | None = None) -> State:
         """Move the source, let UAVs on the ground detect it, and send messages."""
@@ -183,14 +198,23 @@ class Simulation:
         place, emits, over = self.source_now(state)
         state = state._replace(source=place, source_over=over.all(-1))
         on_ground = self.vehicles.on_ground(state)
-        position = state.position[..., :2]
         in_reach = self.in_reach(state, emits, on_ground)
         detected = self._reported(state, in_reach, on_ground.unsqueeze(-1))
-        counts = (in_reach if self.widths.truths else detected).any(-1)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
-        trail, landed = self._stops(state, times, on_ground, action_valid)
-        state, served, serves = self._serve(state, now, on_ground, action_valid)
-        true_time, true_position = self._true_detections(state, in_reach, times)
+        stops = self.vehicles.new_stop(state, on_ground, action_valid)
+        trail, landed = self._stops(state, times, stops)
+        lands = on_ground if stops is None else stops
+        state, served, serves = self._serve(state, now, lands)
+        sent = state.sent
+        position = state.position[..., :2]
+        known = sent.detected_time, sent.detected_position
+        detected_time, detected_position = _last_found(detected, times, position, known)
+        found = detected
+        true = sent.true_time, sent.true_position
+        if self.widths.truths:
+            found = in_reach
+            true = _last_found(in_reach, times, position, true)
+        motions = torch.where(found.any(-1), 0, state.motions)
         messages = Messages(
             time=times,
             position=position,
@@ -200,12 +224,10 @@ class Simulation:
             spotted=detected.any(-1),
             empty=self._empty(state, on_ground),
             motions=state.motions,
-            detected_time=torch.where(detected, times.unsqueeze(-1), state.sent.detected_time),
-            detected_position=torch.where(
-                detected.unsqueeze(-1), position.unsqueeze(-2), state.sent.detected_position
-            ),
-            true_time=true_time,
-            true_position=true_position,
+            detected_time=detected_time,
+            detected_position=detected_position,
+            true_time=true[0],
+            true_position=true[1],
             requests=self._heard(state, on_ground),
             served=served,
             serves=serves,
@@ -216,67 +238,65 @@ class Simulation:
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
         if self.config.requests.known_at_once:
             sent = sent._replace(requests=messages.requests)
-        return state._replace(
-            message_sent=sends, motions=torch.where(counts, 0, state.motions), sent=sent
-        )
+        return state._replace(message_sent=sends, motions=motions, sent=sent)
 
     def radii(self, state: State) -> Tensor | None:
         """Radius of the footprints of each world's UAVs [m], [B, 1], if it is drawn."""
         level = self.vehicles.values.get("source.level_db", state.drawn)
-        return drawn_radius(level, self.config.source) if isinstance(level, Tensor) else None
+        if isinstance(level, Tensor):
+            return drawn_radius(level, self.config.source)
+        return None
 
     def in_reach(self, state: State, emits: Tensor, on_ground: Tensor) -> Tensor:
         """Whether UAVs ``on_ground`` [B, N] are within the radius of sources that emit [B, K];
         [B, N, K]."""
         ways = state.position[..., None, :2] - state.source.unsqueeze(-3)
+        reach = self.reach
         drawn = self.radii(state)
-        reach = self.reach if drawn is None else drawn.unsqueeze(-1)
+        if drawn is not None:
+            reach = drawn.unsqueeze(-1)
         near = ways.square().sum(-1) <= reach.square()
-        return on_ground.unsqueeze(-1) & emits.unsqueeze(-2) & near
+        hears = on_ground.unsqueeze(-1) & emits.unsqueeze(-2)
+        return hears & near
 
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
         """What each UAV reports of each source; some in reach miss it, some out of reach raise an
         alarm."""
         values = self.vehicles.values
-        drawn = state.drawn
-        miss, alarm = (values.get(f"source.{name}", drawn) for name in ("miss", "false_alarm"))
-        if not (self.unsure or isinstance(miss, Tensor) or isinstance(alarm, Tensor)):
+        unsure = self.unsure
+        miss = values.get("source.miss", state.drawn)
+        if isinstance(miss, Tensor):
+            unsure = True
+            miss = miss.unsqueeze(-1)
+        else:
+            miss = self.misses
+        alarm = values.get("source.false_alarm", state.drawn)
+        if isinstance(alarm, Tensor):
+            unsure = True
+            alarm = alarm.unsqueeze(-1)
+        else:
+            alarm = self.false_alarms
+        if not unsure:
             return in_reach
-        miss = miss.unsqueeze(-1) if isinstance(miss, Tensor) else self.misses
-        alarm = alarm.unsqueeze(-1) if isinstance(alarm, Tensor) else self.false_alarms
-        counters = torch.full_like(state.episode, _REPORT), state.episode, state.steps
-        seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
+        report = torch.full_like(state.episode, _REPORT)
+        counters = state.seed, report, state.episode, state.steps
+        seed, *counters = (each.view(-1, 1, 1) for each in counters)
         share = counter_rng.uniform(seed, *counters, self.pairs)
-        return torch.where(in_reach, share >= miss, listens & (share < alarm))
+        false_alarm = listens & (share < alarm)
+        return torch.where(in_reach, share >= miss, false_alarm)
 
-    def _true_detections(
-        self, state: State, in_reach: Tensor, now: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """When and where each UAV truly was in reach of each source last, if messages tell that."""
-        time = state.sent.true_time
-        place = state.sent.true_position
-        if not self.widths.truths:
-            return time, place
-        here = state.position[..., None, :2]
-        time = torch.where(in_reach, now.unsqueeze(-1), time)
-        return time, torch.where(in_reach.unsqueeze(-1), here, place)
-
-    def _stops(
-        self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _stops(self, state: State, now: Tensor, added: Tensor | None) -> tuple[Tensor, Tensor]:
         """Landing points and times [s] of each UAV's latest stops, newest first, [B, N, S] each."""
-        before = state.sent.trail, state.sent.landed
-        added = self.vehicles.new_stop(state, on_ground, action_valid)
-        newest = zip((state.goal, now), before, strict=True)
-        trail, landed = (torch.cat([new.unsqueeze(-1), old[..., :-1]], -1) for new, old in newest)
-        if added is None:
-            return trail, landed
-        added = added.unsqueeze(-1)
-        return torch.where(added, trail, before[0]), torch.where(added, landed, before[1])
+        sent = state.sent
+        trail = _prepended(state.goal, sent.trail)
+        landed = _prepended(now, sent.landed)
+        if added is not None:
+            added = added.unsqueeze(-1)
+            trail = torch.where(added, trail, sent.trail)
+            landed = torch.where(added, landed, sent.landed)
+        return trail, landed
 
-    def _serve(
-        self, state: State, now: Tensor, on_ground: Tensor, action_valid: Tensor | None
-    ) -> tuple[State, Tensor, Tensor]:
+    def _serve(self, state: State, now: Tensor, lands: Tensor) -> tuple[State, Tensor, Tensor]:
         """Let requests appear, and the UAVs that land serve some, as in ``Messages``."""
         served = state.sent.served
         serves = state.sent.serves
@@ -284,12 +304,14 @@ class Simulation:
             return state, served, serves
         counters = state.seed, state.episode, state.steps, state.region
         requests = appear(state.requests, served, self.arrivals, counters, now)
-        lands = self.vehicles.new_stop(state, on_ground, action_valid)
-        lands = on_ground if lands is None else lands
+        radius = self.radius
         drawn = self.radii(state)
-        radius = self.radius if drawn is None else drawn.unsqueeze(-1)
-        served, serves = serve(requests, served, state.position[..., :2], lands, radius)
-        return state._replace(requests=requests), served, serves.unsqueeze(-1).to(now.dtype)
+        if drawn is not None:
+            radius = drawn.unsqueeze(-1)
+        place = state.position[..., :2]
+        served, serves = serve(requests, served, place, lands, radius)
+        serves = serves.unsqueeze(-1).to(now.dtype)
+        return state._replace(requests=requests), served, serves
 
     def _heard(self, state: State, on_ground: Tensor) -> Tensor:
         """The latest request of each slot that each UAV knows, [B, N, M, 3]."""
@@ -298,7 +320,8 @@ class Simulation:
         if reach is None:  # everybody knows of all
             return requests.expand(-1, on_ground.shape[-1], -1, -1)
         ways = requests[..., :2] - state.position[..., None, :2]
-        hears = on_ground.unsqueeze(-1) & (ways.square().sum(-1) <= reach**2)
+        near = ways.square().sum(-1) <= reach**2
+        hears = on_ground.unsqueeze(-1) & near
         return torch.where(hears.unsqueeze(-1), requests, state.sent.requests)
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:
@@ -306,11 +329,13 @@ class Simulation:
         if self.shortest_flight is None:
             return state.sent.empty
         reach = self.vehicles.battery_reach(state)
-        shortest = gather_rows(self.shortest_flight, state.goal)
         if self.vehicles.is_windy:
             shortest = self._shortest_in_wind(state)
+        else:
+            shortest = gather_rows(self.shortest_flight, state.goal)
         stuck = on_ground & (reach < shortest)
-        return stuck | (observed(state.battery, self.config.battery) <= 0)
+        level = observed(state.battery, self.config.battery)
+        return stuck | (level <= 0)
 
     def _shortest_flights(self) -> Tensor:
         """Length of the shortest flight from each landing point [m], 0 if no action flies, [R*L].
@@ -323,9 +348,11 @@ class Simulation:
             length = length.where(length > 0, torch.inf).amin(-1)
             longest = torch.inf
         else:  # a landing point is nearest beyond half of the way to it
-            length = torch.cat([_nearest_other(points) for points in self.airspace.points])
+            nearest = [_nearest_other(points) for points in self.airspace.points]
+            length = torch.cat(nearest)
             longest = 2 * self.candidates.max_distance
-        moves = self.airspace.max_points == 1 or bool((length < longest).any())
+        flies = bool((length < longest).any())
+        moves = flies or self.airspace.max_points == 1
         problem = (
             "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
         )
@@ -339,8 +366,9 @@ class Simulation:
             length = self._action_distances(state)
         else:
             n_points = self.airspace.max_points
-            goals = torch.arange(n_points, device=state.goal.device)
-            goals = (state.region.unsqueeze(-1) * n_points + goals).unsqueeze(1)  # [B, 1, L]
+            point = torch.arange(n_points, device=state.goal.device)
+            base = state.region.unsqueeze(-1) * n_points
+            goals = (base + point).unsqueeze(1)  # [B, 1, L]
             goals = goals.expand(-1, state.goal.shape[-1], -1)
             origin = state.goal.unsqueeze(-1).expand_as(goals)
             straight = self.airspace.length(origin, goals)
@@ -354,36 +382,39 @@ class Simulation:
         """Readings of all sensors beside each other, [B, N, K]."""
         if not self.sensors:
             return state.sent.readings
-        return torch.cat([sensor.read(state, self) for sensor in self.sensors.values()], -1)
+        readings = [sensor.read(state, self) for sensor in self.sensors.values()]
+        return torch.cat(readings, -1)
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """Positions of the sources [B, K, 2], whether they emit and whether their walks are over,
         [B, K]."""
         found = [self._source_now(state, number) for number in range(len(self.sources))]
-        place, emits, over = (torch.stack([each[i] for each in found], 1) for i in range(3))
-        return place, emits, over
+        place, emits, over = zip(*found, strict=True)
+        return torch.stack(place, 1), torch.stack(emits, 1), torch.stack(over, 1)
 
     def _source_now(self, state: State, number: int) -> tuple[Tensor, Tensor, Tensor]:
         """The same of one source, [B, 2] and [B]."""
         config = self.sources[number]
         seed = state.seed
         if number:
-            source = torch.full_like(seed, _SOURCE)
-            seed = counter_rng.bits64(seed, source, torch.full_like(seed, number))
+            stream = torch.full_like(seed, _SOURCE)
+            source = torch.full_like(seed, number)
+            seed = counter_rng.bits64(seed, stream, source)
         emits = torch.ones_like(state.source_over)
         if config.motion == "static":
             place = state.source[:, number]
             over = torch.zeros_like(state.source_over)
         else:
-            walk = tree_map(
-                lambda t: t.index_select(0, state.initial_condition), self.walks[number]
-            )
+            condition = state.initial_condition
+            walk = tree_map(lambda t: t.index_select(0, condition), self.walks[number])
             time = state.steps.double() * self.dt
-            place, stop, tour, over = locate(walk, time, config.after_walk == "loop")
+            loops = config.after_walk == "loop"
+            place, stop, tour, over = locate(walk, time, loops)
             if config.emission == "per_stop":
                 first = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
                 draw = counter_rng.uniform(seed, state.episode, tour, stop)
-                emits = torch.where(tour == 0, first, draw < config.emission_probability)
+                later = draw < config.emission_probability
+                emits = torch.where(tour == 0, first, later)
         if config.emission == "per_step":
             draw = counter_rng.uniform(seed, state.episode, state.steps)
             emits = draw < config.emission_probability
@@ -392,19 +423,24 @@ class Simulation:
     def _initial_state(self, region: Tensor, start: Tensor, stops: int, seed: int) -> State:
         """The state at time 0 of every initial condition, [Q, ...]; resets copy rows of it."""
         n = len(region)
-        goal = start + region.unsqueeze(-1) * self.airspace.max_points
+        base = region.unsqueeze(-1) * self.airspace.max_points
+        goal = start + base
         number = torch.arange(n)
+        none = torch.zeros_like(number)
         zeros = torch.zeros(goal.shape)
         place = gather_rows(self.points, goal)
+        sensing_steps = math.ceil(self.config.motion.sensing_time / self.dt)
+        seeds = counter_rng.world_seeds(seed, n)
+        trail = goal.unsqueeze(-1).repeat(1, 1, stops)
         state = State(
-            seed=counter_rng.world_seeds(seed, n),
-            episode=torch.zeros_like(number),
+            seed=seeds,
+            episode=none,
             initial_condition=number,
             region=region,
-            steps=torch.zeros_like(number),
+            steps=none,
             origin=goal,
             goal=goal,
-            elapsed=torch.full_like(goal, math.ceil(self.config.motion.sensing_time / self.dt) + 1),
+            elapsed=torch.full_like(goal, sensing_steps + 1),
             vertical=zeros,
             cruise=zeros,
             air=zeros,
@@ -416,12 +452,10 @@ class Simulation:
             source=torch.stack([walk.stop[:, 0] for walk in self.walks], 1),
             source_over=torch.zeros_like(number, dtype=torch.bool),
             requests=torch.full((n, self.widths.requests, 3), -1.0),
-            drawn=self.vehicles.values.draw(
-                counter_rng.world_seeds(seed, n), torch.zeros_like(number)
-            ),
+            drawn=self.vehicles.values.draw(seeds, none),
             coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
-            sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, stops), self.widths),
+            sent=Messages.blank(trail, self.widths),
         )
         return self._first_messages(state)
 
@@ -429,11 +463,27 @@ class Simulation:
         """The state at the beginning of episodes with the messages that the UAVs send then."""
         blank = Messages.blank(state.sent.trail, self.widths)
         state = self._sense(state._replace(sent=blank))
-        first = torch.arange(state.sent.landed.shape[-1], device=state.track.device) == 0
-        landed = torch.where(first, 0.0, -1.0).expand_as(
-            state.sent.landed
-        )  # nothing is known of before
-        return state._replace(sent=state.sent._replace(landed=landed))
+        landed = state.sent.landed
+        stop = torch.arange(landed.shape[-1], device=landed.device)
+        times = torch.where(stop == 0, 0.0, -1.0)  # nothing is known of before
+        sent = state.sent._replace(landed=times.expand_as(landed))
+        return state._replace(sent=sent)
+
+
+def _prepended(newest: Tensor, before: Tensor) -> Tensor:
+    """Rows [*, S] with a newest entry [*] first, without the oldest."""
+    return torch.cat([newest.unsqueeze(-1), before[..., :-1]], -1)
+
+
+def _last_found(
+    found: Tensor, time: Tensor, place: Tensor, before: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """When and where UAVs have last found each source, [B, N, K] and [B, N, K, 2], if ``found``
+    [B, N, K] says whether they do at this time [B, N] and place [B, N, 2]."""
+    last_time, last_place = before
+    last_time = torch.where(found, time.unsqueeze(-1), last_time)
+    last_place = torch.where(found.unsqueeze(-1), place.unsqueeze(-2), last_place)
+    return last_time, last_place
 
 
 def _draw_initial_conditions(
@@ -450,26 +500,33 @@ def _draw_initial_conditions(
     starts = []
     for index, region in enumerate(airspace.regions):
         for source, drawn in zip(sources, walks, strict=True):
-            place = source.position
-            start = None if place is None else local_places("source.position", [place], region)[0]
-            drawn.append(draw_walks(region.polygon, source, per_region, rng, start))
-        starts.append(_draw_starts(config, airspace, index, per_region, rng))
-    indices = torch.arange(len(airspace.regions)).repeat_interleave(per_region)
+            start = None
+            if source.position is not None:
+                start = local_places("source.position", [source.position], region)[0]
+            walk = draw_walks(region.polygon, source, per_region, rng, start)
+            drawn.append(walk)
+        start = _draw_starts(config, airspace, index, per_region, rng)
+        starts.append(start)
+    regions = torch.arange(len(airspace.regions))
+    indices = regions.repeat_interleave(per_region)
     return indices, torch.cat(starts), tuple(map(_joined, walks))
 
 
 def _joined(walks: list[Walk]) -> Walk:
     """The walks of one source in all regions."""
     stops = max(walk.arrive.shape[1] for walk in walks)
-    return tree_map(lambda *parts: torch.cat(parts), *(_pad(walk, stops) for walk in walks))
+    padded = [_pad(walk, stops) for walk in walks]
+    return tree_map(lambda *parts: torch.cat(parts), *padded)
 
 
 def _pad(walk: Walk, stops: int) -> Walk:
     """Pad walks to the given number of stops; the source never reaches the padded ones."""
     last = walk.arrive.shape[1] - 1
     index = torch.arange(stops)
-    padded = tree_map(lambda field: field[:, index.clamp(max=last)], walk)
-    return padded._replace(arrive=padded.arrive.masked_fill(index > last, torch.inf))
+    kept = index.clamp(max=last)
+    padded = tree_map(lambda field: field[:, kept], walk)
+    arrive = padded.arrive.masked_fill(index > last, torch.inf)
+    return padded._replace(arrive=arrive)
 
 
 def _draw_starts(
@@ -477,22 +534,24 @@ def _draw_starts(
 ) -> Tensor:
     """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for
     each."""
+    key = "region.start_positions"
     given = config.region.start_positions
     together = config.region.start_together
     n_points = int(airspace.n_points[region])
     if given is None and together:
-        return torch.as_tensor(rng.integers(n_points, size=(n, 1))).repeat(1, config.agents)
+        point = torch.as_tensor(rng.integers(n_points, size=(n, 1)))
+        return point.repeat(1, config.agents)
     if given is None:
-        return torch.as_tensor(rng.random((n, n_points))).topk(config.agents, dim=-1).indices
-    points = airspace.nearest(
-        local_places("region.start_positions", given, airspace.regions[region]), region
-    )
-    name = airspace.regions[region].name
+        order = torch.as_tensor(rng.random((n, n_points)))
+        return order.topk(config.agents, dim=-1).indices
+    home = airspace.regions[region]
+    places = local_places(key, given, home)
+    points = airspace.nearest(places, region)
     problem = (
-        f"lead to the same landing point of {name}: take others, or region.start_together=true"
+        f"lead to the same landing point of {home.name}: take others, or region.start_together=true"
     )
-    distinct = together or len(points.unique()) == len(points)
-    checks.require(distinct, "region.start_positions", given, problem)
+    distinct = len(points.unique()) == len(points)
+    checks.require(together or distinct, key, given, problem)
     return points.expand(n, -1).clone()
 
 
@@ -500,11 +559,11 @@ def _nearest_other(points: Tensor) -> Tensor:
     """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for
     padded ones."""
     distance = torch.full((len(points),), torch.inf)
-    real = points.isfinite().all(-1)
-    places = np.asarray(shapely.points(points[real].double().numpy()))
+    real = points.isfinite().all(-1).nonzero().squeeze(-1)
+    exact = points[real].double().numpy()
+    places = np.asarray(shapely.points(exact))
     options = {"exclusive": True, "return_distance": True, "all_matches": False}
-    (index, _), found = map(
-        torch.as_tensor, shapely.STRtree(places).query_nearest(places, **options)
-    )
-    distance[real.nonzero().squeeze(-1)[index]] = found.float()
+    pairs, found = shapely.STRtree(places).query_nearest(places, **options)
+    index = torch.as_tensor(pairs[0])
+    distance[real[index]] = torch.as_tensor(found).float()
     return distance

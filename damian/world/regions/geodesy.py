@@ -30,17 +30,25 @@ def to_local(
     """
     lat = np.radians(np.asarray(lat_deg, float))
     lat_0 = np.radians(origin[0])
+    d_lat = lat - lat_0
     d_lon = np.radians(np.asarray(lon_deg, float) - origin[1])
-    haversine = (
-        np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
-    )
-    distance = 2 * EARTH_RADIUS_M * np.arcsin(np.sqrt(np.clip(haversine, 0, 1)))
-    east = np.cos(lat) * np.sin(d_lon)
+    cos_lat = np.cos(lat)
+    across = np.sin(d_lon / 2) ** 2
+    haversine = np.sin(d_lat / 2) ** 2 + np.cos(lat_0) * cos_lat * across
+    half_chord = np.sqrt(np.clip(haversine, 0, 1))
+    distance = 2 * EARTH_RADIUS_M * np.arcsin(half_chord)
+    east = cos_lat * np.sin(d_lon)
     # Equals cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(d_lon), without cancellation near the
     # origin.
-    north = np.sin(lat - lat_0) + 2 * np.sin(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
-    bearing = np.arctan2(east, north)
-    return distance * np.sin(bearing), distance * np.cos(bearing)
+    north = np.sin(d_lat) + 2 * np.sin(lat_0) * cos_lat * across
+    return _by_bearing(distance, np.arctan2(east, north))
+
+
+def _by_bearing(length: Floats, bearing: Floats) -> tuple[Floats, Floats]:
+    """Parts east and north of lengths [*] in the directions of bearings [*] rad."""
+    east = length * np.sin(bearing)
+    north = length * np.cos(bearing)
+    return east, north
 
 
 def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
@@ -53,15 +61,17 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tu
     y = np.asarray(y_m, float)
     lat_0 = np.radians(origin[0])
     arc = np.hypot(x, y) / EARTH_RADIUS_M
-    bearing = np.arctan2(x, y)
-    east = np.sin(arc) * np.sin(bearing)
-    north = np.sin(arc) * np.cos(bearing)
+    east, north = _by_bearing(np.sin(arc), np.arctan2(x, y))
+    height = np.cos(arc)
+    sin_lat = np.sin(lat_0)
+    cos_lat = np.cos(lat_0)
     # Cartesian coordinates on the unit sphere, with the origin's meridian as the x-z plane. Near
     # the poles an arcsine would lose half the digits of the latitude; the arctangent keeps them.
-    out = np.cos(arc) * np.cos(lat_0) - north * np.sin(lat_0)
-    up = np.cos(arc) * np.sin(lat_0) + north * np.cos(lat_0)
+    out = height * cos_lat - north * sin_lat
+    up = height * sin_lat + north * cos_lat
     lat = np.degrees(np.arctan2(up, np.hypot(out, east)))
-    return lat, wrap_longitude(np.degrees(np.arctan2(east, out)) + origin[1])
+    lon = np.degrees(np.arctan2(east, out)) + origin[1]
+    return lat, wrap_longitude(lon)
 
 
 def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
@@ -74,27 +84,34 @@ def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
     lies to the left of each closed ring, [V, 2] degrees (longitude, latitude): shells run
     counter-clockwise and holes clockwise.
     """
-    base = (float(rings[0][0, 1]), float(rings[0][0, 0]))
+    lon_0, lat_0 = map(float, rings[0][0])
+    base = lat_0, lon_0
+    upward = np.array([0.0, 0.0, 1.0])
     moment = np.zeros(3)
     for ring in rings:
-        x, y = to_local(ring[:, 1], ring[:, 0], base)
+        lon, lat = ring.T
+        x, y = to_local(lat, lon, base)
         distance = np.hypot(x, y) / EARTH_RADIUS_M
-        outward = np.column_stack([x, y]) / EARTH_RADIUS_M * np.sinc(distance / np.pi)[:, None]
+        shrinks = np.sinc(distance / np.pi)
+        outward = np.column_stack([x, y]) / EARTH_RADIUS_M * shrinks[:, None]
         # Corners east, north and up of the base, in Earth radii. Near the base the closed form
         # would lose all digits; the part of it that cancels over a closed ring is therefore left
         # out.
-        offset = np.column_stack([outward, -2 * np.sin(distance / 2) ** 2])
+        up = -2 * np.sin(distance / 2) ** 2
+        offset = np.column_stack([outward, up])
         start = offset[:-1]
         end = offset[1:]
-        up = np.array([0.0, 0.0, 1.0])
+        edge = end - start
         bent = np.cross(start, end)
-        normal = np.cross(up, end - start) + bent
-        angle = 2 * np.arcsin(np.minimum(np.linalg.norm(end - start, axis=1) / 2, 1))
-        moment += ((1 / np.sinc(angle / np.pi) - 1)[:, None] * normal + bent).sum(0)
+        normal = np.cross(upward, edge) + bent
+        half_chord = np.linalg.norm(edge, axis=1) / 2
+        angle = 2 * np.arcsin(np.minimum(half_chord, 1))
+        excess = 1 / np.sinc(angle / np.pi) - 1
+        moment += (excess[:, None] * normal + bent).sum(0)
     east, north, up = moment
     arc = EARTH_RADIUS_M * np.arctan2(np.hypot(east, north), up)
-    bearing = np.arctan2(east, north)
-    lat, lon = to_latlon(arc * np.sin(bearing), arc * np.cos(bearing), base)
+    x, y = _by_bearing(arc, np.arctan2(east, north))
+    lat, lon = to_latlon(x, y, base)
     return float(lat), float(lon)
 
 
