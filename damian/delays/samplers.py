@@ -101,8 +101,14 @@ class Sampler(nn.Module, ABC):
         """The delays [M], of which a share ``loss`` is lost, by a draw of its own."""
         if not self.loss:
             return delay
-        draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
+        draw = _further_draw(streams, clock, _LOSS_DRAW)
         return torch.where(draw < self.loss, self.lost, delay)
+
+
+def _further_draw(streams: Tensor, clock: Tensor, number: int) -> Tensor:
+    """A further random number in [0, 1) of each message, [M]."""
+    counter = torch.full_like(clock, number)
+    return counter_rng.uniform(streams, clock, counter)
 
 
 class TableSampler(Sampler):
@@ -131,25 +137,32 @@ class TableSampler(Sampler):
         super().__init__(longest, loses=False, loss=loss)
         arrive = torch.zeros(len(states), longest + 1, dtype=torch.float64)
         for row, chances in zip(arrive, states, strict=True):
-            row[: len(chances)] = torch.tensor(chances, dtype=torch.float64) * (1 - loss)
+            given = torch.tensor(chances, dtype=torch.float64)
+            row[: len(chances)] = given * (1 - loss)
         rest = 1 - arrive.sum(-1, keepdim=True)
-        chances = torch.cat([arrive, rest.where(rest > _ROUNDING, 0.0)], -1)
+        lost = rest.where(rest > _ROUNDING, 0.0)
+        chances = torch.cat([arrive, lost], -1)
         self.register_buffer("chances", chances, persistent=False)
-        self.loses = bool((chances[:, -1] > 0).any())
+        self.loses = bool((lost > 0).any())
         likeliest = int(chances[0, :-1].argmax())
-        if bool((chances[:, likeliest] == 1).all()):
+        is_certain = chances[:, likeliest] == 1
+        if is_certain.all():
             self.constant_delay = likeliest
         change = torch.tensor(transitions or [[1.0]], dtype=torch.float64)
         # The next state and the delay are one outcome, so that a message takes a single draw.
-        joint = (change.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)
-        boundaries = (joint.cumsum(-1)[:, :-1] * 2**32).round().long()
+        joint = (change.unsqueeze(-1) * chances).flatten(1)
+        upper = joint.cumsum(-1)[:, :-1]
+        boundaries = (upper * 2**32).round().long()
         self.register_buffer("_boundaries", boundaries, persistent=False)
-        self._bad_share = (
-            (change[0, 1] / (change[0, 1] + change[1, 0])).item() if transitions else 0.0
-        )
+        self._bad_share = 0.0
+        if transitions:
+            worsens = change[0, 1]
+            improves = change[1, 0]
+            self._bad_share = (worsens / (worsens + improves)).item()
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        return (counter_rng.uniform(streams) < self._bad_share).long()
+        is_bad = counter_rng.uniform(streams) < self._bad_share
+        return is_bad.long()
 
     def forward(
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
@@ -159,9 +172,11 @@ class TableSampler(Sampler):
         draw = counter_rng.bits(streams, clock)
         if len(self.chances) == 1:
             return torch.bucketize(draw, self._boundaries[0], right=True), state
-        outcome = (draw.unsqueeze(-1) >= self._boundaries[state]).sum(-1)
+        below = self._boundaries[state]
+        outcome = (draw.unsqueeze(-1) >= below).sum(-1)
         n = self.longest + 2
-        return outcome % n, outcome // n
+        delay = outcome % n
+        return delay, outcome // n
 
 
 _ROUNDING = 1e-10
@@ -175,8 +190,9 @@ class Recorded(Sampler):
     _delays: Tensor
 
     def __init__(self, delays: list[int], loss: float = 0.0) -> None:
-        super().__init__(max(*delays, 0), loses=min(delays) < 0, loss=loss)
-        if not self.loses and min(delays) == self.longest:
+        shortest = min(delays)
+        super().__init__(max(*delays, 0), loses=shortest < 0, loss=loss)
+        if not self.loses and shortest == self.longest:
             self.constant_delay = self.longest
         codes = torch.tensor([self.lost if delay < 0 else delay for delay in delays])
         self.register_buffer("_delays", codes, persistent=False)
@@ -189,8 +205,10 @@ class Recorded(Sampler):
     ) -> Drawn:
         delay = self._delays[state]
         if self.loss:
-            delay = torch.where(counter_rng.uniform(streams, clock) < self.loss, self.lost, delay)
-        return delay, (state + 1) % len(self._delays)
+            draw = counter_rng.uniform(streams, clock)
+            delay = torch.where(draw < self.loss, self.lost, delay)
+        following = (state + 1) % len(self._delays)
+        return delay, following
 
 
 class HeldSampler(Sampler):
@@ -218,7 +236,8 @@ class HeldSampler(Sampler):
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
-        return torch.where(delay < self.lost, self.longest, self.lost), state
+        held = torch.where(delay < self.lost, self.longest, self.lost)
+        return held, state
 
 
 class LossSampler(HeldSampler):
@@ -236,9 +255,11 @@ class LossSampler(HeldSampler):
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
-        draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
-        chance = cast(MessageContext, context).entries["loss"].view_as(draw)
-        return torch.where(draw < chance, self.lost, delay), state
+        draw = _further_draw(streams, clock, _LOSS_DRAW)
+        read = cast(MessageContext, context).entries
+        chance = read["loss"].view_as(draw)
+        delay = torch.where(draw < chance, self.lost, delay)
+        return delay, state
 
 
 class LagSampler(Sampler):
@@ -252,21 +273,24 @@ class LagSampler(Sampler):
     def __init__(self, law: Any, chances: list[float], loss: float, period: int | None) -> None:
         table = TableSampler([chances], loss=loss)
         arrives = sum(chances)
-        super().__init__(table.longest, loses=False, loss=table.chances[0, -1].item())
+        loss = table.chances[0, -1].item()
+        super().__init__(table.longest, loses=False, loss=loss)
         self.constant_delay = table.constant_delay
-        self._lags = TableSampler(
-            [[chance / arrives for chance in chances]] if arrives else [[1.0]]
-        )
+        lags = [chance / arrives for chance in chances] if arrives else [1.0]
+        self._lags = TableSampler([lags])
         self._period = period or _NEVER
         self._hold_probability = law.hold_probability
         self.same_draws_for_all_agents = law.shared
         self._stagger = law.stagger
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        return torch.stack([torch.full_like(streams, -1), torch.zeros_like(streams)], -1)
+        lag = torch.full_like(streams, -1)
+        wait = torch.zeros_like(streams)
+        return torch.stack([lag, wait], -1)
 
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
-        return torch.where(mask.unsqueeze(-1), self.initial_state(state[:, 0]), state)
+        first = self.initial_state(state[:, 0])
+        return torch.where(mask.unsqueeze(-1), first, state)
 
     def forward(
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
@@ -279,16 +303,18 @@ class LagSampler(Sampler):
         renewed = due
         interval = torch.full_like(streams, self._period)
         if self._hold_probability:
-            draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _HOLD_DRAW))
-            renewed = first | (due & (draw >= self._hold_probability))
+            draw = _further_draw(streams, clock, _HOLD_DRAW)
+            released = draw >= self._hold_probability
+            renewed = first | (due & released)
         if self._stagger:
-            phase = (
-                counter_rng.bits(streams, clock, torch.full_like(clock, _PHASE_DRAW)) % self._period
-            )
+            counter = torch.full_like(clock, _PHASE_DRAW)
+            bits = counter_rng.bits(streams, clock, counter)
+            phase = bits % self._period
             interval = torch.where(first, 1 + phase, interval)
         drawn, _ = self._lags(streams, clock, lag)
         lag = torch.where(renewed, drawn, lag)
-        state = torch.stack([lag, torch.where(due, interval, wait) - 1], -1)
+        wait = torch.where(due, interval, wait) - 1
+        state = torch.stack([lag, wait], -1)
         return self.lose(lag, streams, clock), state
 
 
@@ -356,13 +382,16 @@ class LinkSampler(Sampler):
     _loss: Tensor
 
     def __init__(self, samplers: Sequence[Sampler], law_index: Tensor, loss: Tensor) -> None:
-        loses = any(sampler.loses for sampler in samplers) or bool((loss > 0).any())
-        super().__init__(max(sampler.longest for sampler in samplers), loses)
+        loses_on_links = bool((loss > 0).any())
+        loses = loses_on_links or any(sampler.loses for sampler in samplers)
+        longest = max(sampler.longest for sampler in samplers)
+        super().__init__(longest, loses)
         self.n_agents = math.isqrt(len(law_index))
         self.samplers: Any = nn.ModuleList(samplers)
         self.sees_context = any(sampler.sees_context for sampler in samplers)
-        self.reads = tuple(dict.fromkeys(name for sampler in samplers for name in sampler.reads))
-        self._loses_on_links = bool((loss > 0).any())
+        reads = (name for sampler in samplers for name in sampler.reads)
+        self.reads = tuple(dict.fromkeys(reads))
+        self._loses_on_links = loses_on_links
         example = torch.zeros(1, dtype=torch.long)
         states = [sampler.initial_state(example)[0] for sampler in samplers]
         self._state_forms = [(state.numel(), state.shape, state.dtype) for state in states]
@@ -370,7 +399,8 @@ class LinkSampler(Sampler):
         self.register_buffer("_loss", loss, persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        return _packed([sampler.initial_state(streams) for sampler in self.samplers])
+        states = [sampler.initial_state(streams) for sampler in self.samplers]
+        return _packed(states)
 
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
         pairs = zip(self.samplers, self._split(state), strict=True)
@@ -384,19 +414,23 @@ class LinkSampler(Sampler):
         delay = torch.zeros_like(streams)
         states = []
         index = self._law_index.repeat(n_worlds)
-        for k, (sampler, part) in enumerate(zip(self.samplers, self._split(state), strict=True)):
-            drawn, new_state = sampler(streams_for(sampler, streams, n_links), clock, part, context)
+        pairs = zip(self.samplers, self._split(state), strict=True)
+        for k, (sampler, part) in enumerate(pairs):
+            own_streams = streams_for(sampler, streams, n_links)
+            drawn, new_state = sampler(own_streams, clock, part, context)
             drawn = torch.where(drawn < sampler.lost, drawn, self.lost)
             delay = torch.where(index == k, drawn, delay)
             states.append(new_state)
         if self._loses_on_links:
-            draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LINK_LOSS_DRAW))
-            delay = torch.where(draw < self._loss.repeat(n_worlds), self.lost, delay)
+            draw = _further_draw(streams, clock, _LINK_LOSS_DRAW)
+            loss = self._loss.repeat(n_worlds)
+            delay = torch.where(draw < loss, self.lost, delay)
         return delay, _packed(states)
 
     def _split(self, state: Tensor) -> list[Tensor]:
         """The state of each sampler, [M, ...]."""
-        parts = state.split([size for size, _, _ in self._state_forms], -1)
+        sizes = [size for size, _, _ in self._state_forms]
+        parts = state.split(sizes, -1)
         states = []
         for part, (_, shape, dtype) in zip(parts, self._state_forms, strict=True):
             number = part.view(torch.double) if dtype.is_floating_point else part

@@ -90,18 +90,22 @@ class UavEnv(EnvBase):
         messages_only: bool = False,
     ) -> None:
         checks.whole("num_worlds", num_worlds, 1, checks.WORLDS)
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
+        shape = torch.Size([num_worlds])
+        super().__init__(device=torch.device("cpu"), batch_size=shape)
         self.scenario = copy.deepcopy(scenario) if scenario else ScenarioConfig()
         checks.device("device", str(device))
         self.extras = checks.names("extras", extras, ALL_EXTRAS)
         self.messages_only = messages_only
         of = self.scenario
-        self.simulation = Simulation(of, of.clock.dt, of.observation.carried_stops, seed)
-        self.server = Server(self.simulation, of.observation, of.reward, of.episode, of.time_scale)
+        observation = of.observation
+        belief = observation.belief
+        stops = observation.carried_stops
+        self.simulation = Simulation(of, of.clock.dt, stops, seed)
+        self.server = Server(self.simulation, observation, of.reward, of.episode, of.time_scale)
         problem = "needs transforms before a ServerNode: build the environment by damian.make_env"
-        belief, stops = of.observation.belief, of.observation.carried_stops
-        checks.require(messages_only or not belief, "observation.belief", belief, problem)
-        told = messages_only or stops >= of.observation.timeline
+        allowed = messages_only or not belief
+        checks.require(allowed, "observation.belief", belief, problem)
+        told = messages_only or stops >= observation.timeline
         checks.require(told, "observation.stops", stops, problem)
         initial = self.simulation.initial
         features = checked_features(self.server, initial.sent, initial.steps)
@@ -120,8 +124,9 @@ class UavEnv(EnvBase):
         super().to(device)
         self.simulation.to(device)
         self.server.to(device)
-        self._reset_outputs = {key: table.to(device) for key, table in self._reset_outputs.items()}
-        self.worlds = tree_map(lambda t: t.to(device), self.worlds)
+        outputs = self._reset_outputs
+        self._reset_outputs = {key: table.to(device) for key, table in outputs.items()}
+        self.worlds = tree_map(lambda table: table.to(device), self.worlds)
         return self
 
     @property
@@ -145,8 +150,9 @@ class UavEnv(EnvBase):
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Put the worlds into the state of a ``state_dict``, of as many worlds and the same
         scenario."""
-        own = self.worlds._asdict()
-        loaded = {name: state[name].view_as(own[name]).to(own[name], copy=True) for name in own}
+        loaded = {}
+        for name, own in self.worlds._asdict().items():
+            loaded[name] = state[name].view_as(own).to(own, copy=True)
         self.worlds = PackedState(**loaded)
 
     def seed_worlds(self, seeds: Tensor) -> None:
@@ -159,13 +165,14 @@ class UavEnv(EnvBase):
         seeds = seeds.to(self.device, torch.long)
         zero = torch.zeros_like(seeds)
         if "worlds" not in self.__dict__:
-            self.state = tree_map(
-                lambda table: table.index_select(0, zero), self.simulation.initial
-            )
+            initial = self.simulation.initial
+            self.state = tree_map(lambda table: table.index_select(0, zero), initial)
         self.state = self.state._replace(seed=seeds, episode=zero)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.seed_worlds(counter_rng.world_seeds(seed or 0, self.batch_size[0], self.device))
+        n_worlds = self.batch_size[0]
+        seeds = counter_rng.world_seeds(seed or 0, n_worlds, self.device)
+        self.seed_worlds(seeds)
 
     # Methods that TorchRL calls.
 
@@ -178,9 +185,8 @@ class UavEnv(EnvBase):
         if self.messages_only:  # TorchRL expects a reward from every environment
             outputs[keys.REWARD] = self.full_reward_spec[keys.REWARD].zero()
         stepped = tensordict.get(keys.STEPPED, None)
-        if (
-            stepped is not None
-        ):  # the others keep their state, and repeat what they have output last
+        # The other worlds keep their state, and repeat what they have output last.
+        if stepped is not None:
             stepped = stepped.view(-1)
             self.worlds = tree_where(stepped, self.worlds, before)
             for key, new in outputs.items():
@@ -205,66 +211,66 @@ class UavEnv(EnvBase):
         episodes."""
         if torch.compiler.is_compiling() or not devices.data_dependent(mask.device):
             fresh = self.simulation.next_episode(worlds)
-            worlds = tree_map(
-                lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds
-            )
+            worlds = tree_where(mask, fresh, worlds)
         else:
             worlds = self.simulation.reset(worlds, mask)
-        condition = worlds.integers[:, INITIAL_CONDITION]
-        outputs = {k: table.index_select(0, condition) for k, table in self._reset_outputs.items()}
-        if (
-            self.simulation.draws
-        ):  # a table cannot hold first readings, which differ in every episode
+        # A table cannot hold first readings, which differ in every episode.
+        if self.simulation.draws:
             state = self.simulation.layout.unpack(worlds)
             features = self.server.features(state.sent, state.steps)
-            outputs = self._outputs_at_reset(state, features)
+            return worlds, self._outputs_at_reset(state, features)
+        condition = worlds.integers[:, INITIAL_CONDITION]
+        outputs = {}
+        for key, table in self._reset_outputs.items():
+            outputs[key] = table.index_select(0, condition)
         return worlds, outputs
 
     def step_fn(
         self, worlds: PackedState, action: Tensor, valid: Tensor | None = None
     ) -> tuple[PackedState, Outputs]:
         """One step of the physics, then the server's outputs; inputs as in ``Simulation.step``."""
-        before = self.simulation.layout.unpack(worlds)
+        layout = self.simulation.layout
+        before = layout.unpack(worlds)
         state = self.simulation.step(before, action, valid)
         if self.messages_only:
-            return self.simulation.layout.pack(state), self._state_outputs(state)
-        remembers = self.server.remembers_coverage
-        known = (
-            KnownCoverage(self.server.counted(before.sent), before.coverage) if remembers else None
-        )
+            return layout.pack(state), self._state_outputs(state)
+        known = None
+        if self.server.remembers_coverage:
+            counted = self.server.counted(before.sent)
+            known = KnownCoverage(counted, before.coverage)
         served = self.server(state.sent, state.steps, state.source_over, known)
         if served.coverage is not None:
             state = state._replace(coverage=served.coverage.share)
         outputs = self._state_outputs(state, served.global_observation)
-        return self.simulation.layout.pack(state), outputs | served.entries(
-            "reward_terms" in self.extras
-        )
+        outputs |= served.entries("reward_terms" in self.extras)
+        return layout.pack(state), outputs
 
     def _state_outputs(self, state: State, global_observation: Tensor | None = None) -> Outputs:
         """The outputs that depend on a state alone; the critic's observation [B, N, G] saves
         time."""
-        outputs: Outputs = {keys.READY: self.simulation.vehicles.ready(state)}
-        if self.scenario.actions.kind == "discrete" and self.scenario.actions.mask:
+        vehicles = self.simulation.vehicles
+        outputs: Outputs = {keys.READY: vehicles.ready(state)}
+        actions = self.scenario.actions
+        if actions.kind == "discrete" and actions.mask:
             outputs[keys.ACTION_MASK] = self.simulation.action_mask(state)
         if "message" in self.extras:
-            outputs |= {keys.MESSAGE: state.sent.pack(), keys.MESSAGE_SENT: state.message_sent}
+            outputs[keys.MESSAGE] = state.sent.pack()
+            outputs[keys.MESSAGE_SENT] = state.message_sent
         if "position" in self.extras:
-            offset = gather_rows(self.simulation.airspace.offset, state.region).unsqueeze(-2)
-            outputs[keys.POSITION] = state.position[..., :2] + offset
-        values = self.simulation.vehicles.values
-        if "delay.loss" in values.choices:
-            loss = values.get("delay.loss", state.drawn)
-            outputs[keys.LOSS] = (
-                torch.as_tensor(loss).unsqueeze(-1).expand(-1, state.track.shape[1], 1)
-            )
+            offset = gather_rows(self.simulation.airspace.offset, state.region)
+            outputs[keys.POSITION] = state.position[..., :2] + offset.unsqueeze(-2)
+        if "delay.loss" in vehicles.values.choices:
+            loss = torch.as_tensor(vehicles.values.get("delay.loss", state.drawn))
+            outputs[keys.LOSS] = loss.unsqueeze(-1).expand(-1, self.n_agents, 1)
         if "privileged" in self.extras:
             outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, global_observation)
         if self.scenario.episode.end_with_source:
             outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
         if "state" in self.extras:
             _, emits, _ = self.simulation.source_now(state)
-            unserved = is_open(state.requests, state.sent.served).unsqueeze(-1)
-            requests = torch.cat([state.requests[..., :2], unserved], -1)
+            unserved = is_open(state.requests, state.sent.served)
+            places = state.requests[..., :2]
+            requests = torch.cat([places, unserved.unsqueeze(-1)], -1)
             truth = Truth(state.position, state.battery, emits, state.source, requests, state.drawn)
             outputs[keys.STATE] = truth.pack()
         return outputs
@@ -276,35 +282,40 @@ class UavEnv(EnvBase):
             belief = None if grid is None else certain_belief(grid, state.source)
             features = self.server.features(state.sent, state.steps, belief=belief)
             _, global_observation = self.server.observations(features)
-        scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
-        ways = state.source.unsqueeze(-3) - state.position[..., None, :2]
-        to_source = nearest_way(ways) / scale
-        return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)
+        scale = gather_rows(self.simulation.airspace.scale, state.region)
+        place = state.position[..., None, :2]
+        ways = state.source.unsqueeze(-3) - place
+        to_source = nearest_way(ways) / scale.view(-1, 1, 1)
+        to_source = to_source.clamp(-1, 1)
+        return torch.cat([global_observation, to_source], -1)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         """Outputs of a reset, [Q, ...] by key, from Q first states of episodes and their
         features."""
         observation, global_observation = self.server.observations(features)
         outputs = self._state_outputs(initial, global_observation)
-        outputs |= {keys.OBSERVATION: observation, keys.GLOBAL_OBSERVATION: global_observation}
+        outputs[keys.OBSERVATION] = observation
+        outputs[keys.GLOBAL_OBSERVATION] = global_observation
         if "reward_terms" in self.extras:
             zero = torch.zeros_like(initial.track)
-            outputs |= {(*keys.REWARD_TERMS, name): zero for name in self.scenario.reward.terms}
+            for name in self.scenario.reward.terms:
+                outputs[*keys.REWARD_TERMS, name] = zero
         false = torch.zeros_like(initial.source_over).unsqueeze(-1)
-        return outputs | dict.fromkeys((*keys.ENDS, keys.SUCCESS), false)
+        flags = (*keys.ENDS, keys.SUCCESS)
+        return outputs | dict.fromkeys(flags, false)
 
     # TensorDicts and specs.
 
     def to_tensordict(self, outputs: Outputs) -> TensorDict:
         """Outputs as a TensorDict of batch size [B], with ``"agents"`` of batch size [B, N]."""
-        shape, make = (
-            torch.Size((*self.batch_size, self.n_agents)),
-            TensorDict._new_unsafe,
-        )  # saves 4 %
+        shape = torch.Size((*self.batch_size, self.n_agents))
+        make = TensorDict._new_unsafe  # saves 4 %
         levels: dict[tuple[str, ...], dict[str, Any]] = {(): {}, (keys.AGENTS,): {}}
         for key, value in outputs.items():
-            *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
-            levels.setdefault(tuple(path), {})[name] = value
+            parts = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
+            *path, name = parts
+            level = levels.setdefault(tuple(path), {})
+            level[name] = value
         root = levels.pop(())
         agents = levels.pop((keys.AGENTS,))
         for path, level in levels.items():
@@ -315,12 +326,14 @@ class UavEnv(EnvBase):
     def _layouts(self, features: Features) -> dict[str, Layout]:
         actor, critic = self.server.layouts(features)
         meaning = "Way from the UAV to the nearest source, over the size of the region."
-        privileged = critic.appended(
-            "source_way", (2,), -1.0, 1.0, entries=("east", "north"), meaning=meaning
-        )
-        observed = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.PRIVILEGED_OBSERVATION)
-        layouts = zip(observed, (actor, critic, privileged), strict=True)
-        return {keys.last_part(key): layout for key, layout in layouts}
+        axes = ("east", "north")
+        privileged = critic.appended("source_way", (2,), -1.0, 1.0, entries=axes, meaning=meaning)
+        layouts = {
+            keys.OBSERVATION: actor,
+            keys.GLOBAL_OBSERVATION: critic,
+            keys.PRIVILEGED_OBSERVATION: privileged,
+        }
+        return {keys.last_part(key): layout for key, layout in layouts.items()}
 
     def _make_specs(self) -> None:
         """Specs with the bounds that the layouts state."""
@@ -328,35 +341,32 @@ class UavEnv(EnvBase):
             (keys.AGENTS, name): layout.bounds() for name, layout in self.layout.items()
         }
         worlds = self.batch_size
-        agents = torch.Size((*self.batch_size, self.n_agents))
-        ends: Outputs = {
-            key: table for key, table in self._reset_outputs.items() if key in keys.ENDS
-        }
-        observations: Outputs = {
-            key: table for key, table in self._reset_outputs.items() if key not in ends
-        }
+        agents = torch.Size((*worlds, self.n_agents))
+        observations = dict(self._reset_outputs)
+        ends: Outputs = {key: observations.pop(key) for key in keys.ENDS}
         self.observation_spec = self._specs_of(observations, bounds)
         config = self.scenario.actions
         if config.kind == "discrete":
             action = Categorical(config.n_actions, shape=agents, device=self.device)
         else:
-            action = Bounded(0.0, 1.0, shape=torch.Size((*agents, 2)), device=self.device)
-        reward = Unbounded(torch.Size((*agents, 1)), device=self.device)
-        of_agents = Composite(action=action, shape=agents), Composite(reward=reward, shape=agents)
-        self.action_spec, self.reward_spec = (
-            Composite(agents=each, shape=worlds, device=self.device) for each in of_agents
-        )
+            shape = torch.Size((*agents, 2))
+            action = Bounded(0.0, 1.0, shape=shape, device=self.device)
+        shape = torch.Size((*agents, 1))
+        reward = Unbounded(shape, device=self.device)
+        actions = Composite(action=action, shape=agents)
+        rewards = Composite(reward=reward, shape=agents)
+        self.action_spec = Composite(agents=actions, shape=worlds, device=self.device)
+        self.reward_spec = Composite(agents=rewards, shape=worlds, device=self.device)
         self.done_spec = self._specs_of(ends)
 
     def _specs_of(self, tables: Outputs, bounds: Bounds | None = None) -> Composite:
         """Specs of outputs, derived from examples with any number of rows and the bounds of
         observations."""
-        found = {
-            k: table[:1].expand(*self.batch_size, *table.shape[1:]) for k, table in tables.items()
-        }
-        specs = make_composite_from_td(
-            self.to_tensordict(found).select(*found), unsqueeze_null_shapes=False
-        )
+        found: Outputs = {}
+        for key, table in tables.items():
+            found[key] = table[:1].expand(*self.batch_size, *table.shape[1:])
+        examples = self.to_tensordict(found).select(*found)
+        specs = make_composite_from_td(examples, unsqueeze_null_shapes=False)
         for key, value in found.items():
             like: dict[str, Any] = {
                 "shape": value.shape,
@@ -367,7 +377,6 @@ class UavEnv(EnvBase):
             if value.dtype == torch.bool:
                 specs[key] = Categorical(2, **like)
             elif limits is not None:
-                specs[key] = Bounded(
-                    limits[0].expand(value.shape), limits[1].expand(value.shape), **like
-                )
+                low, high = (limit.expand(value.shape) for limit in limits)
+                specs[key] = Bounded(low, high, **like)
         return specs.to(self.device)

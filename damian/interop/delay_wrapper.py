@@ -24,6 +24,11 @@ from damian.transforms.context import ContextReader
 
 ByName = dict[str, Any]
 """Something of each agent, or of each part of an observation; the only one is called ``""``."""
+Told = tuple[ByName, ByName]
+"""What agents are told, and their infos."""
+Numbers = NDArray[np.float32]
+Sent = dict[int, tuple[Any, float]]
+"""Things that were sent, each with a time, by time."""
 
 
 class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
@@ -81,7 +86,8 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         gymnasium.utils.RecordConstructorArgs.__init__(self, **told)
         super().__init__(env)
         space: Any = env.observation_space
-        self._in_parts = isinstance(space, Dict) and (_by_name(observation) or _by_name(loss))
+        named = _by_name(observation) or _by_name(loss)
+        self._in_parts = isinstance(space, Dict) and named
         observed = space.spaces if self._in_parts else {"": space}
         told["default"] = {} if default is None else {"": default}
         self._delays = Delays(observed, {"": env.action_space}, told)
@@ -91,7 +97,8 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
-        told, more = self._delays.reset(observation if self._in_parts else {"": observation}, seed)
+        observed = observation if self._in_parts else {"": observation}
+        told, more = self._delays.reset(observed, seed)
         return told[""], info | more[""]
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -130,9 +137,8 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         self._worlds = [str(i) for i in range(env.num_envs)]
         self._at_once = mode == AutoresetMode.SAME_STEP
         known = self._at_once or mode == AutoresetMode.NEXT_STEP
-        checks.require(
-            known, "env", mode, "is no autoreset_mode in which episodes begin by themselves"
-        )
+        should = "is no autoreset_mode in which episodes begin by themselves"
+        checks.require(known, "env", mode, should)
         told: ByName = {
             "observation": observation,
             "action": action,
@@ -142,10 +148,9 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
         told |= {"history": history, "timeline": timeline, "dt": dt}
         told["default"] = {} if default is None else dict.fromkeys(self._worlds, default)
         space = env.single_observation_space
-        acting = env.single_action_space
-        self._delays = Delays(
-            dict.fromkeys(self._worlds, space), dict.fromkeys(self._worlds, acting), told
-        )
+        observed = dict.fromkeys(self._worlds, space)
+        acting = dict.fromkeys(self._worlds, env.single_action_space)
+        self._delays = Delays(observed, acting, told)
         self.single_observation_space = self._delays.space("0", space)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
@@ -154,22 +159,27 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
     ) -> tuple[Any, dict]:
         observations, infos = self.env.reset(seed=seed, options=options)
         self._over: list[str] = []
-        told, more = self._delays.reset(
-            self._by_world(self.env.observation_space, observations), seed
-        )
-        return self._batch(self.single_observation_space, told), self._with(infos, more)
+        firsts = self._by_world(self.env.observation_space, observations)
+        told, more = self._delays.reset(firsts, seed)
+        observations = self._batch(self.single_observation_space, told)
+        return observations, self._with(infos, more)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         chosen = self._by_world(self.action_space, actions)
         begin = self._over
         going = {world: action for world, action in chosen.items() if world not in begin}
-        executed = self._batch(self.env.single_action_space, chosen | self._delays.act(going))
+        acted = chosen | self._delays.act(going)
+        executed = self._batch(self.env.single_action_space, acted)
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         now = self._by_world(self.env.observation_space, observations)
-        over = [self._worlds[i] for i in np.flatnonzero(terminated | truncated)]
-        final = {world: infos["final_obs"][int(world)] for world in over if self._at_once}
+        ended = np.flatnonzero(terminated | truncated)
+        over = [self._worlds[i] for i in ended]
+        final = {}
+        if self._at_once:
+            final = {world: infos["final_obs"][int(world)] for world in over}
         paid = dict(zip(chosen, rewards.tolist(), strict=True))
-        seen = {w: (now | final)[w] for w in going}
+        observed = now | final
+        seen = {w: observed[w] for w in going}
         earned = {w: paid[w] for w in going}
         told, received, more = self._delays.step(seen, earned, over)
         if self._at_once:
@@ -178,19 +188,26 @@ class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
             infos = self._with(infos, last)
         else:
             self._over = over
-        first, at_first = self._delays.begin({w: now[w] for w in begin}) if begin else ({}, {})
-        rewards = np.array([*(paid | received).values()], rewards.dtype)
-        observations = self._batch(self.single_observation_space, told | first)
-        return observations, rewards, terminated, truncated, self._with(infos, more | at_first)
+        if begin:
+            first, at_first = self._delays.begin({w: now[w] for w in begin})
+            told |= first
+            more |= at_first
+        paid |= received
+        rewards = np.array([*paid.values()], rewards.dtype)
+        observations = self._batch(self.single_observation_space, told)
+        infos = self._with(infos, more)
+        return observations, rewards, terminated, truncated, infos
 
     def _by_world(self, space: Space[Any], things: Any) -> ByName:
         """A batch as a dict by world."""
-        return dict(zip(self._worlds, iterate(space, things), strict=True))
+        each = iterate(space, things)
+        return dict(zip(self._worlds, each, strict=True))
 
     def _batch(self, space: Space[Any], things: ByName) -> Any:
         """Things of all worlds in one batch."""
         empty = create_empty_array(space, len(self._worlds))
-        return concatenate(space, [things[world] for world in self._worlds], empty)
+        in_order = [things[world] for world in self._worlds]
+        return concatenate(space, in_order, empty)
 
     def _with(self, infos: ByName, more: ByName) -> ByName:
         """Infos of the batch, which the environment may keep, with those of some worlds."""
@@ -214,48 +231,56 @@ class Delays:
             checks.whole(name, told[name], 0, unit="steps")
         self._history = told["history"]
         self._timeline = told["timeline"]
-        self._parts = {agent: [agent] if agent in observed else [*observed] for agent in acting}
+        self._parts: dict[str, list[str]] = {}
+        for agent in acting:
+            self._parts[agent] = [agent] if agent in observed else [*observed]
         self._observations = _Link("observation", observed, told)
-        self.actions, self._rewards = (_Link(name, acting, told) for name in ("action", "reward"))
-        checks.require(not self._rewards.sampler.loses, "reward", told["reward"], LOSES)
+        self.actions = _Link("action", acting, told)
+        self._rewards = _Link("reward", acting, told)
+        all_arrive = not self._rewards.sampler.loses
+        checks.require(all_arrive, "reward", told["reward"], LOSES)
         needed = self.actions.sampler.late or self._history
-        given = told["default"]
-        default = {
-            a: given[a] if a in given else _zero(acting[a]) if needed else None for a in acting
-        }
+        default = dict(told["default"])
+        for agent, space in acting.items():
+            if agent not in default:
+                default[agent] = _zero(space) if needed else None
         self._default = copy.deepcopy(default)
         self.present: set[str] = set()
         """Agents whose episode goes on."""
-        self._messages = {
-            n: _flat("timeline", each) for n, each in observed.items() if self._timeline
-        }
-        self._chosen = {a: _flat("history", each) for a, each in acting.items() if self._history}
+        self._messages: ByName = {}
+        if self._timeline:
+            self._messages = {part: _flat("timeline", each) for part, each in observed.items()}
+        self._chosen: ByName = {}
+        if self._history:
+            self._chosen = {agent: _flat("history", each) for agent, each in acting.items()}
 
     def space(self, agent: str, space: Space[Any]) -> Space[Any]:
         """The space of what an agent is told, whose observations are in ``space``."""
-        added = {
-            name: Box(-np.inf, np.inf, each.shape) for name, each in self._added(agent).items()
-        }
-        own = dict(space.spaces) if isinstance(space, Dict) else {"observation": space}
-        taken = sorted(added.keys() & own.keys())
-        checks.require(
-            not taken, "observation", listed(taken), "is an entry of it already: rename that"
-        )
-        return Dict({**own, **added}) if added else space
+        added = self._added(agent)
+        if not added:
+            return space
+        entries = dict(space.spaces) if isinstance(space, Dict) else {"observation": space}
+        taken = sorted(added.keys() & entries.keys())
+        should = "is an entry of it already: rename that"
+        checks.require(not taken, "observation", listed(taken), should)
+        for name, each in added.items():
+            entries[name] = Box(-np.inf, np.inf, each.shape)
+        return Dict(entries)
 
-    def reset(self, observations: ByName, seed: int | None) -> tuple[ByName, ByName]:
+    def reset(self, observations: ByName, seed: int | None) -> Told:
         """What agents are told first, and their infos; a seed decides all later delays."""
         for link in (self._observations, self.actions, self._rewards):
             link.reset(seed)
         self.present = set()
         return self.begin(observations)
 
-    def begin(self, observations: ByName) -> tuple[ByName, ByName]:
+    def begin(self, observations: ByName) -> Told:
         """The same where the episodes of some agents begin."""
         agents = self._agents(observations)
         self.present |= {*agents}
         self._observations.begin(observations)
-        self.actions.begin({agent: self._default[agent] for agent in agents})
+        defaults = {agent: self._default[agent] for agent in agents}
+        self.actions.begin(defaults)
         self._rewards.begin(dict.fromkeys(agents, 0.0))
         return self._told(agents)
 
@@ -263,7 +288,8 @@ class Delays:
         """What is executed when agents choose these actions."""
         sent = {agent: action for agent, action in actions.items() if agent in self.present}
         self.actions.send(sent)
-        return {**actions, **{agent: self.actions.held(agent) for agent in sent}}
+        executed = {agent: self.actions.held(agent) for agent in sent}
+        return {**actions, **executed}
 
     def step(
         self, observations: ByName, rewards: ByName, ended: list[str]
@@ -273,23 +299,18 @@ class Delays:
         rewards = dict(rewards)
         self._observations.send(observations)
         if joining := {*agents} - self.present:
-            self.begin(
-                {part: observations[part] for agent in joining for part in self._parts[agent]}
-            )
+            parts = (part for agent in joining for part in self._parts[agent])
+            self.begin({part: observations[part] for part in parts})
         told, infos = self._told(agents)
         if self._rewards.sampler.late:
             self._rewards.send(rewards)
             for agent in rewards:
-                sent = self._rewards.recent(agent).items()
-                due = [
-                    (age, r)
-                    for age, (r, wait) in sent
-                    if wait == 0 or (wait > 0 and agent in ended)
-                ]
-                infos[agent]["received"], rewards[agent] = (
-                    due,
-                    float(sum(reward for _, reward in due)),
-                )
+                received = []
+                for age, (reward, wait) in self._rewards.recent(agent).items():
+                    if wait == 0 or (wait > 0 and agent in ended):
+                        received.append((age, reward))
+                infos[agent]["received"] = received
+                rewards[agent] = float(sum(reward for _, reward in received))
         self.present -= {*ended}
         return told, rewards, infos
 
@@ -297,51 +318,56 @@ class Delays:
         """The agents of whom there are observations."""
         return [agent for agent, parts in self._parts.items() if observations.keys() >= {*parts}]
 
-    def _told(self, agents: list[str]) -> tuple[ByName, ByName]:
+    def _told(self, agents: list[str]) -> Told:
         """What agents are told, and their infos."""
+        link = self._observations
         told = {}
         infos = {}
         for agent in agents:
-            found: Any = {part: self._observations.held(part) for part in self._parts[agent]}
-            age: Any = {part: self._observations.age[part] for part in found}
+            parts = self._parts[agent]
+            found: Any = {part: link.held(part) for part in parts}
+            age: Any = {part: link.age[part] for part in parts}
             if agent in found:
                 found = found[agent]
                 age = age[agent]
             if added := self._added(agent):
-                found = {
-                    **(found if isinstance(found, Mapping) else {"observation": found}),
-                    **added,
-                }
-            told[agent], infos[agent] = found, {"age": age}
+                own = found if isinstance(found, Mapping) else {"observation": found}
+                found = {**own, **added}
+            told[agent] = found
+            infos[agent] = {"age": age}
         return told, infos
 
-    def _added(self, agent: str) -> dict[str, NDArray[np.float32]]:
+    def _added(self, agent: str) -> dict[str, Numbers]:
         """The entries that are added to the observation of an agent."""
         added = {}
         parts = self._parts[agent]
-        link = self._observations
         if self._timeline:
-            added["timeline"] = np.concatenate([self._slots(part) for part in parts], -1)
+            slots = [self._slots(part) for part in parts]
+            added["timeline"] = np.concatenate(slots, -1)
         if self._history:
             sent = self.actions.recent(agent)
             first = (self._default[agent], 0)
             space, low, width = self._chosen[agent]
-            chosen = [sent.get(age, first)[0] for age in reversed(range(self._history))]
-            numbers = [np.asarray(flatten(space, action), np.float32) for action in chosen]
-            added["action_history"] = np.concatenate([(each - low) / width for each in numbers])
-        return (
-            added | {"age": np.array([link.age[part] for part in parts], np.float32)}
-            if added
-            else {}
-        )
+            chosen = []
+            for age in reversed(range(self._history)):
+                action, _ = sent.get(age, first)
+                numbers = np.asarray(flatten(space, action), np.float32)
+                chosen.append((numbers - low) / width)
+            added["action_history"] = np.concatenate(chosen)
+        if added:
+            ages = [self._observations.age[part] for part in parts]
+            added["age"] = np.array(ages, np.float32)
+        return added
 
-    def _slots(self, part: str) -> NDArray[np.float32]:
+    def _slots(self, part: str) -> Numbers:
         """The timeline of what is sent under a name, [K, D + 1]."""
         space, low, _ = self._messages[part]
-        slots: Any = np.zeros((self._timeline, len(low) + 1), np.float32)
+        width = len(low) + 1
+        slots: Any = np.zeros((self._timeline, width), np.float32)
         for age, (thing, wait) in self._observations.recent(part).items():
             if age < self._timeline and wait <= 0:
-                slots[age, :-1], slots[age, -1] = flatten(space, thing), 1
+                slots[age, :-1] = flatten(space, thing)
+                slots[age, -1] = 1
         return slots
 
 
@@ -353,43 +379,49 @@ class _Link:
     """
 
     def __init__(self, name: str, senders: Collection[str], told: ByName) -> None:
-        laws: list[Any] = [told[name], told["loss"] if name == "observation" else 0.0]
+        loss = told["loss"] if name == "observation" else 0.0
+        laws: list[Any] = [told[name], loss]
+        should = f"is named, but the names are: {listed(filter(None, senders))}"
         for key, given in zip((name, "loss"), laws, strict=True):
-            unknown = [each for each in given if each not in senders] if _by_name(given) else []
-            should = f"is named, but the names are: {listed(filter(None, senders))}"
-            checks.require(not unknown, key, listed(unknown), should)
-        each = [
-            [law.get(sender, 0) if _by_name(law) else law for law in laws] for sender in senders
+            if _by_name(given):
+                unknown = [each for each in given if each not in senders]
+                checks.require(not unknown, key, listed(unknown), should)
+        by_name: list[ByName] = [
+            law if _by_name(law) else dict.fromkeys(senders, law) for law in laws
         ]
+        each = [[law.get(sender, 0) for law in by_name] for sender in senders]
         distinct = [law for i, law in enumerate(each) if law not in each[:i]]
-        samplers = [sampler_of(law, told["dt"], loss, name) for law, loss in distinct]
+        dt = told["dt"]
+        samplers = [sampler_of(law, dt, loss, name) for law, loss in distinct]
         self.sampler: Sampler = samplers[0]
         if len(samplers) > 1:
             index = torch.tensor([distinct.index(law) for law in each])
-            self.sampler = LinkSampler(samplers, index, torch.zeros(len(index)))
+            no_loss = torch.zeros(len(index))
+            self.sampler = LinkSampler(samplers, index, no_loss)
         self._line = DelayLine(self.sampler, "generation")
-        self._contexts = ContextReader(
-            self.sampler, None, told["dt"], name, before_step=name == "action"
-        )
-        self._numbers = torch.tensor(
-            [counter_rng.number_of(f"{name} {each}".strip()) for each in senders]
-        )
+        before_step = name == "action"
+        self._contexts = ContextReader(self.sampler, None, dt, name, before_step=before_step)
+        names = (f"{name} {sender}".strip() for sender in senders)
+        self._numbers = torch.tensor([*map(counter_rng.number_of, names)])
         self._memory: Memory | None = None
-        self._now, self._kept = 0, max(self.sampler.longest, told["timeline"], told["history"])
+        self._now = 0
+        self._kept = max(self.sampler.longest, told["timeline"], told["history"])
         self.age = dict.fromkeys(senders, 0)
         """Age of what is held of each sender [steps]."""
-        self._sent: dict[str, dict[int, tuple[Any, float]]] = {sender: {} for sender in senders}
+        self._sent: dict[str, Sent] = {sender: {} for sender in senders}
         """What was sent, and when it arrives, by sender and time."""
 
     def reset(self, seed: int | None) -> None:
         """Forget all messages; a seed decides all later delays."""
         self._sent = {sender: {} for sender in self.age}
         if self._memory is None or seed is not None:
-            entropy = np.random.SeedSequence(seed).generate_state(1, np.uint64).view(np.int64)
-            streams = counter_rng.bits64(torch.from_numpy(entropy), self._numbers)
+            entropy = np.random.SeedSequence(seed).generate_state(1, np.uint64)
+            world = torch.from_numpy(entropy.view(np.int64))
+            streams = counter_rng.bits64(world, self._numbers)
             streams = streams_for(self.sampler, streams, len(streams))
             memory = self._line.init_memory([], streams)
-            self._memory = memory | {"agents": torch.arange(len(streams))}
+            memory["agents"] = torch.arange(len(streams))
+            self._memory = memory
             self._now = 0
 
     def begin(self, firsts: ByName) -> None:
@@ -404,19 +436,23 @@ class _Link:
         """Send the things of some senders."""
         if self._memory is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        self._now, delays, things = self._now + 1, [0] * len(self.age), copy.deepcopy(things)
+        self._now += 1
+        delays = [0] * len(self.age)
+        things = copy.deepcopy(things)
         if self.sampler.late:
             sends = torch.tensor([sender in things for sender in self.age])
             sent = None if sends.all() else sends
             context = self._contexts.read(self._memory, {}, sent, sends.shape)
             self._memory, delivery = self._line.step(self._memory, [], sent, context)
-            self.age = dict(zip(self.age, delivery.age.tolist(), strict=True))
+            ages = delivery.age.tolist()
+            self.age = dict(zip(self.age, ages, strict=True))
             delays = delivery.delay.tolist()
+        now = self._now
         for sender, delay in zip(self.age, delays, strict=True):
             sent = self._sent[sender]
-            now = self._now
             if sender in things:
-                sent[now] = things[sender], now + delay if delay < self.sampler.lost else math.inf
+                due = now + delay if delay < self.sampler.lost else math.inf
+                sent[now] = things[sender], due
             # What is neither recent nor held is never asked for again.
             recent = now - self._kept
             held = now - self.age[sender]
@@ -424,19 +460,20 @@ class _Link:
 
     def held(self, sender: str) -> Any:
         """What is held of a sender."""
-        return copy.deepcopy(self._sent[sender][self._now - self.age[sender]][0])
+        time = self._now - self.age[sender]
+        thing, _ = self._sent[sender][time]
+        return copy.deepcopy(thing)
 
-    def recent(self, sender: str) -> dict[int, tuple[Any, float]]:
+    def recent(self, sender: str) -> Sent:
         """What a sender sent lately, and the time until it arrives, by age [steps]."""
-        return {
-            self._now - t: (thing, due - self._now)
-            for t, (thing, due) in self._sent[sender].items()
-        }
+        now = self._now
+        recent = {}
+        for time, (thing, due) in self._sent[sender].items():
+            recent[now - time] = thing, due - now
+        return recent
 
 
-def _flat(
-    key: str, space: Space[Any]
-) -> tuple[Space[Any], NDArray[np.float32], NDArray[np.float32]]:
+def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], Numbers, Numbers]:
     """A space, and the bound and width of each of its D numbers, 0 and 1 if they have no bounds,
     [D]."""
     flat = flatten_space(space)
@@ -444,25 +481,22 @@ def _flat(
         raise InputError(f"{key}: {space} has no vectors of a fixed length")
     with np.errstate(over="ignore"):  # a bound may be the largest number
         low = np.float32(flat.low)
-        width = np.float32(flat.high) - np.float32(flat.low)
+        width = np.float32(flat.high) - low
     bounded = np.isfinite(width)
-    return (
-        space,
-        np.where(bounded, low, np.float32(0)),
-        np.where(bounded & (width > 0), width, np.float32(1)),
-    )
+    low = np.where(bounded, low, np.float32(0))
+    width = np.where(bounded & (width > 0), width, np.float32(1))
+    return space, low, width
 
 
 def _copied(infos: ByName) -> ByName:
     """A copy of infos down to their arrays; what else they hold cannot always be copied."""
-    return {
-        name: _copied(each)
-        if isinstance(each, dict)
-        else each.copy()
-        if isinstance(each, np.ndarray)
-        else each
-        for name, each in infos.items()
-    }
+    copied = dict(infos)
+    for name, each in infos.items():
+        if isinstance(each, dict):
+            copied[name] = _copied(each)
+        elif isinstance(each, np.ndarray):
+            copied[name] = each.copy()
+    return copied
 
 
 def _by_name(given: Any) -> bool:
@@ -472,7 +506,8 @@ def _by_name(given: Any) -> bool:
 
 def _zero(space: Space[Any]) -> Any:
     """The action 0 of a space."""
-    zero = next(iter(iterate(batch_space(space, 1), create_empty_array(space, 1))))
+    zeros = create_empty_array(space, 1)
+    zero = next(iter(iterate(batch_space(space, 1), zeros)))
     if not space.contains(zero):
         raise InputError(f"default: is missing, and {space} has no action 0")
     return zero

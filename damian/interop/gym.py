@@ -53,11 +53,14 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         return instant.observation[0, 0], row(instant.infos, 0, 0)
 
     def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
-        instant, _ = self.flight.step(actions_in(self.action_space, "action", action)[None, None])
+        chosen = actions_in(self.action_space, "action", action)
+        instant, _ = self.flight.step(chosen[None, None])
         self._infos = instant.infos
         info = row(instant.infos, 0, 0)
-        ends = bool(instant.terminated[0]), bool(instant.truncated[0])
-        return instant.observation[0, 0], float(instant.reward[0, 0]), *ends, info
+        reward = float(instant.reward[0, 0])
+        terminated = bool(instant.terminated[0])
+        truncated = bool(instant.truncated[0])
+        return instant.observation[0, 0], reward, terminated, truncated, info
 
     def render(self) -> Any:
         return self.flight.render()
@@ -65,7 +68,9 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
     def action_masks(self) -> Array:
         """Which discrete actions are legal now, [A] bool; all of them if nothing is masked."""
         space = cast(gymnasium.spaces.Discrete, self.action_space)
-        return row(self._infos, 0, 0).get("action_mask", np.ones(space.n)).astype(bool)
+        info = row(self._infos, 0, 0)
+        mask = info.get("action_mask", np.ones(space.n))
+        return mask.astype(bool)
 
 
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
@@ -90,9 +95,8 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        checks.require(
-            not isinstance(seed, list), "seed", seed, "is a list: world i draws from seed + i"
-        )
+        is_list = isinstance(seed, list)
+        checks.require(not is_list, "seed", seed, "is a list: world i draws from seed + i")
         instant = self.flight.reset(seed)  # type: ignore[arg-type]
         return instant.observation[:, 0], _infos(instant.infos)
 
@@ -106,16 +110,23 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
             for world in done.nonzero()[0]:
                 final[world] = last.observation[world, 0]
             infos |= {"final_obs": final, "_final_obs": done}
-            infos |= {"final_info": _infos(last.infos, done), "_final_info": done}
-        return instant.observation[:, 0], last.reward[:, 0], last.terminated, last.truncated, infos
+            infos["final_info"] = _infos(last.infos, done)
+            infos["_final_info"] = done
+        observation = instant.observation[:, 0]
+        reward = last.reward[:, 0]
+        return observation, reward, last.terminated, last.truncated, infos
 
 
 def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, Any]:
     """Infos of the worlds [B, ...] by name, each with a mask of the worlds [B] that have it
     (all)."""
-    found = {name: each if name == "is_success" else each[:, 0] for name, each in infos.items()}
-    mask = np.ones(len(infos["ready"]), bool) if worlds is None else worlds
-    return found | {f"_{name}": mask.copy() for name in found}
+    if worlds is None:
+        worlds = np.ones(len(infos["ready"]), bool)
+    found = {}
+    for name, each in infos.items():
+        found[name] = each if name == "is_success" else each[:, 0]
+    masks = {f"_{name}": worlds.copy() for name in found}
+    return found | masks
 
 
 def one_uav(scenario: ScenarioConfig) -> None:

@@ -77,7 +77,8 @@ class Mappo:
         numbers["explained_variance"] = explained_variance(corrected).item()
         if self.buffer is None:
             return numbers
-        return {"backupdated": corrected[keys.BACKUPDATED].float().mean().item(), **numbers}
+        backupdated = corrected[keys.BACKUPDATED].float().mean()
+        return {"backupdated": backupdated.item(), **numbers}
 
     @torch.no_grad()
     def backupdated_batch(self, batch: TensorDictBase) -> TensorDictBase:
@@ -94,9 +95,11 @@ class Mappo:
         settle = self.setup.settle_steps
         self.buffer.extend(batch.exclude(*self.unread))
         latest = storage.latest(batch.shape[1] + settle)
-        batch = storage[latest[: len(latest) - settle]].transpose(0, 1)
+        settled = latest[: len(latest) - settle]
+        batch = storage[settled].transpose(0, 1)
         if self.setup.recompute_actor:
-            batch[keys.ACTION_LOG_PROB] = self.actor.get_dist(batch).log_prob(batch[keys.ACTION])
+            policy = self.actor.get_dist(batch)
+            batch[keys.ACTION_LOG_PROB] = policy.log_prob(batch[keys.ACTION])
         return batch
 
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
@@ -112,24 +115,29 @@ class Mappo:
             terms.append(torch.cat([losses.detach(), numbers, norm.view(1)]))
         # A number that is read at once would make the device wait at every minibatch.
         names = (*LOSSES, *NUMBERS, "gradient_norm")
-        return dict(zip(names, torch.stack(terms).double().mean(0).tolist(), strict=True))
+        means = torch.stack(terms).double().mean(0)
+        return dict(zip(names, means.tolist(), strict=True))
 
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
         """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
         recurrent = self.setup.model.recurrent
-        read = [*self.loss_keys, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
-        found = {key: batch.get(key, None) for key in read}
-        samples = {
-            k: v if recurrent else v.flatten(0, 1) for k, v in found.items() if v is not None
-        }
-        n_samples = len(samples[keys.READY])
-        device = samples[keys.READY].device
+        read = [*self.loss_keys, *self.critic.in_keys]
+        if recurrent:
+            read += RECURRENT_KEYS
+        samples = {}
+        for key in read:
+            entry = batch.get(key, None)
+            if entry is not None:
+                samples[key] = entry if recurrent else entry.flatten(0, 1)
+        ready = samples[keys.READY]
+        n_samples = len(ready)
         n_minibatches = min(self.config.minibatches, n_samples)
         for _ in range(self.config.epochs):
-            order = torch.randperm(n_samples, device=device)
-            parts = {
-                k: v.index_select(0, order).tensor_split(n_minibatches) for k, v in samples.items()
-            }
+            order = torch.randperm(n_samples, device=ready.device)
+            parts = {}
+            for key, entry in samples.items():
+                shuffled = entry.index_select(0, order)
+                parts[key] = shuffled.tensor_split(n_minibatches)
             for i in range(n_minibatches):
                 yield {key: part[i] for key, part in parts.items()}
 
@@ -161,14 +169,15 @@ def mappo_losses(
     log_ratio, entropy = policy_terms(steps, actor)
     ratio = log_ratio.exp()
     advantage = entries[keys.ADVANTAGE].squeeze(-1)
-    clipped = ratio.clamp(1 - config.clip_epsilon, 1 + config.clip_epsilon)
+    epsilon = config.clip_epsilon
+    clipped = ratio.clamp(1 - epsilon, 1 + epsilon)
     objective = torch.minimum(ratio * advantage, clipped * advantage)
     n_decisions = ready.sum().clamp(min=1)
     scale = value_scale(critic)
     mean_entropy = (entropy * ready).sum() / n_decisions
-    error = smooth_l1_loss(
-        critic(steps)[keys.STATE_VALUE] / scale, entries[keys.VALUE_TARGET] / scale
-    )
+    value = critic(steps)[keys.STATE_VALUE]
+    target = entries[keys.VALUE_TARGET]
+    error = smooth_l1_loss(value / scale, target / scale)
     losses = [
         -(objective * ready).sum() / n_decisions,
         -config.entropy_coeff * mean_entropy,
@@ -176,9 +185,11 @@ def mappo_losses(
     ]
     with torch.no_grad():
         divergence = (ratio - 1 - log_ratio) * ready
-        beyond = ((ratio - 1).abs() > config.clip_epsilon) * ready
-        means = torch.stack([divergence.sum(), beyond.sum()]) / n_decisions
-    return torch.stack(losses), torch.cat([means, mean_entropy.detach().view(1)])
+        beyond = ((ratio - 1).abs() > epsilon) * ready
+        sums = torch.stack([divergence.sum(), beyond.sum()])
+        means = sums / n_decisions
+    numbers = torch.cat([means, mean_entropy.detach().view(1)])
+    return torch.stack(losses), numbers
 
 
 def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
@@ -188,7 +199,8 @@ def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tens
         policy = actor.get_dist(steps)
     log_ratio = policy.log_prob(steps[keys.ACTION]) - steps[keys.ACTION_LOG_PROB]
     if isinstance(policy, TanhNormal):
-        return log_ratio, -policy.rsample_and_log_prob()[1]
+        _, log_prob = policy.rsample_and_log_prob()
+        return log_ratio, -log_prob
     return log_ratio, policy.entropy()
 
 
@@ -203,19 +215,26 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     """
     next_step = cast(TensorDictBase, batch["next"])
     value, next_value = state_values(batch, critic)
-    batch[keys.STATE_VALUE], next_step[keys.STATE_VALUE] = value, next_value
-    ends = (next_step[key].unsqueeze(-2).expand_as(value) for key in (keys.DONE, keys.TERMINATED))
+    batch[keys.STATE_VALUE] = value
+    next_step[keys.STATE_VALUE] = next_value
+    flags = next_step[keys.DONE], next_step[keys.TERMINATED]
+    ends = (flag.unsqueeze(-2).expand_as(value) for flag in flags)
     # TorchRL says float, but broadcasts tensors.
-    lmbda: Any = torch.where(next_step[keys.READY].unsqueeze(-1), config.lmbda, 1.0)
-    advantage, batch[keys.VALUE_TARGET] = generalized_advantage_estimate(
-        config.gamma, lmbda, value, next_value, next_step[keys.REWARD], *ends, time_dim=-3
+    decides_next = next_step[keys.READY].unsqueeze(-1)
+    lmbda: Any = torch.where(decides_next, config.lmbda, 1.0)
+    reward = next_step[keys.REWARD]
+    advantage, target = generalized_advantage_estimate(
+        config.gamma, lmbda, value, next_value, reward, *ends, time_dim=-3
     )
+    batch[keys.VALUE_TARGET] = target
     if isinstance(critic.module, NormalizedValue):
-        critic.module.norm.update(batch[keys.VALUE_TARGET].double())
+        critic.module.norm.update(target.double())
     ready = batch[keys.READY].unsqueeze(-1)
     if config.normalize_advantage:
-        decisions = advantage[ready] if ready.any() else torch.zeros(1, device=advantage.device)
-        advantage = (advantage - decisions.mean()) / decisions.std(correction=0).clamp(min=1e-6)
+        decisions = advantage[ready] if ready.any() else advantage.new_zeros(1)
+        centred = advantage - decisions.mean()
+        scale = decisions.std(correction=0).clamp(min=1e-6)
+        advantage = centred / scale
     else:
         advantage = advantage / value_scale(critic)
     batch[keys.ADVANTAGE] = torch.where(ready, advantage, 0.0)
@@ -224,7 +243,9 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
 def value_scale(critic: TensorDictModule) -> Tensor | float:
     """Running standard deviation of a critic's value targets, [1]; 1 if its values are not
     normalised."""
-    return critic.module.norm.scale().float() if isinstance(critic.module, NormalizedValue) else 1.0
+    if not isinstance(critic.module, NormalizedValue):
+        return 1.0
+    return critic.module.norm.scale().float()
 
 
 def explained_variance(batch: TensorDictBase) -> Tensor:
@@ -232,20 +253,25 @@ def explained_variance(batch: TensorDictBase) -> Tensor:
     none."""
     target = batch[keys.VALUE_TARGET].double()
     variance = target.var(correction=0)
-    left = (target - batch[keys.STATE_VALUE]).var(correction=0)
-    return torch.where(variance > 0, 1 - left / variance, torch.nan)
+    left = target - batch[keys.STATE_VALUE]
+    explained = 1 - left.var(correction=0) / variance
+    return torch.where(variance > 0, explained, torch.nan)
 
 
 def state_values(batch: TensorDictBase, critic: TensorDictModule) -> tuple[Tensor, Tensor]:
     """Values before and after each step of a batch [B, T], [B, T, N, 1]; equal observations count
     once."""
     (key,) = critic.in_keys
-    before, after = (cast(Tensor, batch[at]) for at in (key, keys.next_key(key)))
-    followed = after[:, :-1].eq(before[:, 1:]).flatten(2).all(-1)
+    before = cast(Tensor, batch[key])
+    after = cast(Tensor, batch[keys.next_key(key)])
+    equal = after[:, :-1].eq(before[:, 1:])
+    followed = equal.flatten(2).all(-1)
     alone = pad(~followed, (0, 1), value=True)  # no step follows the last one
     observed = torch.cat([before.flatten(0, 1), after[alone]])
-    values = critic(TensorDict({key: observed}, [len(observed)]))[keys.STATE_VALUE]
-    value = values[: batch.numel()].view(*batch.shape, *values.shape[1:])
+    once = TensorDict({key: observed}, [len(observed)])
+    values = critic(once)[keys.STATE_VALUE]
+    n_steps = batch.numel()
+    value = values[:n_steps].view(*batch.shape, *values.shape[1:])
     next_value = value.roll(-1, 1)
-    next_value[alone] = values[batch.numel() :]
+    next_value[alone] = values[n_steps:]
     return value, next_value

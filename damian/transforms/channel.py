@@ -100,22 +100,24 @@ class Channel(StatefulTransform):
                 "does not go with in_key or known_at_reset: at a reset no message has been chosen "
                 "yet"
             )
-            checks.require(in_key is None and not known_at_reset, "action_key", action_key, should)
+            chosen_only = in_key is None and not known_at_reset
+            checks.require(chosen_only, "action_key", action_key, should)
         placed = position_key is not None
-        checks.require(
-            comm_range is None or placed, "comm_range", comm_range, "needs a position_key"
-        )
-        sent = None if action_key is not None else in_key or ("agents", "observation")
-        super().__init__(sent, seed=seed)
+        known_places = comm_range is None or placed
+        checks.require(known_places, "comm_range", comm_range, "needs a position_key")
+        sent = in_key or ("agents", "observation")
+        super().__init__(sent if action_key is None else None, seed=seed)
         self.action_key = None if action_key is None else unravel_key(action_key)
         self._beside = cast(NestedKey, self.action_key or self.in_keys[0])
         should = "is not in a group of agents, as ('agents', 'observation') is"
-        checks.require(isinstance(self._beside, tuple), "in_key", self._beside, should)
-        written, self.age_key, self.mask_key, self.delay_key, self.sent_key, self.position_key = (
-            sibling_key(self._beside, key)
-            for key in (out_key, age_key, mask_key, delay_key, sent_key, position_key)
-        )
-        self.out_keys = existing([written, self.age_key, self.mask_key, self.delay_key])
+        in_group = isinstance(self._beside, tuple)
+        checks.require(in_group, "in_key", self._beside, should)
+        written = out_key, age_key, mask_key, delay_key
+        beside = [sibling_key(self._beside, key) for key in written]
+        _, self.age_key, self.mask_key, self.delay_key = beside
+        self.out_keys = existing(beside)
+        self.sent_key = sibling_key(self._beside, sent_key)
+        self.position_key = sibling_key(self._beside, position_key)
         self.message_size = message_size
         self.known_at_reset = known_at_reset
         self.dt = dt
@@ -138,9 +140,10 @@ class Channel(StatefulTransform):
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         """The shape of the rows: there is one for each link (receiver, sender), [*B, N, N]."""
         agents = super().find_rows(tensordict)
-        should = f"are given for {self.n_agents} agents, but {self._beside} is of {agents[-1]}"
-        checks.require(self.n_agents in (None, agents[-1]), "Channel", "the links", should)
-        return torch.Size((*agents, agents[-1]))
+        n = agents[-1]
+        should = f"are given for {self.n_agents} agents, but {self._beside} is of {n}"
+        checks.require(self.n_agents in (None, n), "Channel", "the links", should)
+        return torch.Size((*agents, n))
 
     @property
     def agents(self) -> torch.Size:
@@ -151,36 +154,43 @@ class Channel(StatefulTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         entries = select_entries(tensordict, self.step_keys)
-        content = self._content(entries, next(iter(tensordict.values(True, True))).device)
+        example = next(iter(tensordict.values(True, True)))
+        content = self._content(entries, example.device)
         n = self.agents[-1]
         streams = self.streams(tensordict.batch_size, content.device, self.sampler)
         links = torch.arange(len(streams), device=streams.device)
         receiver = links // n
         sender = links % n
+        first_of_world = receiver // n * n
+        of_last_receiver = links.view(-1, n, n)[:, -1]
         memory = self.line.init_memory([], streams)
-        memory |= {"sender": receiver // n * n + sender, "hears": receiver % n != sender}
-        memory["link"] = links.view(-1, n, n)[:, -1].flatten()
+        memory["sender"] = first_of_world + sender
+        memory["hears"] = receiver % n != sender
+        memory["link"] = of_last_receiver.flatten()
         memory["contents"] = content.new_zeros(self._n_slots, *content.shape)
         memory["held"] = content.new_zeros(len(links), *content.shape[1:])
-        return memory | {"delay": torch.zeros_like(streams)} if self.delay_key else memory
+        if self.delay_key:
+            memory["delay"] = torch.zeros_like(streams)
+        return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         self._put(memory, self._content(entries, mask.device))
         begun, _ = self.line.reset(memory, [], mask)
-        begun["held"] = begun["held"].masked_fill(expand_mask(mask, begun["held"]), 0)
-        sending = mask & self._wanted(entries, mask) & (self.action_key is None)
-        after = self._send(begun, entries, sending)
+        held = begun["held"]
+        begun["held"] = held.masked_fill(expand_mask(mask, held), 0)
+        wanted = self._wanted(entries, mask) & (self.action_key is None)
+        after = self._send(begun, entries, wanted)
         if self.known_at_reset:
             after["generated_at"] = torch.where(mask, after["clock"], after["generated_at"])
             after = self._hold(after, mask)
-            after |= {"delay": torch.zeros_like(after["delay"])} if self.delay_key else {}
-        merged = {
-            name: new
-            if new is begun[name]
-            else torch.where(expand_mask(mask, new), new, begun[name])
-            for name, new in after.items()
-        }
-        return memory | merged, self._outputs(memory | merged)
+            if self.delay_key:
+                after["delay"] = torch.zeros_like(after["delay"])
+        memory = dict(memory)
+        for name, new in after.items():
+            old = begun[name]
+            changed = new is not old
+            memory[name] = torch.where(expand_mask(mask, new), new, old) if changed else new
+        return memory, self._outputs(memory)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         if self.action_key:
@@ -205,8 +215,10 @@ class Channel(StatefulTransform):
 
     def _put(self, memory: Memory, content: Tensor) -> None:
         """Write what the senders send in the next step, [S, ...]; the step may send it or not."""
-        rows = slot_rows((memory["clock"][memory["link"]] + 1) % self._n_slots)
-        memory["contents"].flatten(0, 1).index_copy_(0, rows, content)
+        following = memory["clock"][memory["link"]] + 1
+        rows = slot_rows(following % self._n_slots)
+        slots = memory["contents"].flatten(0, 1)
+        slots.index_copy_(0, rows, content)
 
     def _hold(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [M] is true, hold the messages that were generated at ``generated_at``."""
@@ -214,72 +226,84 @@ class Channel(StatefulTransform):
         old = memory["held"]
         rows = slot * len(memory["link"]) + memory["sender"]
         new = memory["contents"].flatten(0, 1).index_select(0, rows)
-        return memory | {"held": torch.where(expand_mask(mask, old), new, old)}
+        held = torch.where(expand_mask(mask, old), new, old)
+        return memory | {"held": held}
 
     def _wanted(self, entries: Entries, active: Tensor) -> Tensor:
         """Links among the active ones [M] on which an agent wants to send, [M] bool."""
         if self.sent_key is None:
             return active
         n = self.agents[-1]
-        return active & entries[self.sent_key].reshape(-1, 1, n).expand(-1, n, n).reshape(-1)
+        wants = entries[self.sent_key].reshape(-1, 1, n)
+        by_link = wants.expand(-1, n, n)
+        return active & by_link.reshape(-1)
 
     def _send(self, memory: Memory, entries: Entries, wanted: Tensor) -> Memory:
         """Send what was written last over the wanted links [M], and deliver what arrives in this
         step."""
         n = self.agents[-1]
-        position = (
-            as_rows(entries[self.position_key], self.agents)[:, :2] if self.position_key else None
-        )
+        position = None
+        if self.position_key:
+            position = as_rows(entries[self.position_key], self.agents)[:, :2]
         sent = wanted & memory["hears"]
         if self.comm_range is not None:
             place = cast(Tensor, position).view(-1, n, 2)
-            distance = torch.linalg.vector_norm(place.unsqueeze(1) - place.unsqueeze(2), dim=-1)
-            sent = sent & (distance <= self.comm_range).view(-1)
+            way = place.unsqueeze(1) - place.unsqueeze(2)
+            distance = torch.linalg.vector_norm(way, dim=-1)
+            is_near = distance <= self.comm_range
+            sent = sent & is_near.view(-1)
         context = self._context(memory, sent, position) if self.sampler.sees_context else None
         memory, delivery = self.line.step(memory, [], sent, context)
         memory = self._hold(memory, delivery.fresh)
-        return memory | {"delay": delivery.delay} if self.delay_key else memory
+        if self.delay_key:
+            memory["delay"] = delivery.delay
+        return memory
 
     def _context(self, memory: Memory, sent: Tensor, position: Tensor | None) -> MessageContext:
         """The circumstances of what is ``sent`` over the links [M]; positions are [B * N, 2]."""
         n = self.agents[-1]
         sender = memory["sender"]
         receiver = torch.arange(len(sender), device=sender.device) // n
-        places = {"position": sender, "receiver_position": receiver}
-        read = (
-            {} if position is None else {k: position.index_select(0, v) for k, v in places.items()}
-        )
-        n_sending = sent.view(-1, n, n).any(1).sum(-1).repeat_interleave(n * n)
-        time = (memory["clock"] - memory["reset_at"]) * self.dt
+        read = {}
+        if position is not None:
+            read["position"] = position.index_select(0, sender)
+            read["receiver_position"] = position.index_select(0, receiver)
+        is_sending = sent.view(-1, n, n).any(1)
+        n_sending = is_sending.sum(-1).repeat_interleave(n * n)
+        steps = memory["clock"] - memory["reset_at"]
+        time = steps * self.dt
         uniform = counter_rng.uniform(memory["streams"], memory["clock"] + 1)
         return MessageContext(sender % n, receiver % n, n_sending, time, uniform, self.dt, read)
 
     def _outputs(self, memory: Memory) -> Entries:
         """What the agents hold, with ages and flags; each agent holds its own message at once."""
         n = self.agents[-1]
-        shape = (*self.agents, self.agents[-1])
-        time, now = (
-            (memory[name] - memory["reset_at"]).view(-1, n) for name in ("generated_at", "clock")
-        )
+        shape = self.rows
+        start = memory["reset_at"]
+        time = (memory["generated_at"] - start).view(-1, n)
+        now = (memory["clock"] - start).view(-1, n)
         agents = torch.arange(len(now), device=now.device)
         senders = torch.arange(n, device=now.device)
         is_own = (agents % n).unsqueeze(-1) == senders
-        own_time = (
-            now.masked_fill(now == 1, 0) if self.action_key else now
-        )  # nothing is chosen at a reset
+        own_time = now
+        if self.action_key:  # nothing is chosen at a reset
+            own_time = now.masked_fill(now == 1, 0)
         time = torch.where(is_own, own_time, time)
-        newest = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
+        clock = memory["clock"][memory["link"]]
+        newest = slot_rows(clock % self._n_slots)
         own = memory["contents"].flatten(0, 1).index_select(0, newest)
         held = memory["held"].unflatten(0, (-1, n))
         value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
         entries: Entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
         if self.age_key is not None:
-            entries[self.age_key] = (now - time.clamp(min=1)).to(torch.float32).view(shape)
+            age = now - time.clamp(min=1)
+            entries[self.age_key] = age.to(torch.float32).view(shape)
         if self.mask_key is not None:
             entries[self.mask_key] = (time > 0).view(shape)
         if self.delay_key is not None:
             delay = memory["delay"].view(-1, n).masked_fill(is_own, 0)
-            entries[self.delay_key] = torch.where(delay < self.sampler.lost, delay, -1).view(shape)
+            delay = torch.where(delay < self.sampler.lost, delay, -1)
+            entries[self.delay_key] = delay.view(shape)
         return entries
 
     # The chosen message is an action for the policy, but none for the environment.
@@ -292,20 +316,21 @@ class Channel(StatefulTransform):
         input_spec = super().transform_input_spec(input_spec)
         if self.action_key and self.message_size:
             specs = cast(Composite, input_spec)["full_action_spec"]
-            shape = torch.Size((*spec_rows(specs, self.action_key), self.message_size))
+            agents = spec_rows(specs, self.action_key)
+            shape = torch.Size((*agents, self.message_size))
             specs[self.action_key] = Bounded(-1.0, 1.0, shape, device=specs.device)
         return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         agents = spec_rows(observation_spec, self._beside)
         pairs = (*agents, agents[-1])
+        received = self.out_keys[0]
         if self.message_size:
-            add_spec(observation_spec, self.out_keys[0], (*pairs, self.message_size))
+            add_spec(observation_spec, received, (*pairs, self.message_size))
         else:
             sent = observation_spec[self.in_keys[0]]
-            add_spec(
-                observation_spec, self.out_keys[0], (*pairs, *sent.shape[len(agents) :]), sent.dtype
-            )
+            size = sent.shape[len(agents) :]
+            add_spec(observation_spec, received, (*pairs, *size), sent.dtype)
         add_spec(observation_spec, self.age_key, pairs)
         add_spec(observation_spec, self.mask_key, pairs, torch.bool)
         add_spec(observation_spec, self.delay_key, pairs, torch.long)

@@ -77,9 +77,8 @@ class RewardDelay(StatefulTransform):
     ) -> None:
         super().__init__(reward_key, reward_key, seed=seed)
         self.reward_key: NestedKey = self.in_keys[0]
-        self.delay_key, self.earned_key = (
-            sibling_key(self.reward_key, k) for k in (delay_key, earned_key)
-        )
+        self.delay_key = sibling_key(self.reward_key, delay_key)
+        self.earned_key = sibling_key(self.reward_key, earned_key)
         self.out_keys = [self.reward_key, *existing([self.delay_key, self.earned_key])]
         self.sampler = sampler_of(delay, dt)
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
@@ -105,16 +104,20 @@ class RewardDelay(StatefulTransform):
         zero = torch.zeros_like(streams)
         state = self.sampler.initial_state(streams)
         memory = {name: zero.clone() for name in ("clock", "slot", "time", "reset_at")}
-        memory |= {"streams": streams, "state": state, "due": zero.repeat(self.n_slots, 1)}
+        memory |= {"streams": streams, "state": state}
+        memory["due"] = zero.repeat(self.n_slots, 1)
         memory["past"] = reward.new_zeros(self.n_slots, *reward.shape)
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         clock = memory["clock"]
-        time = memory["time"] + self.n_slots * mask
-        memory = memory | {"reset_at": torch.where(mask, clock, memory["reset_at"]), "time": time}
+        memory = dict(memory)
+        memory["reset_at"] = torch.where(mask, clock, memory["reset_at"])
+        memory["time"] = memory["time"] + self.n_slots * mask
         memory["state"] = self.sampler.begin_episode(memory["state"], mask)
-        return memory, self._told(torch.zeros_like(clock), torch.zeros_like(memory["past"][0]))
+        delay = torch.zeros_like(clock)
+        earned = torch.zeros_like(memory["past"][0])
+        return memory, self._told(delay, earned)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock = memory["clock"] + 1
@@ -122,23 +125,28 @@ class RewardDelay(StatefulTransform):
         context = self.contexts.read(memory, entries, None, self.rows)
         delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
         slot = (memory["slot"] + 1) % self.n_slots
-        memory = memory | {"clock": clock, "slot": slot, "state": state, "time": memory["time"] + 1}
-        memory["past"] = self._send(memory, reward, delay, self.sending_rows(entries))
+        time = memory["time"] + 1
+        memory = memory | {"clock": clock, "slot": slot, "state": state, "time": time}
+        past = self._send(memory, reward, delay, self.sending_rows(entries))
         row = slot_rows(slot)
-        here, due = (memory[name].flatten(0, 1).index_select(0, row) for name in ("past", "due"))
-        received = torch.where(expand_mask(due == memory["time"], here), here, 0)
+        here = past.flatten(0, 1).index_select(0, row)
+        due = memory["due"].flatten().index_select(0, row)
+        arrives = expand_mask(due == time, here)
+        received = torch.where(arrives, here, 0)
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = any_flag(done, self.rows)
-            past = memory["past"]
-            late = torch.where(expand_mask(memory["due"] > memory["time"], past), past, 0)
+            is_late = expand_mask(memory["due"] > time, past)
+            late = torch.where(is_late, past, 0)
             # In double precision, so that the order of the sum, which depends on the batch, does
             # not matter.
             precise = torch.float64 if past.is_floating_point() else past.dtype
             in_transit = late.sum(0, dtype=precise).to(past.dtype)
-            received = torch.where(expand_mask(ended, received), received + in_transit, received)
-            memory["time"] = memory["time"] + self.n_slots * ended
-        return memory, {self.reward_key: self.from_rows(received)} | self._told(delay, reward)
+            pays = expand_mask(ended, received)
+            received = torch.where(pays, received + in_transit, received)
+            memory["time"] = time + self.n_slots * ended
+        outputs: Entries = {self.reward_key: self.from_rows(received)}
+        return memory, outputs | self._told(delay, reward)
 
     def _send(
         self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None
@@ -149,10 +157,12 @@ class RewardDelay(StatefulTransform):
         arrival = memory["time"] + delay
         flat = past.flatten(0, 1)
         due = memory["due"].view(-1)
-        row = slot_rows((memory["slot"] + delay) % self.n_slots)
+        slot = (memory["slot"] + delay) % self.n_slots
+        row = slot_rows(slot)
         there = flat.index_select(0, row)
         old = due.index_select(0, row)
-        added = torch.where(expand_mask(old == arrival, there), there, 0) + reward
+        same_arrival = expand_mask(old == arrival, there)
+        added = torch.where(same_arrival, there, 0) + reward
         # ``old`` is never later; a compiler that sees that it is read before writes the new times
         # in place.
         arrival = torch.maximum(arrival, old)
@@ -168,23 +178,24 @@ class RewardDelay(StatefulTransform):
         [M, ...]."""
         entries: Entries = {}
         if self.delay_key is not None:
-            entries[self.delay_key] = self.from_rows(delay.unsqueeze(-1).clone())
+            delays = delay.unsqueeze(-1).clone()
+            entries[self.delay_key] = self.from_rows(delays)
         if self.earned_key is not None:
             entries[self.earned_key] = self.from_rows(earned.clone())
         return entries
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
+        key = self.reward_key
         if self.n_slots > 1:  # sums of rewards have other bounds than one reward
-            old = reward_spec[self.reward_key]
-            reward_spec[self.reward_key] = Unbounded(old.shape, dtype=old.dtype, device=old.device)
+            old = reward_spec[key]
+            reward_spec[key] = Unbounded(old.shape, dtype=old.dtype, device=old.device)
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         rewards = self.env.full_reward_spec
         earned = rewards[self.reward_key]
-        add_spec(
-            observation_spec, self.delay_key, (*spec_rows(rewards, self.reward_key), 1), torch.long
-        )
+        rows = spec_rows(rewards, self.reward_key)
+        add_spec(observation_spec, self.delay_key, (*rows, 1), torch.long)
         add_spec(observation_spec, self.earned_key, earned.shape, earned.dtype)
         return observation_spec
 
@@ -202,27 +213,35 @@ class RewardDelay(StatefulTransform):
         """What the rewards are by now: what a step earned if that has been paid, else 0."""
         key = next_key(self.reward_key)
         earned_key = self.earned_key and next_key(self.earned_key)
-        if key not in entries and (earned_key is None or earned_key not in steps.keys(True)):
+        if key in entries:
+            earned = entries[key]
+        elif earned_key is not None and earned_key in steps.keys(True):
+            earned = cast(Tensor, steps[earned_key])
+        else:
             raise InputError(
                 f"earned_key: nothing says what {key} was earned: give RewardDelay an earned_key"
             )
-        earned = entries[key] if key in entries else cast(Tensor, steps[earned_key])
         paid = self._paid(steps, count).squeeze(-1)
-        return entries | {
-            key: torch.where(expand_mask(paid, earned), earned, torch.zeros_like(earned))
-        }
+        unpaid = torch.zeros_like(earned)
+        reward = torch.where(expand_mask(paid, earned), earned, unpaid)
+        return entries | {key: reward}
 
     def _paid(self, steps: TensorDictBase, count: Tensor) -> Tensor:
         """Whether the reward of each step has been paid by the last step, in the shape of the
         delays."""
-        delay = cast(Tensor, steps[next_key(cast(NestedKey, self.delay_key))])
+        key = next_key(cast(NestedKey, self.delay_key))
+        delay = cast(Tensor, steps[key])
         begins = expand_mask(count == 0, delay).expand_as(delay)
-        step = expand_mask(torch.arange(len(delay), device=delay.device), delay).expand(delay.shape)
+        number = torch.arange(len(delay), device=delay.device)
+        step = expand_mask(number, delay).expand_as(delay)
         # The last step before a reset pays what is still in transit, if the environment was done
         # there.
-        last = torch.cat([next_true(begins)[1:], torch.full_like(step[:1], len(step))]) - 1
-        done = expand_mask(steps[keys.RESET_AFTER].squeeze(-1), delay).expand_as(step)
-        return (step + delay <= last) | done.gather(0, last)
+        end = torch.full_like(step[:1], len(step))
+        last = torch.cat([next_true(begins)[1:], end]) - 1
+        reset_after = steps[keys.RESET_AFTER].squeeze(-1)
+        done = expand_mask(reset_after, delay).expand_as(step)
+        arrived = step + delay <= last
+        return arrived | done.gather(0, last)
 
 
 def _zero_rewards(transform: StatefulTransform) -> Tensor:
@@ -256,24 +275,29 @@ class CumulativeReward(StatefulTransform):
         self.gamma = gamma
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        return {
-            "past": _zero_rewards(self).unsqueeze(1).repeat_interleave(self.n_slots, 1)
-        }  # [M, K, ...]
+        reward = _zero_rewards(self).unsqueeze(1)
+        past = reward.repeat_interleave(self.n_slots, 1)  # [M, K, ...]
+        return {"past": past}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        return {"past": memory["past"].masked_fill(expand_mask(mask, memory["past"]), 0)}, {}
+        past = memory["past"]
+        past = past.masked_fill(expand_mask(mask, past), 0)
+        return {"past": past}, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         reward = self.to_rows(entries[self.reward_key])
-        past = torch.cat([reward.unsqueeze(1), memory["past"][:, :-1]], 1)
-        total = discounted_sum(past.movedim(1, 0), self.gamma)
+        before = memory["past"][:, :-1]
+        past = torch.cat([reward.unsqueeze(1), before], 1)
+        newest_first = past.movedim(1, 0)
+        total = discounted_sum(newest_first, self.gamma)
         return {"past": past}, {self.reward_key: self.from_rows(total)}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
-        old = reward_spec[self.reward_key]
+        key = self.reward_key
         if self.n_slots > 1:
+            old = reward_spec[key]
             dtype = torch.promote_types(old.dtype, torch.float32)
-            reward_spec[self.reward_key] = Unbounded(old.shape, dtype=dtype, device=old.device)
+            reward_spec[key] = Unbounded(old.shape, dtype=dtype, device=old.device)
         return reward_spec
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
@@ -285,12 +309,13 @@ class CumulativeReward(StatefulTransform):
     def _sum_again(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
         key = next_key(self.reward_key)
         reward = entries[key]
-        before = torch.cat([reward.new_zeros(self.n_slots - 1, *reward.shape[1:]), reward])
-        past = (
-            before.unfold(0, self.n_slots, 1).movedim(-1, 0).flip(0)
-        )  # [K, T, B, ...], the newest first
-        age = torch.arange(self.n_slots, device=count.device).view(-1, 1, 1)
-        past = past.masked_fill(expand_mask(age > count, past), 0)
+        none_before = reward.new_zeros(self.n_slots - 1, *reward.shape[1:])
+        rewards = torch.cat([none_before, reward])
+        windows = rewards.unfold(0, self.n_slots, 1)
+        past = windows.movedim(-1, 0).flip(0)  # [K, T, B, ...], the newest first
+        age = torch.arange(self.n_slots, device=count.device)
+        is_earlier = age.view(-1, 1, 1) > count  # of an earlier episode
+        past = past.masked_fill(expand_mask(is_earlier, past), 0)
         return entries | {key: discounted_sum(past, self.gamma)}
 
 
@@ -301,5 +326,7 @@ def discounted_sum(past: Tensor, gamma: float) -> Tensor:
     weights = (gamma**ages).to(dtype)
     # In double precision, so that the order of the sum, which depends on the batch, does not
     # matter.
-    weighted = weights.view(-1, *[1] * (past.dim() - 1)) * past
-    return weighted.sum(0, dtype=torch.float64).to(dtype)
+    ones = [1] * (past.dim() - 1)
+    weighted = weights.view(-1, *ones) * past
+    total = weighted.sum(0, dtype=torch.float64)
+    return total.to(dtype)

@@ -89,15 +89,18 @@ def draw_walks(
     """
     shapely.prepare(polygon)
     n_hotspots = 1 if config.motion == "static" else config.n_hotspots
-    hotspots = sample_interior(polygon, n_walks * n_hotspots, rng).reshape(n_walks, n_hotspots, 2)
+    places = sample_interior(polygon, n_walks * n_hotspots, rng)
+    hotspots = places.reshape(n_walks, n_hotspots, 2)
     if start is not None:
         hotspots[:, 0] = start
     if config.motion == "dynamic":
-        return _timed_walk(*_draw_stops(polygon, hotspots, config, rng), config, rng)
+        stops = _draw_stops(polygon, hotspots, config, rng)
+        return _timed_walk(*stops, config, rng)
     zeros = torch.zeros(n_walks, 1)
     ones = torch.ones(n_walks, 1)
     stop = torch.as_tensor(hotspots, dtype=torch.float32)
-    return Walk(stop, zeros, zeros + math.inf, ones, ones, ones.bool())
+    never = zeros + math.inf
+    return Walk(stop, zeros, never, ones, ones, ones.bool())
 
 
 def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
@@ -119,17 +122,21 @@ def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
     time = time.to(walk.depart.dtype)
     if last == 0:
         return Located(walk.stop[..., 0, :], tour, tour, finished)
-    stop = (walk.arrive[..., 1:] <= time.unsqueeze(-1)).sum(-1)
+    arrived = walk.arrive[..., 1:] <= time.unsqueeze(-1)
+    stop = arrived.sum(-1)
     here = stop.unsqueeze(-1)
-    ends = torch.cat([here, (here + 1).clamp_max(last)], dim=-1)
-    places = walk.stop.gather(-2, ends.unsqueeze(-1).expand(*ends.shape, 2))
-    origin, target = places.unbind(-2)
+    following = (here + 1).clamp_max(last)
+    ends = torch.cat([here, following], dim=-1)
+    index = ends.unsqueeze(-1).expand(*ends.shape, 2)
+    origin, target = walk.stop.gather(-2, index).unbind(-2)
     depart, speed, acceleration = (
         x.gather(-1, here).squeeze(-1) for x in (walk.depart, walk.speed, walk.acceleration)
     )
     length = torch.linalg.vector_norm(target - origin, dim=-1)
-    share = _covered(length, speed, acceleration, time - depart) / length.clamp_min(_TINY)
-    return Located(torch.lerp(origin, target, share.unsqueeze(-1)), stop, tour, finished)
+    covered = _covered(length, speed, acceleration, time - depart)
+    share = covered / length.clamp_min(_TINY)
+    position = torch.lerp(origin, target, share.unsqueeze(-1))
+    return Located(position, stop, tour, finished)
 
 
 def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,7 +144,9 @@ def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Te
     [*]."""
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
-    return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp
+    tiny = torch.finfo(peak.dtype).tiny
+    duration = length / peak.clamp_min(tiny) + ramp
+    return ramp, duration
 
 
 def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:
@@ -163,12 +172,17 @@ def _draw_stops(
     inner = _inner_points(polygon, hotspots, config, rng)
     grid = np.concatenate([hotspots[:, :, None], inner], axis=2)  # [W, H, 1 + max_stops, 2]
     n_inner = rng.integers(config.min_stops, config.max_stops, hotspots.shape[:2], endpoint=True)
-    column = np.broadcast_to(np.arange(grid.shape[2]), grid.shape[:3]).reshape(n_walks, -1)
-    real = column <= n_inner.repeat(grid.shape[2], axis=1)
+    width = grid.shape[2]
+    column = np.broadcast_to(np.arange(width), grid.shape[:3])
+    column = column.reshape(n_walks, -1)
+    real = column <= n_inner.repeat(width, axis=1)
     n = real.sum(1)
-    order = np.argsort(~real, axis=1, kind="stable")[:, : n.max()]
-    place = np.take_along_axis(grid.reshape(n_walks, -1, 2), order[..., None], axis=1)
-    return place, np.take_along_axis(column, order, axis=1) == 0, n
+    real_first = np.argsort(~real, axis=1, kind="stable")
+    order = real_first[:, : n.max()]
+    places = grid.reshape(n_walks, -1, 2)
+    place = np.take_along_axis(places, order[..., None], axis=1)
+    hotspot = np.take_along_axis(column, order, axis=1) == 0
+    return place, hotspot, n
 
 
 def _inner_points(
@@ -177,17 +191,18 @@ def _inner_points(
     """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2]
     metres."""
     # Points outside after the first rounds are drawn from ever smaller discs, so that this ends.
-    radii = config.local_distance / 2.0 ** np.maximum(np.arange(_ROUNDS) - _FULL_DISC_ROUNDS, 0)
+    halvings = np.maximum(np.arange(_ROUNDS) - _FULL_DISC_ROUNDS, 0)
+    radii = config.local_distance / 2.0**halvings
     points = np.repeat(hotspots[:, :, None], config.max_stops, axis=2)
     flat = points.reshape(-1, 2)
-    centre = points.reshape(-1, 2).copy()
+    centre = flat.copy()
     missing = np.arange(len(flat))
     for radius in radii:
         distance = radius * np.sqrt(rng.random(len(missing)))
         angle = 2 * math.pi * rng.random(len(missing))
-        drawn = centre[missing] + distance[:, None] * np.stack(
-            [np.sin(angle), np.cos(angle)], axis=1
-        )
+        direction = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+        offset = distance[:, None] * direction
+        drawn = centre[missing] + offset
         accepted = shapely.contains_xy(polygon, drawn)
         flat[missing[accepted]] = drawn[accepted]
         missing = missing[~accepted]
@@ -206,9 +221,9 @@ def _timed_walk(
     """Add waiting times, legs and emission to the stops."""
     shape = hotspot.shape
     loops = config.after_walk == "loop"
-    per_stop = config.emission == "per_stop"
     wait = rng.uniform(config.min_wait, config.max_wait, shape)
-    emits = rng.random(shape) < (config.emission_probability if per_stop else 1.0)
+    probability = config.emission_probability if config.emission == "per_stop" else 1.0
+    emits = rng.random(shape) < probability
     if loops:  # room for the return to the first stop
         drawn = place, hotspot, wait, emits
         place, hotspot, wait, emits = (
@@ -218,16 +233,19 @@ def _timed_walk(
     column = np.arange(hotspot.shape[1])
     padded = column > last
     after = np.zeros_like(last) if loops else last
-    place = np.where(padded[..., None], np.take_along_axis(place, after[..., None], axis=1), place)
-    to_hotspot = np.roll(hotspot, -1, axis=1) | (loops & (column == last))
+    rest = np.take_along_axis(place, after[..., None], axis=1)
+    place = np.where(padded[..., None], rest, place)
+    returns = loops & (column == last)
+    to_hotspot = np.roll(hotspot, -1, axis=1) | returns
     speed = np.where(to_hotspot, config.speed, config.local_speed)
     acceleration = np.where(to_hotspot, config.acceleration, config.local_acceleration)
-    length = np.linalg.norm(np.diff(place, axis=1), axis=2)
-    _, leg = leg_profile(
-        *(torch.as_tensor(x) for x in (length, speed[:, :-1], acceleration[:, :-1]))
-    )
+    way = np.diff(place, axis=1)
+    length = np.linalg.norm(way, axis=2)
+    legs = length, speed[:, :-1], acceleration[:, :-1]
+    _, leg = leg_profile(*map(torch.as_tensor, legs))
     arrive = np.zeros(hotspot.shape)
-    arrive[:, 1:] = np.cumsum(wait[:, :-1] + leg.numpy(), axis=1)
+    between = wait[:, :-1] + leg.numpy()
+    arrive[:, 1:] = np.cumsum(between, axis=1)
     depart = arrive + wait
     end = (
         np.take_along_axis(arrive, last + 1, axis=1)
@@ -236,5 +254,6 @@ def _timed_walk(
     )
     depart = np.where(padded, np.maximum(end, _TINY), depart)
     arrive = np.where(padded, math.inf, arrive)
-    walk = Walk(*map(torch.as_tensor, (place, arrive, depart, speed, acceleration, emits)))
-    return Walk(*(x if x.dtype == torch.bool else x.float() for x in walk))
+    columns = place, arrive, depart, speed, acceleration
+    numbers = (torch.as_tensor(each).float() for each in columns)
+    return Walk(*numbers, emits=torch.as_tensor(emits))

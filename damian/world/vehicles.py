@@ -57,7 +57,8 @@ class MotionModel(ABC):
         if not self.instant:
             check_levels(levels, airspace)
         self.levels = torch.tensor(levels)
-        self.gusts = torch.arange(2 * config.agents).view(-1, 2)
+        n_draws = 2 * config.agents
+        self.gusts = torch.arange(n_draws).view(-1, 2)
         """Numbers of the two draws of each UAV's gust, [N, 2]; made within a step, they would not
         compile."""
         self.chargers = _charging_points(config, airspace)
@@ -109,10 +110,9 @@ class MotionModel(ABC):
         if not self.battery.enabled:
             return torch.full_like(state.battery, checks.METRES)
         battery = battery_of(self.values, state.drawn)
-        vertical = self.vertical(state)
-        return cruise_range(state.battery - vertical_drain(2 * vertical, battery), battery).clamp(
-            min=0
-        )
+        climb_and_descent = 2 * self.vertical(state)
+        left = state.battery - vertical_drain(climb_and_descent, battery)
+        return cruise_range(left, battery).clamp(min=0)
 
     def distance(self, state: State, origin: Tensor, goal: Tensor) -> Tensor:
         """How long the flights between landing points are for the batteries [m], as far as can be
@@ -127,16 +127,19 @@ class MotionModel(ABC):
 
         ``drawn`` are the drawn values of the worlds, if there may be any.
         """
-        drawn = length.new_zeros(0) if drawn is None else drawn
-        limits = (
-            self.values.get(f"motion.{name}", drawn) for name in ("max_speed", "max_acceleration")
-        )
-        return minimum_time(length, self.motion.degree, *limits)
+        if drawn is None:
+            drawn = length.new_zeros(0)
+        speed = self.values.get("motion.max_speed", drawn)
+        acceleration = self.values.get("motion.max_acceleration", drawn)
+        return minimum_time(length, self.motion.degree, speed, acceleration)
 
     def kinds(self, n_agents: int) -> Tensor:
         """Speed limit and battery capacity of each UAV, over the largest ones, [N, 2]."""
-        each = [self.values.settings[name] for name in ("motion.max_speed", "battery.capacity_kwh")]
-        kinds = torch.stack([torch.as_tensor(value).float().expand(n_agents) for value in each], -1)
+        each = []
+        for name in ("motion.max_speed", "battery.capacity_kwh"):
+            value = torch.as_tensor(self.values.settings[name])
+            each.append(value.float().expand(n_agents))
+        kinds = torch.stack(each, -1)
         return kinds / kinds.amax(0)
 
     def vertical(self, state: State) -> Tensor:
@@ -149,8 +152,10 @@ class MotionModel(ABC):
     ) -> Tensor:
         """Battery levels [%] after a flight and ``rested`` steps on the landing point ``goal``,
         [B, N]."""
-        step = charge_gain(level.new_full((), self.dt), battery_of(self.values, state.drawn))
-        gain = step * (rested * gather_rows(self.chargers, goal))
+        battery = battery_of(self.values, state.drawn)
+        dt = level.new_full((), self.dt)
+        charged = rested * gather_rows(self.chargers, goal)
+        gain = charge_gain(dt, battery) * charged
         return (level - drain + gain).clamp(0, 100)
 
 
@@ -178,12 +183,15 @@ class InstantMotion(MotionModel):
 
     def move(self, state: State) -> State:
         place = gather_rows(self.points, state.goal)
-        state = state._replace(position=torch.cat([place, torch.zeros_like(place[..., :1])], -1))
+        height = torch.zeros_like(place[..., :1])
+        position = torch.cat([place, height], -1)
+        state = state._replace(position=position)
         if not self.battery.enabled:
             return state
         length = self.airspace.length(state.origin, state.goal)
         battery = battery_of(self.values, state.drawn)
-        drain = flight_drain(self.vertical(state), length, battery) * (length > 0)
+        flies = length > 0
+        drain = flight_drain(self.vertical(state), length, battery) * flies
         level = self.battery_after(state, state.battery, drain, length == 0, state.goal)
         return state._replace(battery=level)
 
@@ -212,12 +220,14 @@ class PolynomialFlight(MotionModel):
         return state.elapsed >= self.steps(state)
 
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
-        state = state._replace(origin=torch.where(ready, state.goal, state.origin), goal=goal)
+        origin = torch.where(ready, state.goal, state.origin)
+        state = state._replace(origin=origin, goal=goal)
         air = self._air(state)
         cruise = self.shortest_time(air, state.drawn)
+        vertical = self.vertical(state) * departs
         return state._replace(
             elapsed=torch.where(ready, 0, state.elapsed),
-            vertical=torch.where(ready, self.vertical(state) * departs, state.vertical),
+            vertical=torch.where(ready, vertical, state.vertical),
             cruise=torch.where(ready, cruise, state.cruise),
             air=torch.where(ready, air, state.air),
             battery_before=torch.where(ready, state.battery, state.battery_before),
@@ -226,65 +236,71 @@ class PolynomialFlight(MotionModel):
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)
         elapsed = state.elapsed.double() * self.dt
-        times = (state.vertical, state.cruise)
+        vertical = state.vertical
+        cruise = state.cruise
         way = self.airspace.way(state.origin, state.goal)
-        position, crossed = poses(way, self.levels, elapsed, *times, self.motion.degree)
+        degree = self.motion.degree
+        position, crossed = poses(way, self.levels, elapsed, vertical, cruise, degree)
         state = state._replace(position=position)
         if not self.battery.enabled:
             return state
         # From the latest decision on, not from step to step, because rounding errors would add up.
         cruised = crossed * state.air
         battery = battery_of(self.values, state.drawn)
-        used = used_so_far(elapsed, state.vertical, state.cruise, cruised, battery)
-        rested = (state.elapsed - self.steps(state)).clamp(min=0)
-        level = self.battery_after(
-            state, state.battery_before, used.to(cruised.dtype), rested, state.goal
-        )
+        used = used_so_far(elapsed, vertical, cruise, cruised, battery)
+        drain = used.to(cruised.dtype)
+        rested = state.elapsed - self.steps(state)
+        rested = rested.clamp(min=0)
+        level = self.battery_after(state, state.battery_before, drain, rested, state.goal)
         return state._replace(battery=level)
 
     def distance(self, state: State, origin: Tensor, goal: Tensor) -> Tensor:
         if not self.is_windy:
             return self.airspace.length(origin, goal)
-        wind = self._wind(state).view(-1, *[1] * (origin.dim() - 1), 2)
+        ones = [1] * (origin.dim() - 1)
+        wind = self._wind(state).view(-1, *ones, 2)
         air, slowest = self._through(state, origin, goal, wind)
-        stays = origin == goal
-        return torch.where(
-            stays, 0.0, air.where(slowest >= self.motion.min_ground_speed, torch.inf)
-        )
+        advances = slowest >= self.motion.min_ground_speed
+        length = air.where(advances, torch.inf)
+        return torch.where(origin == goal, 0.0, length)
 
     def _air(self, state: State) -> Tensor:
         """Way of each flight through the air that begins now [m], gusts included, [B, N]."""
         if not self.is_windy:
             return self.airspace.length(state.origin, state.goal)
-        counters = torch.full_like(state.episode, _GUST), state.episode, state.steps
-        seed, *counters = (each.view(-1, 1, 1) for each in (state.seed, *counters))
-        size, turn = counter_rng.uniform(seed, *counters, self.gusts).unbind(-1)
-        size = times((-2 * (1 - size).log()).sqrt(), self.values.get("wind.gusts", state.drawn))
-        gust = displacement(
-            size, 2 * math.pi * turn
-        )  # normal east and north (Box and Muller, 1958)
-        return self._through(
-            state, state.origin, state.goal, self._wind(state).unsqueeze(-2) + gust
-        )[0]
+        of_gusts = torch.full_like(state.episode, _GUST)
+        numbers = state.seed, of_gusts, state.episode, state.steps
+        seed, *counters = (each.view(-1, 1, 1) for each in numbers)
+        draws = counter_rng.uniform(seed, *counters, self.gusts)
+        size, turn = draws.unbind(-1)
+        # Normal east and north (Box and Muller, 1958).
+        standard = (-2 * (1 - size).log()).sqrt()
+        size = times(standard, self.values.get("wind.gusts", state.drawn))
+        gust = displacement(size, 2 * math.pi * turn)
+        wind = self._wind(state).unsqueeze(-2) + gust
+        air, _ = self._through(state, state.origin, state.goal, wind)
+        return air
 
     def _wind(self, state: State) -> Tensor:
         """Mean wind of each world, the way in which it blows, east and north [m/s], [B, 2]."""
         calm = state.track.new_zeros(len(state.seed), 1)
-        direction, speed = (
-            self.values.get(f"wind.{name}", state.drawn) for name in ("direction", "speed")
-        )
-        return displacement(calm - speed, (calm + direction).deg2rad()).squeeze(-2)
+        speed = calm - self.values.get("wind.speed", state.drawn)
+        direction = calm + self.values.get("wind.direction", state.drawn)
+        wind = displacement(speed, direction.deg2rad())
+        return wind.squeeze(-2)
 
     def _through(
         self, state: State, origin: Tensor, goal: Tensor, wind: Tensor
     ) -> tuple[Tensor, Tensor]:
         """As ``air_length``, of flights between landing points, flat ids [B, N, ...], wind
         [B, 1, ..., 2]."""
-        speed = torch.as_tensor(self.values.get("motion.max_speed", state.drawn)).to(state.track)
-        speed = speed.expand_as(state.track).view(*state.track.shape, *[1] * (origin.dim() - 2))
-        return air_length(
-            self.airspace.way(origin, goal), wind, speed, self.motion.min_ground_speed
-        )
+        track = state.track
+        speed = torch.as_tensor(self.values.get("motion.max_speed", state.drawn))
+        speed = speed.to(track).expand_as(track)
+        ones = [1] * (origin.dim() - 2)
+        speed = speed.view(*track.shape, *ones)
+        way = self.airspace.way(origin, goal)
+        return air_length(way, wind, speed, self.motion.min_ground_speed)
 
     def latest_messages(
         self, state: State, on_ground: Tensor, messages: Messages
@@ -294,28 +310,34 @@ class PolynomialFlight(MotionModel):
         sends = on_ground | (state.elapsed == 1)
         start = gather_rows(self.points, state.origin)
         position = torch.where(expand_mask(on_ground, start), messages.position, start)
-        return sends, tree_where(sends, messages._replace(position=position), state.sent)
+        sent = messages._replace(position=position)
+        return sends, tree_where(sends, sent, state.sent)
 
     def new_stop(
         self, state: State, on_ground: Tensor, action_valid: Tensor | None
     ) -> Tensor | None:
         """Each decision adds one landing point, however long the UAV then senses there."""
-        return on_ground & (state.elapsed == self.steps(state).clamp(min=1))
+        landing = self.steps(state).clamp(min=1)
+        return on_ground & (state.elapsed == landing)
 
     def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
         """Least number of steps after which the latest flight, and a time [s] after it, are over,
         [B, N]."""
         flight = 2 * state.vertical + state.cruise
         seconds = flight.double() * (1 - _FLIGHT_ERROR) + sensing_time
-        return (seconds * ((1 - _ROUNDING) / self.dt)).ceil().long()
+        steps_per_second = (1 - _ROUNDING) / self.dt
+        return (seconds * steps_per_second).ceil().long()
 
 
 def check_levels(levels: list[float], airspace: Airspace) -> None:
     """Require that each flight level lies within those of every region."""
     key = "motion.min_level + i * motion.level_separation"
-    for low, high in (region.levels for region in airspace.regions if region.levels is not None):
+    for region in airspace.regions:
+        if region.levels is None:
+            continue
+        lowest, highest = (FLIGHT_LEVEL_M * level for level in region.levels)
         for level in levels:
-            checks.in_range(key, level, low * FLIGHT_LEVEL_M, high * FLIGHT_LEVEL_M, "m")
+            checks.in_range(key, level, lowest, highest, "m")
 
 
 def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
