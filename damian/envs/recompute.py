@@ -1,6 +1,6 @@
 """Recomputes stored steps of UAVs with the server node, for ``BackupdateStorage``."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -30,9 +30,11 @@ def server_recompute(
     ``corrected``: names in ``CORRECTED``; the ends of episodes always are.
     """
     own = "actor" in corrected and server.observation.own
-    observers = {"critic", "actor"}.intersection(corrected) - ({"actor"} if own else set())
-    kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
-    observed = own or bool(observers)
+    observers = {"critic", "actor"}.intersection(corrected)
+    observed = bool(observers)
+    if own:
+        observers.remove("actor")
+    kept = {key for name, key in CORRECTED.items() if name not in corrected}
     believes = server.grid is not None and (observed or server.rewards_belief)
     timed = server.observation.timeline > 0 and observed
 
@@ -52,8 +54,9 @@ def server_recompute(
         if timeline is not None:
             entries[keys.STOPS] = timeline
         if own:
-            read = (keys.MESSAGE, keys.OWN_BELIEF, keys.OWN_STOPS)
-            sent, own_belief, own_timeline = (steps.get(next_key(key), None) for key in read)
+            sent = steps[next_key(keys.MESSAGE)]
+            own_belief = steps.get(next_key(keys.OWN_BELIEF), None)
+            own_timeline = steps.get(next_key(keys.OWN_STOPS), None)
             entries[keys.OBSERVATION] = server.observe_with_own_messages(
                 messages, sent, elapsed, own_belief, timeline, own_timeline
             )
@@ -66,27 +69,51 @@ def timeline_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     """What is known of stops after each stored step, by all that has arrived by now,
     [T, B, N, slots, 3]."""
     messages = steps[next_key(keys.MESSAGE)]
-    n_steps = len(steps)
-    places, told = told_slots(
-        server.stop_places(messages), server.stop_ages(messages), server.observation.timeline
-    )
-    step = torch.arange(n_steps, device=messages.device).view(-1, 1, 1)
+    ages = server.stop_ages(messages)
+    places, told = told_slots(server.stop_places(messages), ages, server.observation.timeline)
     arrived = steps[next_key(keys.MESSAGE_SENT)]
     if next_key(keys.DELAY) in steps.keys(True):
-        delay = steps[next_key(keys.DELAY)].squeeze(-1)
-        arrived = arrived & arrived_by_now(delay, n_steps - 1 - step)
+        arrived = arrived & _arrived(steps)
     told = (told & arrived.unsqueeze(-1)).unsqueeze(-1)
     new = torch.cat([places, torch.ones_like(places[..., :1])], -1)
-    begins = expand_mask(steps[keys.STEP_COUNT].squeeze(-1) == 0, new)
-    known = steps[keys.STOPS][0]
-    found = []
-    for i in range(n_steps):  # each one follows from the one before
-        known = torch.where(begins[i], steps[keys.STOPS][i], known)
+
+    def advance(known: Tensor, step: int) -> Tensor:
         older = F.pad(known[..., :-1, :], (0, 0, 1, 0))  # a step older
-        known = torch.where(told[i], new[i], older)
-        if i == 0:  # where its episode began earlier, what had been told then is not known
-            known = torch.where(begins[0], known, steps[next_key(keys.STOPS)][0])
-        found.append(known)
+        return torch.where(told[step], new[step], older)
+
+    return _one_after_another(steps, keys.STOPS, advance)
+
+
+def _arrived(steps: TensorDictBase) -> Tensor:
+    """Which messages of stored steps have arrived by the last of these, [T, B, N] bool."""
+    delay = steps[next_key(keys.DELAY)].squeeze(-1)
+    step = torch.arange(len(delay), device=delay.device).view(-1, 1, 1)
+    return arrived_by_now(delay, len(delay) - 1 - step)
+
+
+def _begins(steps: TensorDictBase, like: Tensor) -> Tensor:
+    """Which stored steps begin an episode, to broadcast against values [T, B, ...]."""
+    return expand_mask(steps[keys.STEP_COUNT].squeeze(-1) == 0, like)
+
+
+def _one_after_another(
+    steps: TensorDictBase, key: NestedKey, advance: Callable[[Tensor, int], Tensor]
+) -> Tensor:
+    """The entry after each stored step, as ``advance`` makes it from that before, [T, B, ...].
+
+    Where the episode of the first step began earlier, what had been told then is not known: there
+    the entry after it stays.
+    """
+    before = steps[key]
+    begins = _begins(steps, before)
+    value = before[0]
+    found = []
+    for i in range(len(before)):
+        value = torch.where(begins[i], before[i], value)
+        value = advance(value, i)
+        if i == 0:
+            value = torch.where(begins[0], value, steps[next_key(key)][0])
+        found.append(value)
     return torch.stack(found)
 
 
@@ -96,25 +123,15 @@ def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     assert server.grid is not None
     grid = server.grid
     messages = server.messages(steps[next_key(keys.MESSAGE)])
-    delay = steps[next_key(keys.DELAY)].squeeze(-1)
-    step = torch.arange(len(delay), device=delay.device).view(-1, 1, 1)
-    arrived = arrived_by_now(delay, len(delay) - 1 - step)
-    begins = (steps[keys.STEP_COUNT] == 0).unsqueeze(-1)
-    before = steps[keys.BELIEF]
-    after = steps[next_key(keys.BELIEF)]
     level = server.level(messages)
-    first = server.messages(steps[keys.MESSAGE])
-    rows = report_rows(grid, messages, level, arrived)
-    first = report_rows(grid, first, level)
-    previous = torch.where(begins, first, rows.roll(1, 0))
+    rows = report_rows(grid, messages, level, _arrived(steps))
+    first = report_rows(grid, server.messages(steps[keys.MESSAGE]), level)
+    previous = torch.where(_begins(steps, rows), first, rows.roll(1, 0))
     place = places(grid, server.region_of(messages), level)
     likely = likelihood(grid, repeated(grid, rows, previous), place)
-    belief = before[0]
-    corrected = []
-    for i in range(len(delay)):  # each belief follows from the one before
-        belief = torch.where(begins[i], before[i], belief)
-        belief = weigh(predict(grid, belief, place[i]), likely[i])
-        if i == 0:  # where its episode began earlier, what had been reported then is not known
-            belief = torch.where(begins[0], belief, after[0])
-        corrected.append(belief)
-    return torch.stack(corrected)
+
+    def advance(belief: Tensor, step: int) -> Tensor:
+        predicted = predict(grid, belief, place[step])
+        return weigh(predicted, likely[step])
+
+    return _one_after_another(steps, keys.BELIEF, advance)

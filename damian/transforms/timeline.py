@@ -25,11 +25,11 @@ def told_slots(facts: Tensor, ages: Tensor, slots: int) -> tuple[Tensor, Tensor]
     out.
     """
     slot = torch.where((ages < 0) | (ages >= slots), slots, ages)  # the last one is left out
+    index = slot.unsqueeze(-1).expand_as(facts)
     table = facts.new_zeros(*slot.shape[:-1], slots + 1, facts.shape[-1])
-    table = table.scatter(-2, slot.unsqueeze(-1).expand_as(facts), facts)
-    told = torch.zeros(table.shape[:-1], dtype=torch.bool, device=slot.device).scatter(
-        -1, slot, True
-    )
+    table = table.scatter(-2, index, facts)
+    told = table.new_zeros(table.shape[:-1], dtype=torch.bool)
+    told = told.scatter(-1, slot, True)
     return table[..., :slots, :], told[..., :slots]
 
 
@@ -114,16 +114,19 @@ class ObservationTimeline(StatefulTransform):
         if self.ages is not None:
             first["kept"] = first["kept"][:, 0]  # one fact for each slot
             del first["ages"]
-        blank = {name: torch.zeros_like(value).unsqueeze(1) for name, value in first.items()}
+        blank = {}
+        for name, value in first.items():
+            shape = (len(value), self.slots, *value.shape[1:])
+            blank[name] = value.new_zeros(shape)
         blank["due"] += _NEVER
-        return {name: value.repeat_interleave(self.slots, 1) for name, value in blank.items()}
+        return blank
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        empty = {
-            name: torch.full_like(old, _NEVER * (name == "due")) for name, old in memory.items()
-        }
+        empty = {name: torch.zeros_like(old) for name, old in memory.items()}
+        empty["due"] += _NEVER
         first = self._sent(entries.__getitem__)
-        begun = self._added(empty, first | {"sent": torch.ones_like(first["sent"])})
+        first["sent"] = torch.ones_like(first["sent"])
+        begun = self._added(empty, first)
         memory = {
             name: torch.where(expand_mask(mask, new), new, memory[name])
             for name, new in begun.items()
@@ -143,68 +146,65 @@ class ObservationTimeline(StatefulTransform):
         the observer [..., P].
         """
         message = entry(self.row_key)
-        kept = self.encoded(message)
         sent = torch.ones_like(message[..., 0], dtype=torch.bool)
         if self.sent_key is not None:
             sent = entry(self.sent_key).view(sent.shape)
         due = torch.zeros_like(sent, dtype=torch.long).unsqueeze(-1)
         if self.delay_key is not None:
             delay = entry(self.delay_key)
-            delay = (
-                delay.transpose(-1, -2) if delay.shape[-1] > 1 else delay
-            )  # by sender and receiver
+            if delay.shape[-1] > 1:
+                delay = delay.transpose(-1, -2)  # by sender and receiver
             due = torch.where(delay >= 0, delay, _NEVER)
-        found = {"kept": kept, "due": due, "sent": sent}
+        found = {"kept": self.encoded(message), "due": due, "sent": sent}
         if self.ages is not None:
             found["ages"] = self.ages(message)
-        return (
-            found if self.position_key is None else found | {"position": entry(self.position_key)}
-        )
+        if self.position_key is not None:
+            found["position"] = entry(self.position_key)
+        return found
 
     def _by_row(self, sent: dict[str, Tensor]) -> Memory:
         """The messages of ``_sent`` by rows, [M, ...] each; several rows in order may share a
         position."""
         n_rows = sent["sent"].numel()
         lead = sent["sent"].dim()
-        rows = {
-            n: each.reshape(n_rows, *each.shape[lead:])
-            for n, each in sent.items()
-            if n != "position"
-        }
-        if "position" in sent:
-            position = sent["position"].reshape(-1, sent["position"].shape[-1])
-            rows["position"] = position.repeat_interleave(n_rows // len(position), 0)
+        rows = {}
+        for name, each in sent.items():
+            if name == "position":
+                position = each.reshape(-1, each.shape[-1])
+                rows[name] = position.repeat_interleave(n_rows // len(position), 0)
+            else:
+                rows[name] = each.reshape(n_rows, *each.shape[lead:])
         return rows
 
     def _added(self, memory: Memory, sent: dict[str, Tensor]) -> Memory:
         """The memory with the messages of a step as the newest."""
         newest = self._by_row(sent)
         older = memory | {"due": memory["due"] - 1}
-        newest["due"] = torch.where(newest["sent"].unsqueeze(-1), newest["due"], _NEVER)
+        is_sent = newest["sent"].unsqueeze(-1)
+        newest["due"] = torch.where(is_sent, newest["due"], _NEVER)
         if self.ages is None:
             return {
                 name: torch.cat([new.unsqueeze(1), older[name][:, :-1]], 1)
                 for name, new in newest.items()
             }
-        never = torch.full_like(older["due"][:, :1], _NEVER)
-        blank = {
-            "due": never,
-            **{name: torch.zeros_like(memory[name][:, :1]) for name in ("kept", "sent")},
-        }
+        blank = {name: torch.zeros_like(old[:, :1]) for name, old in older.items()}
+        blank["due"] += _NEVER
         older = {name: torch.cat([blank[name], old[:, :-1]], 1) for name, old in older.items()}
         facts, told = told_slots(newest["kept"], newest["ages"], self.slots)
-        told = told & newest["sent"].unsqueeze(-1)
-        due = torch.minimum(older["due"], newest["due"].unsqueeze(1))
+        told = told & is_sent
+        is_told = told.unsqueeze(-1)
+        due = older["due"].minimum(newest["due"].unsqueeze(1))
         return {
-            "kept": torch.where(told.unsqueeze(-1), facts, older["kept"]),
-            "due": torch.where(told.unsqueeze(-1), due, older["due"]),
+            "kept": torch.where(is_told, facts, older["kept"]),
+            "due": torch.where(is_told, due, older["due"]),
             "sent": older["sent"] | told,
         }
 
     def _written(self, memory: Memory) -> Entries:
         """The timeline, from the memory."""
         found = self._timeline(memory, memory["due"] <= 0)
-        return {self.out_keys[0]: found.view(*self.rows, *found.shape[1:])}
+        found = found.view(*self.rows, *found.shape[1:])
+        return {self.out_keys[0]: found}
 
     def _timeline(self, slots: Memory, arrived: Tensor) -> Tensor:
         """The timelines of M rows, [M, K, D + 1] or, with those of N agents each, [M, N, K, D + 1].
@@ -215,22 +215,26 @@ class ObservationTimeline(StatefulTransform):
         kept = slots["kept"]
         if "position" in slots:
             way = slots["position"][:, :1] - slots["position"]
-            kept = kept - way.repeat(1, 1, kept.shape[-1] // way.shape[-1])
+            n_places = kept.shape[-1] // way.shape[-1]
+            kept = kept - way.repeat(1, 1, n_places)
         n = self.rows[-1] if self.group else 1
         agent = torch.arange(n, device=kept.device)
-        sender = (agent.unsqueeze(-1) + agent) % n  # [N receivers, N senders], its own first
-        receiver = agent.unsqueeze(-1) if arrived.shape[-1] > 1 else torch.zeros_like(sender)
+        receiver = agent.unsqueeze(-1)
+        sender = (receiver + agent) % n  # [N receivers, N senders], its own first
+        if arrived.shape[-1] == 1:
+            receiver = torch.zeros_like(sender)
 
         def for_receivers(rows: Tensor) -> Tensor:
             return rows.unflatten(0, (-1, n))[:, sender]  # [worlds, N, N, K, ...]
 
-        known = arrived.unflatten(0, (-1, n)).movedim(-1, 1)[
-            :, receiver, sender
-        ]  # [worlds, N, N, K]
+        by_receiver = arrived.unflatten(0, (-1, n)).movedim(-1, 1)
+        known = by_receiver[:, receiver, sender]  # [worlds, N, N, K]
         if self.own:
-            known = known | ((agent == 0).unsqueeze(-1) & for_receivers(slots["sent"]))
+            itself = (agent == 0).unsqueeze(-1)
+            known = known | (itself & for_receivers(slots["sent"]))
         known = known.unsqueeze(-1)
-        found = torch.cat([for_receivers(kept) * known, known.to(kept.dtype)], -1).flatten(0, 1)
+        told = for_receivers(kept) * known
+        found = torch.cat([told, known.to(kept.dtype)], -1).flatten(0, 1)
         return found if self.group else found.squeeze(1)
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
@@ -243,50 +247,50 @@ class ObservationTimeline(StatefulTransform):
         return Correction(self._corrected, self.slots) if wanted else None
 
     def _corrected(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
-        after, first = (
-            self._sent(lambda key, at=at: steps[at(key)]) for at in (next_key, lambda key: key)
-        )
+        first = self._sent(steps.__getitem__)
+        after = self._sent(lambda key: steps[next_key(key)])
         first["sent"] = torch.ones_like(first["sent"])
+        last = len(steps) - 1
         step = torch.arange(len(steps), device=count.device)
         slots = []
         arrived = []
         for k in range(self.slots):  # a slot of all steps and worlds at once
             sent_at = step - k  # before 0 lies what is not among the steps
-            is_reset = (k == count + 1) & (sent_at >= -1).unsqueeze(-1)
-            exists = is_reset | ((k <= count) & (sent_at >= 0).unsqueeze(-1))
+            age_now = last - sent_at
             of_step = sent_at.clamp(min=0)
-            of_reset = (sent_at + 1).clamp(0, len(steps) - 1)
+            of_reset = (sent_at + 1).clamp(0, last)
+            is_reset = (k == count + 1) & (sent_at >= -1).unsqueeze(-1)
+            is_step = (k <= count) & (sent_at >= 0).unsqueeze(-1)
+            exists = is_reset | is_step
             slot = {
                 name: torch.where(expand_mask(is_reset, new), first[name][of_reset], new[of_step])
                 for name, new in after.items()
             }
-            slot["sent"] = slot["sent"] & expand_mask(exists, slot["sent"])
-            due = slot["due"] <= expand_mask(len(steps) - 1 - sent_at, slot["due"])
+            sent = slot["sent"] & expand_mask(exists, slot["sent"])
+            slot["sent"] = sent
+            is_due = slot["due"] <= expand_mask(age_now, slot["due"])
+            has_arrived = is_due & sent.unsqueeze(-1)
             slots.append(self._by_row(slot))
-            arrived.append((due & slot["sent"].unsqueeze(-1)).reshape(-1, due.shape[-1]))
+            arrived.append(has_arrived.flatten(0, -2))
         stacked = {name: torch.stack([slot[name] for slot in slots], 1) for name in after}
         found = self._timeline(stacked, torch.stack(arrived, 1))
-        return entries | {
-            next_key(self.out_keys[0]): found.view(*after["sent"].shape, *found.shape[1:])
-        }
+        found = found.view(*after["sent"].shape, *found.shape[1:])
+        return entries | {next_key(self.out_keys[0]): found}
 
     def noted_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
         """The memory with an agent's message [M] that arrives in the next step, ``lag`` >= 1 steps
         late."""
         facts = self.encoded(message).view(1, -1, memory["kept"].shape[-1])
-        ages = (
-            torch.zeros(1, 1, dtype=torch.long)
-            if self.ages is None
-            else self.ages(message).view(1, -1)
-        )
+        ages = torch.zeros(1, 1, dtype=torch.long)
+        if self.ages is not None:
+            ages = self.ages(message).view(1, -1)
         # Slots are of the step before the next one.
-        kept, told = told_slots(facts, torch.where(ages < 0, -1, ages + lag - 1), self.slots)
+        ages = torch.where(ages < 0, -1, ages + lag - 1)
+        (kept,), (told,) = told_slots(facts, ages, self.slots)
         memory = {name: value.clone() for name, value in memory.items()}
-        memory["kept"][agent] = torch.where(told[0].unsqueeze(-1), kept[0], memory["kept"][agent])
-        memory["due"][agent] = torch.where(
-            told[0].unsqueeze(-1), memory["due"][agent].clamp(max=1), memory["due"][agent]
-        )
-        memory["sent"][agent] |= told[0]
+        memory["kept"][agent, told] = kept[told]
+        memory["due"][agent, told] = memory["due"][agent, told].clamp(max=1)
+        memory["sent"][agent] |= told
         return memory
 
     def encoded(self, message: Tensor) -> Tensor:
@@ -297,8 +301,9 @@ class ObservationTimeline(StatefulTransform):
         spec = observation_spec[self.row_key]
         rows = spec_rows(observation_spec, self.row_key)
         encoded = self.encoded(spec.zero())
-        n_numbers = encoded.shape[-1]
-        shape = (*rows, *rows[-1:] * self.group, self.slots, n_numbers + 1)
+        width = encoded.shape[-1] + 1
+        senders = rows[-1:] if self.group else ()
+        shape = (*rows, *senders, self.slots, width)
         dtype = torch.promote_types(encoded.dtype, torch.float32)
         add_spec(observation_spec, self.out_keys[0], shape, dtype)
         return observation_spec

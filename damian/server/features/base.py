@@ -116,16 +116,22 @@ class FeatureCache:
         if not self.own_only:
             return field
         sender = self.context.now.dim()
-        return field.diagonal(0, sender - 1, sender).movedim(-1, sender - 1).unsqueeze(sender)
+        receiver = sender - 1
+        own = field.diagonal(0, receiver, sender).movedim(-1, receiver)
+        return own.unsqueeze(sender)
+
+    def scaled(self, ways: Tensor) -> Tensor:
+        """Ways [*, ...] over half the largest vertex distance of the region."""
+        return ways / expand_mask(self.context.scale / 2, ways)
 
     def reading(self, name: str) -> Tensor:
         """Values of a sensor of the settings (``damian.sensor``), [*, N] or, if several,
         [*, N, width]."""
         known = self.context.readings
         if name not in known:
-            problem = (
-                f"is not one of {', '.join(known)}" if known else "is missing: no sensor is given"
-            )
+            problem = "is missing: no sensor is given"
+            if known:
+                problem = f"is not one of {', '.join(known)}"
             raise InputError(f"sensors: {name}, which a feature reads, {problem}")
         first, width = known[name]
         values = self.messages.readings.narrow(-1, first, width)
@@ -148,12 +154,10 @@ class FeatureCache:
     def tabled(self, point: Tensor) -> Tensor:
         """Ids in tables for each radius of footprints, from the flat ids of landing points
         [*, ...]."""
-        number = self.context.level
-        return (
-            point
-            if number is None
-            else point + expand_mask(number, point) * len(self.context.points)
-        )
+        level = self.context.level
+        if level is None:
+            return point
+        return point + expand_mask(level, point) * len(self.context.points)
 
     @property
     def region(self) -> Tensor:
@@ -173,6 +177,12 @@ class FeatureCache:
         return self(_belief)
 
     @property
+    def radius(self) -> float | Tensor:
+        """Radius of a UAV's footprint [m]; [*, 1, 1] if it is drawn."""
+        radius = self.context.radius
+        return radius[..., None, None] if isinstance(radius, Tensor) else radius
+
+    @property
     def scale(self) -> Tensor:
         """Largest vertex distance of the region [m], [*, 1]."""
         return self.context.scale.unsqueeze(-1)
@@ -183,9 +193,8 @@ def _belief(v: FeatureCache) -> Tensor:
     if v.context.belief is not None:
         return v.context.belief
     level = v.context.level
-    return first_belief(
-        v.grid, report_rows(v.grid, v.messages, level), places(v.grid, v.region, level)
-    )
+    rows = report_rows(v.grid, v.messages, level)
+    return first_belief(v.grid, rows, places(v.grid, v.region, level))
 
 
 class Feature(NamedTuple):
@@ -275,11 +284,8 @@ def feature_of(name: str) -> Feature:
 
 def check_features(config: ObservationConfig) -> None:
     """Require that every feature of an observation exists and has the scope in which it is used."""
-    for scope, key in (
-        ("local", "local_features"),
-        ("global", "global_features"),
-        ("belief", "belief"),
-    ):
+    keys = {"local": "local_features", "global": "global_features", "belief": "belief"}
+    for scope, key in keys.items():
         for name in getattr(config, key):
             found = FEATURES.get(name, f"observation.{key}")
             problem = f"is a {found.scope} feature, not a {scope} one"
@@ -312,11 +318,13 @@ def observe_own(known: Messages, context: ServerContext, names: list[str]) -> di
     """As ``observe``, but each UAV computes its own from messages [*, N, N] (receiver, sender)."""
     cache = FeatureCache(known, context, own_only=True)
     sender = known.time.dim() - 1
-    values = {name: feature_of(name).compute(cache) for name in names}
-    return {
-        name: (each if each.shape[sender] == 1 else cache.wanted(each)).squeeze(sender)
-        for name, each in values.items()
-    }
+    found = {}
+    for name in names:
+        values = feature_of(name).compute(cache)
+        if values.shape[sender] != 1:
+            values = cache.wanted(values)
+        found[name] = values.squeeze(sender)
+    return found
 
 
 def layout_of(features: Mapping[str, Tensor], names: Sequence[str]) -> Layout:
@@ -324,10 +332,9 @@ def layout_of(features: Mapping[str, Tensor], names: Sequence[str]) -> Layout:
     found = Layout()
     for name in names:
         declared = feature_of(name)
-        shape = tuple(features[name].shape[2:])
         found = found.appended(
             name,
-            shape,
+            tuple(features[name].shape[2:]),
             declared.low,
             declared.high,
             meaning=declared.meaning,
@@ -340,7 +347,9 @@ def layout_of(features: Mapping[str, Tensor], names: Sequence[str]) -> Layout:
 def stack(features: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
     """Observation vector in the order of ``names``, [*, N, F] float32, whatever the features' types
     are."""
-    values = [(features[name], len(feature_of(name).shape)) for name in names]
-    return torch.cat(
-        [each.flatten(-n) if n else each.unsqueeze(-1) for each, n in values], -1
-    ).float()
+    found = []
+    for name in names:
+        values = features[name]
+        n_dims = len(feature_of(name).shape)
+        found.append(values.flatten(-n_dims) if n_dims else values.unsqueeze(-1))
+    return torch.cat(found, -1).float()

@@ -40,22 +40,23 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     Actions begin at the latest landing point, are taken to be flown at once, and lead to the
     nearest landing point, or to the second nearest if another UAV is known to stand there.
     """
-    everyone = v.messages.trail[..., 0] % v.context.n_points
-    n_points = v.context.n_points
-    standing = v.wanted(v.messages.trail[..., 0])
+    grid = v.grid
     level = v.context.level
-    rows = v.wanted(report_rows(v.grid, v.messages, level).movedim(-2, -1)).movedim(-1, -2)
-    stays = any_of(chance_of_staying(v.grid, v.belief, rows)).unsqueeze(-1)
-    chance = any_of(detection_chance(v.grid, v.belief, places(v.grid, v.region, level)))
-    chance = chance.scatter(
-        -1, everyone, -chance.gather(-1, everyone)
-    )  # negative where a UAV stands
+    n_points = v.context.n_points
+    points = v.messages.trail[..., 0]
+    taken = points % n_points
+    standing = v.wanted(points)
+    by_uav = report_rows(grid, v.messages, level).movedim(-2, -1)
+    rows = v.wanted(by_uav).movedim(-1, -2)
+    stays = any_of(chance_of_staying(grid, v.belief, rows))
+    chance = any_of(detection_chance(grid, v.belief, places(grid, v.region, level)))
+    chance = chance.scatter(-1, taken, -chance.gather(-1, taken))  # negative where a UAV stands
     chance = chance.unsqueeze(-2).expand(*standing.shape, -1)
-    chance = chance.scatter(-1, (standing % n_points).unsqueeze(-1), stays)
+    own = (standing % n_points).unsqueeze(-1)
+    chance = chance.scatter(-1, own, stays.unsqueeze(-1))
     goals = v.table(goals_of_actions)
-    nearest, second = (
-        chance.gather(-1, gather_rows(each, standing)) for each in (goals[0], goals[-1])
-    )
+    nearest = chance.gather(-1, gather_rows(goals[0], standing))
+    second = chance.gather(-1, gather_rows(goals[-1], standing))
     return torch.where(nearest < 0, second.abs(), nearest).clamp(max=1)
 
 
@@ -74,14 +75,17 @@ def _belief_moments(v: FeatureCache) -> Tensor:
     """
     belief = v.belief
     centres = v.grid.centres
-    *mean, square = (belief @ torch.cat([centres, centres.square().sum(-1, True)], -1)).unbind(-1)
+    squares = centres.square().sum(-1, True)
+    *mean, square = (belief @ torch.cat([centres, squares], -1)).unbind(-1)
     mean = torch.stack(mean, -1)
-    variance = (square - mean.square().sum(-1)).clamp(min=0)
+    variance = square - mean.square().sum(-1)
+    spread = variance.clamp(min=0).sqrt() / v.scale
     position = v.wanted(v.messages.position).unsqueeze(-2)
     offset = (mean.unsqueeze(-3) - position) / v.scale[..., None, None]  # [*, N, K, 2]
     unsure = entropy(belief) / math.log(max(belief.shape[-1], 2))
-    shared = torch.stack([variance.sqrt() / v.scale, unsure], -1).unsqueeze(-3)
-    return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
+    shared = torch.stack([spread, unsure], -1).unsqueeze(-3)
+    shared = shared.expand(*offset.shape[:-1], -1)
+    return torch.cat([offset, shared], -1).clamp(-1, 1)
 
 
 @feature("belief", [None, RINGS, BELIEF_SECTORS], name="belief_map")
@@ -90,18 +94,14 @@ def _belief_map(v: FeatureCache) -> Tensor:
     [*, N, K, 3, 8]."""
     position = v.wanted(v.messages.position)
     east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, C]
-    radius = v.context.radius
-    distance = torch.hypot(east, north) / (
-        radius[..., None, None] if isinstance(radius, Tensor) else radius
-    )
+    distance = torch.hypot(east, north) / v.radius
     ring = sum((distance > edge).long() for edge in BELIEF_RINGS)
     turn = torch.atan2(east, north) / (2 * math.pi)
-    part = ring * BELIEF_SECTORS + (turn * BELIEF_SECTORS).round().long() % BELIEF_SECTORS
+    sector = (turn * BELIEF_SECTORS).round().long() % BELIEF_SECTORS
+    part = ring * BELIEF_SECTORS + sector
+    part = part.unsqueeze(-2)
     share = v.belief.unsqueeze(-3)
-    share = share.expand(*part.shape[:-1], *share.shape[-2:])  # [*, N, K, C]
+    share = share.expand(*position.shape[:-1], -1, -1)  # [*, N, K, C]
     bins = share.new_zeros(*share.shape[:-1], RINGS * BELIEF_SECTORS)
-    return (
-        bins.scatter_add(-1, part.unsqueeze(-2).expand_as(share), share)
-        .clamp(max=1)
-        .unflatten(-1, (RINGS, BELIEF_SECTORS))
-    )
+    found = bins.scatter_add(-1, part.expand_as(share), share)
+    return found.clamp(max=1).unflatten(-1, (RINGS, BELIEF_SECTORS))

@@ -38,9 +38,11 @@ def footprint_tables(
     airspace = simulation.airspace
     radii = footprint_radii(simulation)
     polygons = [region.polygon for region in airspace.regions]
-    tables = tables_of_all(polygons, airspace.points.double().cpu().numpy(), radii)
+    lattices = airspace.points.double().cpu().numpy()
+    tables = tables_of_all(polygons, lattices, radii)
     points = airspace.points.flatten(0, 1)
-    return tables, torch.cat([points * (radii[0] / radius) for radius in radii])
+    scaled = [points * (radii[0] / radius) for radius in radii]
+    return tables, torch.cat(scaled)
 
 
 def map_places_inside(simulation: Simulation, _: ObservationConfig) -> Tensor:
@@ -55,7 +57,8 @@ def ring_places(radius: float | Tensor, device: torch.device | None = None) -> T
 
     For radii [*, 1, 1], [*, 24, 2].
     """
-    angle = torch.arange(SECTORS, device=device) * (2 * math.pi / SECTORS)
+    number = torch.arange(SECTORS, device=device)
+    angle = number * (2 * math.pi / SECTORS)
     ring = torch.stack([angle.sin(), angle.cos()], -1)
     return torch.cat([ring * distance * radius for distance in RINGS], -2)
 
@@ -65,10 +68,10 @@ def places_inside(airspace: Airspace, radius: float) -> Tensor:
     1."""
     points = airspace.points.nan_to_num(posinf=0.0).double().cpu().numpy()
     places = points[:, :, None] + ring_places(radius).double().numpy()
-    inside = [
-        shapely.contains_xy(region.polygon, *np.moveaxis(places[i], -1, 0))
-        for i, region in enumerate(airspace.regions)
-    ]
+    inside = []
+    for region, about in zip(airspace.regions, places, strict=True):
+        east, north = np.moveaxis(about, -1, 0)
+        inside.append(shapely.contains_xy(region.polygon, east, north))
     return torch.from_numpy(np.stack(inside)).float().flatten(0, 1)
 
 
@@ -78,12 +81,13 @@ def _coverage(v: FeatureCache) -> Tensor:
     footprints, points = v.table(footprint_tables)
     trail = v.tabled(v.trail)
     known = v.context.coverage
-    if v.own_only:
-        return own_covered_share(footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
-    if known is not None and devices.data_dependent(trail.device):
+    if not v.own_only and known is not None and devices.data_dependent(trail.device):
         known = known._replace(trail=v.tabled(known.trail))
         return updated_share(footprints, trail, points, known)
-    return covered_share(footprints, trail, gather_rows(points, trail))
+    places = gather_rows(points, trail)
+    if v.own_only:
+        return own_covered_share(footprints, trail, places).unsqueeze(-1)
+    return covered_share(footprints, trail, places)
 
 
 @feature("global", [len(RINGS) * SECTORS], name="coverage_map", tables=[map_places_inside])
@@ -97,15 +101,16 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     context = v.context
     trail = v.trail
     standing = v.wanted(trail[..., 0])
-    radius = context.radius
-    if isinstance(radius, Tensor):
-        radius = radius[..., None, None]
+    radius = v.radius
     offsets = ring_places(radius, standing.device).unsqueeze(-3)
     places = gather_rows(context.points, standing).unsqueeze(-2) + offsets
     n_agents, window = trail.shape[-2:]
-    landed = gather_rows(context.points, trail.transpose(-2, -1)).flatten(-3, -2)  # [*, n N, 2]
+    landed = gather_rows(context.points, trail.transpose(-2, -1))
+    landed = landed.flatten(-3, -2)  # [*, n N, 2]
     distance = distances(landed, places.flatten(-3, -2))  # places last, over which minima are fast
     nearest = distance.unflatten(-2, (window, n_agents)).amin(-2)  # of all UAVs, [*, n, N 24]
-    age = torch.arange(window, device=trail.device).unsqueeze(-1) / window
-    new = (nearest / (2 * radius) + _OLDEST * age).amin(-2).view(places.shape[:-1])
-    return new.clamp(max=1) * gather_rows(v.table(map_places_inside), v.tabled(standing))
+    step = torch.arange(window, device=trail.device).unsqueeze(-1)
+    age = step / window
+    new = (nearest / (2 * radius) + _OLDEST * age).amin(-2)
+    new = new.view(places.shape[:-1]).clamp(max=1)
+    return new * gather_rows(v.table(map_places_inside), v.tabled(standing))

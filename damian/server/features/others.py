@@ -25,24 +25,28 @@ def of_others(v: FeatureCache, pairs: Tensor) -> Tensor:
 
     With ``own_only``, [*, N, 1, N, F] and [*, N, 1, N-1, F].
     """
-    n = pairs.shape[-2]
+    *lead, n, width = pairs.shape
     flat = pairs.flatten(-4 if v.own_only else -3, -2)
     # In rows of N + 1, all but the first of the diagonal are in the last column.
-    different = flat[..., 1:, :].unflatten(-2, (n - 1, n + 1))[..., :-1, :]
-    return different.reshape(*pairs.shape[:-2], n - 1, pairs.shape[-1])
+    rows = flat[..., 1:, :].unflatten(-2, (n - 1, n + 1))
+    different = rows[..., :-1, :]
+    return different.reshape(*lead, n - 1, width)
 
 
 @feature("global", [None], name="agent_distances")
 def _agent_distances(v: FeatureCache) -> Tensor:
     """Distances to the other UAVs in their order, over the largest vertex distance,
     [*, N, N - 1]."""
-    return of_others(v, v(pairwise_distances).unsqueeze(-1)).squeeze(-1).clamp(max=1)
+    distance = of_others(v, v(pairwise_distances).unsqueeze(-1))
+    return distance.squeeze(-1).clamp(max=1)
 
 
 @feature("global", name="mean_distance")
 def _mean_distance(v: FeatureCache) -> Tensor:
     """Mean distance to the other UAVs, over the largest vertex distance, [*, N]."""
-    return (v(pairwise_distances).sum(-1) / max(v.messages.time.shape[-1] - 1, 1)).clamp(max=1)
+    n_others = v.messages.time.shape[-1] - 1
+    total = v(pairwise_distances).sum(-1)
+    return (total / max(n_others, 1)).clamp(max=1)
 
 
 @feature("global", name="mean_distance_not_spotting")
@@ -51,7 +55,8 @@ def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
     others."""
     silent = (~v.messages.spotted).to(v.scale.dtype)
     others = silent.sum(-1, keepdim=True) - 1
-    total = (v(pairwise_distances) * silent.unsqueeze(-2)).sum(-1) * v.wanted(silent)
+    distance = v(pairwise_distances) * silent.unsqueeze(-2)
+    total = distance.sum(-1) * v.wanted(silent)
     return (total / others.clamp(min=1)).clamp(max=1)
 
 
@@ -65,34 +70,44 @@ def _others(v: FeatureCache) -> Tensor:
     """
     messages = v.messages
     places = torch.stack([messages.position, messages.target], -2)
-    ways = ways_to_nearest(v, F.pad(places, (0, 1), value=1.0))
-    return four(torch.cat([ways[..., 0, :2], ways[..., 1, :]], -1))
+    exists = F.pad(places, (0, 1), value=1.0)
+    place, target = ways_to_nearest(v, exists).unbind(-2)
+    return four(torch.cat([place[..., :2], target], -1))
 
 
 @feature("global", [OTHERS], name="ages")
 def _ages(v: FeatureCache) -> Tensor:
     """Ages of what is known of the UAVs that ``others`` describes, over ten seconds, [*, N, 4]."""
-    age = v.messages.age(v.context.now) / v.context.observation.age_scale
-    return four(_of_nearest(v, age.unsqueeze(-1)).clamp(max=1)).squeeze(-1)
+    known = _of_nearest(v, known_ages(v).unsqueeze(-1))
+    return four(known.clamp(max=1)).squeeze(-1)
+
+
+def known_ages(v: FeatureCache) -> Tensor:
+    """Ages of the messages over ``observation.age_scale``, [*, N]."""
+    age = v.messages.age(v.context.now)
+    return age / v.context.observation.age_scale
 
 
 def _nearest(v: FeatureCache) -> Tensor:
     """Indices of at most four other UAVs, those with the nearest targets, the nearest first,
     [*, N, 4]."""
     target = v.messages.target
-    half = (v.context.scale / 2)[..., None, None, None]
-    ways = (target.unsqueeze(-3) - v.wanted(target).unsqueeze(-2)) / half
-    distance = of_others(v, ways.square().sum(-1, keepdim=True)).squeeze(-1)
-    found = distance.argsort(dim=-1, stable=True)[..., :OTHERS]  # of the others
+    own = v.wanted(target).unsqueeze(-2)
+    ways = v.scaled(target.unsqueeze(-3) - own)
+    length = ways.square().sum(-1, keepdim=True)
+    distance = of_others(v, length).squeeze(-1)
+    order = distance.argsort(dim=-1, stable=True)
+    found = order[..., :OTHERS]  # of the others
     itself = torch.arange(target.shape[-2], device=target.device).unsqueeze(-1)
-    return found + (found >= (itself.unsqueeze(-1) if v.own_only else itself))
+    if v.own_only:
+        itself = itself.unsqueeze(-1)
+    return found + (found >= itself)
 
 
 def _of_nearest(v: FeatureCache, table: Tensor) -> Tensor:
     """The rows of a table [*, N, F] for the nearest other UAVs of each, [*, N, 4, F]."""
-    nearest = v(_nearest)
-    rows = table.unsqueeze(-3).expand(*nearest.shape[:-1], *table.shape[-2:])
-    return rows.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, table.shape[-1]))
+    nearest = v(_nearest).unsqueeze(-1)
+    return table.unsqueeze(-3).take_along_dim(nearest, -2)
 
 
 def ways_to_nearest(v: FeatureCache, places: Tensor) -> Tensor:
@@ -101,13 +116,14 @@ def ways_to_nearest(v: FeatureCache, places: Tensor) -> Tensor:
 
     ``places`` [*, N, P, 3]: east, north, and 1 if it is known, else 0.
     """
-    half = v.context.scale / 2
-    own = v.wanted(v.messages.target).unsqueeze(-2)
-    places, known = _of_nearest(v, places.flatten(-2)).unflatten(-1, (-1, 3)).split([2, 1], -1)
-    ways = ((places - own.unsqueeze(-2)) / half[..., None, None, None, None]).clamp(-1, 1)
+    own = v.wanted(v.messages.target)[..., None, None, :]
+    nearest = _of_nearest(v, places.flatten(-2))
+    place, known = nearest.unflatten(-1, (-1, 3)).split([2, 1], -1)
+    ways = v.scaled(place - own).clamp(-1, 1)
     return torch.cat([ways * known, known], -1)
 
 
 def four(described: Tensor) -> Tensor:
     """Descriptions of at most four UAVs [*, N, 4, F], with zeros for those that do not exist."""
-    return F.pad(described, (0, 0, 0, OTHERS - described.shape[-2]))
+    missing = OTHERS - described.shape[-2]
+    return F.pad(described, (0, 0, 0, missing))

@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature
-from damian.server.features.others import OTHERS
+from damian.server.features.others import OTHERS, known_ages
 from damian.world.battery import BatteryConfig, observed
 from damian.world.simulation import Simulation
 
@@ -25,7 +25,7 @@ def battery_settings(simulation: Simulation, _: ObservationConfig) -> BatteryCon
 def _place(v: FeatureCache) -> Tensor:
     """Where the UAV stands or will land, east and north, over half the largest vertex distance,
     [*, N, 2]."""
-    return (v.messages.target / (v.scale.unsqueeze(-1) / 2)).clamp(-1, 1)
+    return v.scaled(v.messages.target).clamp(-1, 1)
 
 
 @feature("local", [OTHERS + 1], name="number")
@@ -37,8 +37,10 @@ def _number(v: FeatureCache) -> Tensor:
     apart.
     """
     known = v.messages.time
-    columns = torch.arange(known.shape[-1], device=known.device) % (OTHERS + 1)
-    return F.one_hot(columns, OTHERS + 1).float().expand(*known.shape, OTHERS + 1)
+    n_columns = OTHERS + 1
+    number = torch.arange(known.shape[-1], device=known.device)
+    marked = F.one_hot(number % n_columns, n_columns).float()
+    return marked.expand(*known.shape, n_columns)
 
 
 @feature("local", [2], name="kind", entries=["speed", "capacity"], tables=[kinds_of_uavs])
@@ -58,10 +60,11 @@ def _time_left(v: FeatureCache) -> Tensor:
 @feature("local", name="battery", tables=[battery_settings])
 def _battery(v: FeatureCache) -> Tensor:
     """Level of the battery, as a share, [*, N]."""
-    return observed(v.messages.battery, v.table(battery_settings)) / 100
+    level = observed(v.messages.battery, v.table(battery_settings))
+    return level / 100
 
 
 @feature("actor", name="age")
 def _age(v: FeatureCache) -> Tensor:
     """Age of the UAV's message on the server, over ten seconds, [*, N]."""
-    return (v.messages.age(v.context.now) / v.context.observation.age_scale).clamp(max=1)
+    return known_ages(v).clamp(max=1)

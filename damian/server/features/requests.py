@@ -15,8 +15,9 @@ REQUESTS = 4
 def known_requests(messages: Messages) -> tuple[Tensor, Tensor]:
     """The latest known request of each slot, [*, M, 3], and which of them nobody is known to have
     served."""
-    newest = messages.requests[..., 2].argmax(-2)[..., None, :, None]  # who knows it, [*, 1, M, 1]
-    requests = messages.requests.gather(-3, newest.expand(*newest.shape[:-1], 3)).squeeze(-3)
+    appeared = messages.requests[..., 2]
+    knows = appeared.argmax(-2)[..., None, :, None]  # the one UAV, [*, 1, M, 1]
+    requests = messages.requests.take_along_dim(knows, -3).squeeze(-3)
     return requests, is_open(requests, messages.served)
 
 
@@ -36,18 +37,22 @@ def _requests(v: FeatureCache) -> Tensor:
     region, its age over ``observation.time_scale``, and 1; zeros stand for those that do not exist.
     """
     requests, unserved = known_requests(v.messages)
-    own = v.wanted(v.messages.target)
-    half = (v.context.scale / 2)[..., None, None, None]
-    ways = (requests[..., :2].unsqueeze(-3) - own.unsqueeze(-2)) / half  # [*, N, M, 2]
-    age = (v.context.now.unsqueeze(-1) - requests[..., 2]) / v.context.time_scale
-    age = age.clamp(0, 1)[..., None, :, None].expand(*ways.shape[:-1], 1)
-    rows = (
-        torch.cat([ways.clamp(-1, 1), age, torch.ones_like(age)], -1) * unserved[..., None, :, None]
-    )
-    distance = ways.square().sum(-1).masked_fill(~unserved.unsqueeze(-2), torch.inf)
-    nearest = distance.argsort(dim=-1, stable=True)[..., :REQUESTS].unsqueeze(-1)
-    found = rows.gather(-2, nearest.expand(*nearest.shape[:-1], 4))
-    return F.pad(found, (0, 0, 0, REQUESTS - found.shape[-2]))
+    place, appeared = requests.split([2, 1], -1)
+    own = v.wanted(v.messages.target).unsqueeze(-2)
+    ways = v.scaled(place.unsqueeze(-3) - own)  # [*, N, M, 2]
+    since = v.context.now[..., None, None] - appeared
+    age = (since / v.context.time_scale).clamp(0, 1)
+    age = age.unsqueeze(-3).expand(*ways.shape[:-1], 1)
+    unserved = unserved.unsqueeze(-2)
+    rows = torch.cat([ways.clamp(-1, 1), age, torch.ones_like(age)], -1)
+    rows = rows * unserved.unsqueeze(-1)
+    distance = ways.square().sum(-1)
+    distance = distance.masked_fill(~unserved, torch.inf)
+    order = distance.argsort(dim=-1, stable=True)
+    nearest = order[..., :REQUESTS].unsqueeze(-1)
+    found = rows.take_along_dim(nearest, -2)
+    missing = REQUESTS - found.shape[-2]
+    return F.pad(found, (0, 0, 0, missing))
 
 
 @feature("local", name="served")

@@ -10,16 +10,18 @@ from damian.server.features.base import FeatureCache, feature
 
 def _any_has_detected(v: FeatureCache) -> Tensor:
     """Whether any UAV has ever detected a source, [*, 1]."""
-    return (v.messages.detected_time >= 0).flatten(-2).any(-1, keepdim=True)
+    detected = v.messages.detected_time >= 0
+    return detected.flatten(-2).any(-1, keepdim=True)
 
 
 def _to_source(v: FeatureCache) -> Tensor:
     """Vector from each UAV to the estimated position of the nearest known source [m], [*, N, 2]."""
-    counts = v.messages.detected_time >= 0  # [*, N, K]
-    weight = counts.to(v.messages.position.dtype)
-    total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-3, keepdim=True)
-    estimate = total / weight.sum(-2).clamp(min=1)[..., None, :, None]
-    ways = estimate - v.messages.position.unsqueeze(-2)  # [*, N, K, 2]
+    messages = v.messages
+    counts = messages.detected_time >= 0  # [*, N, K]
+    weight = counts.to(messages.position.dtype).unsqueeze(-1)
+    total = (messages.detected_position * weight).sum(-3, keepdim=True)
+    n_counted = weight.sum(-3, keepdim=True).clamp(min=1)
+    ways = total / n_counted - messages.position.unsqueeze(-2)  # [*, N, K, 2]
     return nearest_way(ways, counts.any(-2, keepdim=True))
 
 
@@ -29,13 +31,20 @@ def nearest_way(ways: Tensor, known: Tensor | None = None) -> Tensor:
     if ways.shape[-2] == 1:
         return ways.squeeze(-2)
     length = ways.square().sum(-1)
-    length = length if known is None else length.masked_fill(~known, torch.inf)
+    if known is not None:
+        length = length.masked_fill(~known, torch.inf)
     best = length.argmin(-1)[..., None, None]
-    return ways.gather(-2, best.expand(*best.shape[:-1], 2)).squeeze(-2)
+    return ways.take_along_dim(best, -2).squeeze(-2)
 
 
 def _raw_source_distance(v: FeatureCache) -> Tensor:
-    return torch.linalg.vector_norm(v(_to_source), dim=-1) / v.scale
+    distance = torch.linalg.vector_norm(v(_to_source), dim=-1)
+    return distance / v.scale
+
+
+def _if_detected(v: FeatureCache, value: Tensor) -> Tensor:
+    """The value if any UAV has ever detected a source, else 1."""
+    return torch.where(v(_any_has_detected), value, 1.0)
 
 
 def _bearing(v: FeatureCache) -> Tensor:
@@ -43,21 +52,23 @@ def _bearing(v: FeatureCache) -> Tensor:
     east, north = v(_to_source).unbind(-1)
     # Within a millimetre of the source the bearing would be a rounding error: it is set to 0
     # (north).
-    return torch.atan2(east, north) * (east.abs() + north.abs() > 1e-3)
+    is_away = east.abs() + north.abs() > 1e-3
+    return torch.atan2(east, north) * is_away
 
 
 @feature("global", name="source_distance")
 def _source_distance(v: FeatureCache) -> Tensor:
     """Distance to the estimated source, over the largest vertex distance; 1 if it is unknown,
     [*, N]."""
-    return torch.where(v(_any_has_detected), v(_raw_source_distance).clamp(max=1), 1.0)
+    return _if_detected(v, v(_raw_source_distance).clamp(max=1))
 
 
 @feature("global", name="source_bearing")
 def _source_bearing(v: FeatureCache) -> Tensor:
     """Bearing of the estimated source, clockwise from north, in turns; 1 if it is unknown,
     [*, N]."""
-    return torch.where(v(_any_has_detected), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
+    turn = v(_bearing) / (2 * math.pi)
+    return _if_detected(v, turn.remainder(1.0))
 
 
 @feature("global", name="source_drift")
@@ -65,7 +76,7 @@ def _source_drift(v: FeatureCache) -> Tensor:
     """((bearing - track) wrapped to [-pi, pi) + pi) / 2 pi: 0.5 if the UAV flies straight at the
     source."""
     turn = (v(_bearing) - v.messages.track) / (2 * math.pi)
-    return torch.where(v(_any_has_detected), torch.remainder(turn + 0.5, 1.0), 1.0)
+    return _if_detected(v, (turn + 0.5).remainder(1.0))
 
 
 @feature("global", name="source_time")
@@ -74,15 +85,17 @@ def _source_time(v: FeatureCache) -> Tensor:
     [*, N]."""
     latest = v.messages.detected_time.flatten(-2).amax(-1, keepdim=True)
     since = (v.context.now.unsqueeze(-1) - latest) / v.context.time_scale
-    return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)
+    shared = _if_detected(v, since.clamp(max=1))
+    return shared.expand_as(v.messages.time)
 
 
 @feature("global", name="mean_distance_spotting")
 def _mean_distance_spotting(v: FeatureCache) -> Tensor:
     """Mean distance of the spotting UAVs to the source; 0 if no UAV spots."""
     spotting = v.messages.spotted.to(v.scale.dtype)
-    total = (v(_raw_source_distance) * spotting).sum(-1, keepdim=True)
-    mean = total / spotting.sum(-1, keepdim=True).clamp(min=1)
+    distance = v(_raw_source_distance) * spotting
+    n_spotting = spotting.sum(-1, keepdim=True).clamp(min=1)
+    mean = distance.sum(-1, keepdim=True) / n_spotting
     return mean.clamp(max=1).expand_as(spotting)
 
 

@@ -21,14 +21,16 @@ def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
 
     A stop is a landing, or the choice to hold, at its instant.
     """
-    ages = ((messages.time.unsqueeze(-1) - messages.landed) / context.dt).round().long()
+    since = messages.time.unsqueeze(-1) - messages.landed
+    ages = (since / context.dt).round().long()
     return torch.where(messages.landed < 0, -1, ages)
 
 
 def told_timeline(messages: Messages, context: ServerContext) -> Tensor:
     """What these messages alone tell, [*, slots, 3], as ``ServerContext.timeline``."""
     facts = stop_places(messages, context)
-    ages = stop_ages(messages._replace(time=context.now.unsqueeze(-1)), context)
+    as_of_now = messages._replace(time=context.now.unsqueeze(-1))
+    ages = stop_ages(as_of_now, context)
     places, told = told_slots(facts, ages, context.observation.timeline)
     return torch.cat([places, told.unsqueeze(-1)], -1)
 
@@ -52,7 +54,9 @@ def _timeline(v: FeatureCache) -> Tensor:
     """
     messages = v.messages
     context = v.context
-    known = told_timeline(messages, context) if context.timeline is None else context.timeline
+    known = context.timeline
+    if known is None:
+        known = told_timeline(messages, context)
     flies = messages.in_flight.to(known.dtype).unsqueeze(-1)
     destination = torch.cat([messages.target, flies], -1).unsqueeze(-2)
     ways = ways_to_nearest(v, torch.cat([known, destination], -2))
