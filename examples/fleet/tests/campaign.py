@@ -462,6 +462,14 @@ class Campaign:
     def see_to(self, uav):
         """What a person does: lands what he has taken over, mends it, and hands it over again."""
         copter = uav.copter
+        stands = shapely.Point(self.ground.local(copter.degrees(copter.place)))
+        is_out = (
+            copter.landed and not copter.armed and not self.ground.region.polygon.contains(stands)
+        )
+        if is_out and self.now % 60 == 0:  # in the zone, or outside: he carries it back
+            copter.place = STARTS[ord(uav.name) - ord("A")]
+            uav.strayed = True
+            uav.known = np.inf
         if uav.seen_at is not None and (uav.bridge is None or uav.bridge.state == "connect"):
             uav.seen_at = self.now
         is_heeded = uav.bridge is None or uav.bridge.state in ("watch", "left")
@@ -482,11 +490,6 @@ class Campaign:
                 copter.reboot(self.now)
             copter.crashed = False
             copter.battery = [100.0]
-            stands = shapely.Point(self.ground.local(copter.degrees(copter.place)))
-            if not self.ground.region.polygon.contains(
-                stands
-            ):  # in the zone, or outside: he carries it
-                copter.place = STARTS[ord(uav.name) - ord("A")]
             copter.change_mode(STABILIZE)
         elif self.now >= uav.idle_since + 35:
             uav.act = None
