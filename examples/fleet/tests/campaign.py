@@ -134,7 +134,7 @@ class Uav(Link):
         aside = ASIDE * np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())
         super().__init__(name, Copter(ORIGIN, STARTS[number] + aside, system=number + 1, station=255), rng)
         self.memory, self.epoch, self.off_until = None, 0.0, 0.0
-        self.act, self.seen_at, self.changed, self.shown = None, None, {}, {}
+        self.act, self.seen_at, self.changed, self.shown = None, None, set(), {}
         self.aim = None  # where another station has sent it
         self.second, self.second_until, self.ambush, self.others, self.wait = None, 0.0, None, 0, None
         self.strayed, self.known, self.confirmed, self.accepted, self.way = False, 0.0, 0.0, 0.0, None
@@ -399,7 +399,7 @@ class Campaign:
             copter.crashed, copter.battery = False, [100.0]
             copter.change_mode(STABILIZE)
         elif self.now >= uav.idle_since + 35:
-            uav.act, uav.seen_at, uav.changed, uav.idle_since = None, None, {}, self.now
+            uav.act, uav.seen_at, uav.changed, uav.idle_since = None, None, set(), self.now
             copter.change_mode(GUIDED)
 
     # What must hold.
