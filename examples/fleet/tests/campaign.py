@@ -135,7 +135,7 @@ class Uav(Link):
         super().__init__(name, Copter(ORIGIN, STARTS[number] + aside, system=number + 1, station=255), rng)
         self.memory, self.epoch, self.off_until = None, 0.0, 0.0
         self.act, self.seen_at, self.changed, self.shown = None, None, set(), {}
-        self.aim = None  # where another station has sent it
+        self.after = {}  # how an act has left it
         self.second, self.second_until, self.ambush, self.others, self.wait = None, 0.0, None, 0, None
         self.strayed, self.known, self.confirmed, self.accepted, self.way = False, 0.0, 0.0, 0.0, None
         self.last_command = self.hover_since = self.air_since = self.idle_since = None
@@ -165,6 +165,8 @@ class Uav(Link):
         changed = [each for each in changed if each != "mode" or not lands or fell]
         if changed:
             self.act, self.seen_at, self.changed = (now, why), None, {*changed}
+            aim = copter.goal and tuple(round(each * 1e7) for each in copter.degrees(copter.goal[0]))
+            self.after = {"mode": copter.mode, "motors": ARMED * copter.armed, "aim": aim}
         if (changed or fell) and (fell or not copter.landed):
             self.strayed, self.known = True, np.inf
 
@@ -182,7 +184,7 @@ class Uav(Link):
                 return
         for what, value in shows.items():
             is_new = what in self.changed and self.shown.get(what) != value
-            is_new = is_new and (what != "aim" or value == self.aim)  # not the goal that came after
+            is_new = is_new and value == self.after.get(what, value)  # not what came later
             if self.act is not None and self.seen_at is None and at >= self.act[0] and is_new:
                 self.seen_at = now
             self.shown[what] = value
@@ -482,8 +484,10 @@ class Faults:
 
     def vehicle_restarted(field, uav, _):
         if uav.copter.landed:
+            before = {"mode": uav.copter.mode, "motors": uav.copter.armed}
             uav.copter.reboot(field.now)
-            uav.acted(field.now, "reboot", "mode", "motors")
+            after = {"mode": uav.copter.mode, "motors": uav.copter.armed}
+            uav.acted(field.now, "reboot", *(i for i in after if after[i] != before[i]))
 
     def clock_set_an_hour(field, _, seconds):
         jump = HOUR * field.rng.choice([-1, 1])
@@ -525,7 +529,6 @@ class Faults:
         message.pack(mavlink.MAVLink(None, 255, 190))
         if copter.mode == GUIDED and not copter.landed:
             copter.receive(message)
-            uav.aim = tuple(round(each * 1e7) for each in copter.degrees(copter.goal[0]))
             uav.acted(field.now, "go-to", "aim")
 
     def pilot_takes_over(field, uav, seconds):
