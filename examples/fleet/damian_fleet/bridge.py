@@ -61,7 +61,7 @@ ALONE = (
 )
 AIM = 3.0  # difference of its aim to its goal from which somebody else has given it [m]
 SETTLED = 3.0  # how long a switch of a pilot may be told late after he has handed over [s]
-IDENTITY = 10.0  # how long it is waited for which vehicle it is [s]
+IDENTITY = 60.0  # how long it is asked at most which vehicle it is, if it does not say that it cannot tell [s]
 TIMEOUT = 10.0  # when an answer counts as missing [s]
 NEAR, THERE = 2.0, 10.0  # how near to its goal it begins to land, and must have landed [m]
 LEVEL = 1.0  # difference to its flight level at which it has climbed enough [m]
@@ -220,6 +220,7 @@ class Bridge:
         self._was_linked = self._has_switched = self._has_joined = self._is_other = (
             self._is_quiet
         ) = False
+        self._is_nameless = False  # whether the vehicle cannot tell which one it is
         self._spotted = self._was_spotted = False
         self._track = self._turned = self._held = None
         self._offer: Advice | None = None
@@ -394,6 +395,11 @@ class Bridge:
 
     def _hear_command_ack(self, ack: Any) -> None:
         """Note what the vehicle says of a command of this state; none of other stations."""
+        refuses = ack.result not in (
+            mavlink.MAV_RESULT_ACCEPTED,
+            mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+        )
+        self._is_nameless |= ack.command == mavlink.MAV_CMD_REQUEST_MESSAGE and refuses
         if (ack.target_system, ack.target_component) != STATION or ack.command not in self._sent:
             return
         self.memory.lands |= ack.command == mavlink.MAV_CMD_NAV_LAND and ack.result == 0
@@ -805,7 +811,7 @@ class Bridge:
     def _connect(self) -> None:
         if "HEARTBEAT" not in self.seen or self.here is None or not (self.on_ground or self.in_air):
             return
-        if not self.memory.vehicle and self.now < self._since + IDENTITY:
+        if not (self.memory.vehicle or self._is_nameless) and self.now < self._since + IDENTITY:
             self.why = "which vehicle it is"
             if self._is_due("identity", 1.0):
                 asked = mavlink.MAV_CMD_REQUEST_MESSAGE, 0, 148, *[0.0] * 6

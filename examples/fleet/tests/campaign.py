@@ -161,9 +161,9 @@ class Uav(Link):
         self.off_until = 0.0
         self.act = None
         self.seen_at = None
-        self.changed = {}
+        self.changed = set()
         self.shown = {}
-        self.aim = None  # where another station has sent it
+        self.after = {}  # how an act has left it
         self.second = None
         self.second_until = 0.0
         self.ambush = None
@@ -209,6 +209,10 @@ class Uav(Link):
             self.act = (now, why)
             self.seen_at = None
             self.changed = {*changed}
+            aim = copter.goal and tuple(
+                round(each * 1e7) for each in copter.degrees(copter.goal[0])
+            )
+            self.after = {"mode": copter.mode, "motors": ARMED * copter.armed, "aim": aim}
         if (changed or fell) and (fell or not copter.landed):
             self.strayed = True
             self.known = np.inf
@@ -227,7 +231,7 @@ class Uav(Link):
                 return
         for what, value in shows.items():
             is_new = what in self.changed and self.shown.get(what) != value
-            is_new = is_new and (what != "aim" or value == self.aim)  # not the goal that came after
+            is_new = is_new and value == self.after.get(what, value)  # not what came later
             if self.act is not None and self.seen_at is None and at >= self.act[0] and is_new:
                 self.seen_at = now
             self.shown[what] = value
@@ -494,7 +498,7 @@ class Campaign:
         elif self.now >= uav.idle_since + 35:
             uav.act = None
             uav.seen_at = None
-            uav.changed = {}
+            uav.changed = set()
             uav.idle_since = self.now
             copter.change_mode(GUIDED)
 
@@ -586,8 +590,10 @@ class Faults:
 
     def vehicle_restarted(field, uav, _):
         if uav.copter.landed:
+            before = {"mode": uav.copter.mode, "motors": uav.copter.armed}
             uav.copter.reboot(field.now)
-            uav.acted(field.now, "reboot", "mode", "motors")
+            after = {"mode": uav.copter.mode, "motors": uav.copter.armed}
+            uav.acted(field.now, "reboot", *(i for i in after if after[i] != before[i]))
 
     def clock_set_an_hour(field, _, seconds):
         jump = HOUR * field.rng.choice([-1, 1])
@@ -632,7 +638,6 @@ class Faults:
         message.pack(mavlink.MAVLink(None, 255, 190))
         if copter.mode == GUIDED and not copter.landed:
             copter.receive(message)
-            uav.aim = tuple(round(each * 1e7) for each in copter.degrees(copter.goal[0]))
             uav.acted(field.now, "go-to", "aim")
 
     def pilot_takes_over(field, uav, seconds):

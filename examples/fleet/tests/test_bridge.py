@@ -254,6 +254,21 @@ def test_another_bridge_has_it_and_both_say_so(caplog):
     assert "the service warns: 2 has tried" in caplog.text
 
 
+def test_it_reports_nothing_before_it_knows_which_vehicle_it_is_unless_that_cannot_tell():
+    world = World()
+    world.vehicle.mute = ("AUTOPILOT_VERSION",)
+    world.run(30)
+    assert (world.bridge.state, world.service.reports) == ("connect", [])
+    world.vehicle.results = {mavlink.MAV_CMD_REQUEST_MESSAGE: 3}  # unsupported
+    world.until("cruise")
+    assert world.service.reports[-1]["vehicle"] is None
+    world = World().until("cruise")
+    assert (
+        int.from_bytes(bytes.fromhex(world.service.reports[-1]["vehicle"]), "little")
+        == world.vehicle.board
+    )
+
+
 def test_it_flies_beyond_2038(monkeypatch):
     monkeypatch.setattr(scripted, "BEGIN", 2.2e9)
     world = World()
