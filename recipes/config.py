@@ -99,12 +99,12 @@ class TrainConfig(ScenarioConfig):
         checks.names("corrected", self.corrected, ("reward", "critic", "actor"))
         self.refuse(not self.corrected, "corrected", "is empty: choose reward, critic or actor")
         if self.observation.belief and not self.seeks_source:  # aware=belief suits any task
-            keys = "observation.belief" + " and model.skip" * self.model.skip
+            keys = "observation.belief" + " and model.prior" * self.model.prior
             warnings.warn(
                 f"{keys}: left out, because nothing is won by finding the source", stacklevel=2
             )
             self.observation = replace(self.observation, belief=[])
-            self.model = replace(self.model, skip=False)
+            self.model = replace(self.model, prior=False)
 
     @property
     def compiles(self) -> bool:

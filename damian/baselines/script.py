@@ -16,6 +16,7 @@ from damian.common.tensors import distances, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import any_of, chance_of_staying, detection_chance, places, report_rows
+from damian.server.features.actions import FLIGHT_COST, LEAST_GAIN
 from damian.server.features.requests import known_requests
 from damian.world.messages import Messages
 
@@ -26,11 +27,6 @@ TRUST = 0.9
 """Confidence, in [0, 1], that there is no source in a footprint in which a UAV hears nothing."""
 RECENT = 3.0
 """A detection is recent until the source can have moved by this many footprint radii."""
-_FLIGHT_COST = 1e-6
-"""Cost of a flight [weight per metre]: it only decides between equally good places, for the
-nearest."""
-_LEAST_GAIN = 1e-3
-"""If no choice gains more weight than this, all weight lies out of reach."""
 PROBABLE = 0.1
 """If a UAV detects the source with this probability somewhere in the next step, it leaves its own
 ground."""
@@ -150,7 +146,7 @@ class Seeker:
         real = self.real[region].unsqueeze(1)
         gain = gain.where(real, -torch.inf)
         flown = distances(held.target, ground)
-        goal = (gain - _FLIGHT_COST * flown).argmax(-1)
+        goal = (gain - FLIGHT_COST * flown).argmax(-1)
         goal_place = _places_at(ground, goal)
         left = distances(goal_place, ground)
         if self.actions.kind == "discrete":
@@ -242,8 +238,8 @@ class Seeker:
 def _best(gain: Tensor, flown: Tensor, left: Tensor) -> Tensor:
     """Index of the choice of most gain, the nearest of equals, or nearest the goal if none gains,
     [B, N]."""
-    gains = gain.amax(-1, keepdim=True) > _LEAST_GAIN
-    net_gain = gain - _FLIGHT_COST * flown
+    gains = gain.amax(-1, keepdim=True) > LEAST_GAIN
+    net_gain = gain - FLIGHT_COST * flown
     way_left = left.where(gain.isfinite(), torch.inf)
     return torch.where(gains, net_gain, -way_left).argmax(-1)
 
@@ -352,19 +348,18 @@ class Coverer(Seeker):
                 itself = (uavs == uav).unsqueeze(-1)
                 packed = torch.where(itself, own_message, message)
                 own = self.unpack(packed)
-            action, point = self.choose_new(own, uav, claimed, near, legal)
+            action, claims = self.choose_new(own, uav, claimed, near, legal)
             actions.append(action)
             if own_message is not None:  # the others do not know where it is
-                _, point = self.choose_new(held, uav, claimed, near, None)
-            footprint = _footprints_of(point, near).squeeze(1)
-            claimed = torch.maximum(claimed, footprint)
+                _, claims = self.choose_new(held, uav, claimed, near, None)
+            claimed = torch.maximum(claimed, claims)
         return torch.cat(actions, 1)
 
     def choose_new(
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by
-        others."""
+        """Action of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others, and what it
+        claims itself: the footprint in which it gains new ground, [B, L]."""
         alone = _only(known, uav)
         # The next landing replaces the oldest one.
         latest = self.counted(alone)[:, 0, :-1] % self.n_points
@@ -372,7 +367,10 @@ class Coverer(Seeker):
         footprints = torch.cat([own, claimed.unsqueeze(1)], 1)
         new = 1 - footprints.amax(1, keepdim=True)
         region = self.region_of(known)
-        return self.choose_landing(alone, new @ near, region, mask)
+        gain = new @ near
+        action, point = self.choose_landing(alone, gain, region, mask)
+        gains = gain.squeeze(1).gather(-1, point) > LEAST_GAIN
+        return action, _footprints_of(point, near).squeeze(1) * gains
 
 
 class Rescuer(Coverer):
@@ -392,7 +390,8 @@ class Rescuer(Coverer):
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         close = (-from_goal / self.radius).exp()
-        return self.choose_landing(_only(known, uav), close, region, mask)
+        action, _ = self.choose_landing(_only(known, uav), close, region, mask)
+        return action, claimed
 
     def searched(self, known: Messages, uav: int) -> Tensor:
         """Where a UAV that searches flies next, [B, 2]."""
@@ -427,7 +426,8 @@ class Dispatcher(Rescuer):
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         inside = from_goal <= self.radius
-        return self.choose_landing(alone, inside.float(), region, mask)
+        action, _ = self.choose_landing(alone, inside.float(), region, mask)
+        return action, claimed
 
 
 def _assigned(uavs: Tensor, places: Tensor, wanted: Tensor, uav: int) -> tuple[Tensor, Tensor]:

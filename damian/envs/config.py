@@ -110,9 +110,11 @@ class ScenarioConfig(WorldConfig):
             "knows"
         )
         self.refuse(observation.belief and drawn, "observation.belief", problem)
-        per_action = "belief_gain" in observation.belief
-        problem = "needs discrete actions: it has a value for each of them"
-        self.refuse(per_action and self.actions.kind == "continuous", "observation.belief", problem)
+        continuous = self.actions.kind == "continuous"
+        per_action = {"belief": "belief_gain" in observation.belief, "actions": observation.actions}
+        problem = "needs discrete actions: it has values for each of them"
+        for name, observed in per_action.items():
+            self.refuse(observed and continuous, f"observation.{name}", problem)
         problem = "is empty for a single UAV: add another feature"
         empty = self.agents == 1 and observation.critic == ["agent_distances"]
         self.refuse(empty, "observation.global_features", problem)
@@ -149,7 +151,6 @@ class ScenarioConfig(WorldConfig):
 
     @property
     def seeks_source(self) -> bool:
-        """Whether anything is won by finding the source."""
         terms = {*self.reward.terms} - {"coverage", "battery", "mean_distance", "served"}
         return bool(terms) or self.episode.can_succeed
 

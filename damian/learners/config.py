@@ -164,6 +164,22 @@ class MappoConfig(LearnerConfig):
         False,
         "The critic learns values of mean 0 and deviation 1, whatever the scale of the rewards.",
     )
+    team: float = setting(
+        0.0,
+        "Share of the mean reward of all UAVs in what each learns from, instead of its own.",
+        low=0,
+        high=1,
+    )
+    warm_up: int = setting(0, "Updates in which only the critic learns.", low=0, high=checks.STEPS)
+    near_start: int = setting(
+        0,
+        "Environment steps over which a penalty of the divergence from the first policy fades; for "
+        "one that begins well.",
+        low=0,
+        high=checks.STEPS,
+    )
+    near_start_coeff: float = setting(1.0, "Weight of this penalty at first.", low=0)
+    anneal: bool = setting(False, "The learning rate falls to zero over the run.")
 
     learner: ClassVar[str] = "damian.learners.mappo:Mappo"
 

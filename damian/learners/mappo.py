@@ -1,5 +1,6 @@
 """MAPPO, from batches that late messages may have corrected (paper, section 4.3)."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
@@ -7,22 +8,25 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torch.distributions import Distribution
 from torch.nn.functional import pad, smooth_l1_loss
-from torchrl.data import ReplayBuffer
+from torchrl.data import Categorical, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, set_recurrent_mode
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
+from damian.common import checks
 from damian.common.compiling import COMPILE_OPTIONS, compiled
 from damian.learners.base import UNREAD, LearningSetup
 from damian.learners.config import MappoConfig
 from damian.models.critic import NormalizedValue, make_critic
+from damian.models.distribution import LegalCategorical
 from damian.models.memory import RECURRENT_KEYS
 from damian.replay.backupdate import BackupdateStorage
 
-LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
-"""Names of the terms of the loss (``mappo_losses``)."""
+LOSSES = ("loss_objective", "loss_entropy", "loss_critic", "loss_start")
+"""Names of the terms of the loss (``mappo_losses``), the last of which needs ``START``."""
 NUMBERS = ("kl", "clip_fraction", "entropy")
 """Names of the further numbers that ``mappo_losses`` returns."""
 LOSS_KEYS: list[NestedKey] = [
@@ -35,6 +39,24 @@ LOSS_KEYS: list[NestedKey] = [
     keys.READY,
 ]
 """Entries of a step that the loss reads, besides the critic's observation."""
+START: NestedKey = (keys.AGENTS, "start_logits")
+"""Logits of the policy with which the training began, [B, T, N, A]."""
+
+
+class Progress:
+    """How far a learner has come."""
+
+    updates = 0
+    """Number of updates so far."""
+    frames = 0
+    """Number of environment steps so far."""
+
+    def state_dict(self) -> dict[str, int]:
+        return {"updates": self.updates, "frames": self.frames}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.updates = state["updates"]
+        self.frames = state["frames"]
 
 
 class Mappo:
@@ -53,8 +75,13 @@ class Mappo:
         self.config = config
         self.setup = setup
         self.buffer = buffer
+        self.progress = Progress()
         self.actor = config.make_actor(env, setup.model)
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
+        discrete = isinstance(env.full_action_spec_unbatched[keys.ACTION], Categorical)
+        near = config.near_start
+        checks.require(discrete or not near, "learner.near_start", near, "needs discrete actions")
+        self.start = copy.deepcopy(self.actor).requires_grad_(False) if near else None
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
         observed = setup.recompute_actor or setup.critic_key == keys.OBSERVATION
         unread = [keys.ACTION_MASK] if observed else [keys.ACTION_MASK, keys.OBSERVATION]
@@ -65,15 +92,20 @@ class Mappo:
         self.losses = compiled(self._losses, options=COMPILE_OPTIONS) if compiles else self._losses
 
     def components(self) -> dict[str, Any]:
-        """What a checkpoint stores: networks and optimiser."""
-        return {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
+        """What a checkpoint stores: networks, optimiser and progress."""
+        found = {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
+        found |= {"start": self.start} if self.start else {}
+        return found | {"progress": self.progress}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Make one update from a batch [B, T]; also logs ``explained_variance`` and
         ``backupdated``."""
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
+        self._add_start(corrected)
         numbers = self.optimize(corrected)
+        self.progress.updates += 1
+        self.progress.frames += batch.numel()
         numbers["explained_variance"] = explained_variance(corrected).item()
         if self.buffer is None:
             return numbers
@@ -102,26 +134,48 @@ class Mappo:
             batch[keys.ACTION_LOG_PROB] = policy.log_prob(batch[keys.ACTION])
         return batch
 
+    def _add_start(self, batch: TensorDictBase) -> None:
+        """Write the logits of the first policy into a batch, while it is to stay near that."""
+        if self.start and self.progress.frames < self.config.near_start:
+            with torch.no_grad(), set_recurrent_mode(True):
+                batch[START] = self.start.get_dist(batch).logits
+
+    def _weights_of_losses(self) -> list[float]:
+        """Factors of ``LOSSES`` in this update."""
+        moves = float(self.progress.updates >= self.config.warm_up)
+        share = self.progress.frames / max(self.config.near_start, 1)
+        near = self.config.near_start_coeff * max(1 - share, 0.0)
+        return [moves, moves, 1.0, moves * near]
+
+    def _anneal(self) -> None:
+        left = 1 - self.progress.frames / self.setup.frames
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.lr * max(left, 0.0)
+
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
         """Make ``epochs`` passes over a batch [B, T]; means of ``LOSSES``, ``NUMBERS``,
         ``gradient_norm``."""
         terms = []
+        if self.config.anneal:
+            self._anneal()
+        weights = torch.tensor(self._weights_of_losses(), device=batch.device)
         for entries in self._minibatches(batch):
             losses, numbers = self.losses(entries)
             self.optimizer.zero_grad()
+            losses = losses * weights[: len(losses)]
             losses.sum().backward()
             norm = torch.nn.utils.clip_grad_norm_(self.weights, self.config.max_grad_norm)
             self.optimizer.step()
             terms.append(torch.cat([losses.detach(), numbers, norm.view(1)]))
         # A number that is read at once would make the device wait at every minibatch.
-        names = (*LOSSES, *NUMBERS, "gradient_norm")
+        names = (*LOSSES[: len(losses)], *NUMBERS, "gradient_norm")
         means = torch.stack(terms).double().mean(0)
         return dict(zip(names, means.tolist(), strict=True))
 
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
         """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
         recurrent = self.setup.model.recurrent
-        read = [*self.loss_keys, *self.critic.in_keys]
+        read = [*self.loss_keys, *self.critic.in_keys, START]
         if recurrent:
             read += RECURRENT_KEYS
         samples = {}
@@ -166,7 +220,7 @@ def mappo_losses(
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
-    log_ratio, entropy = policy_terms(steps, actor)
+    policy, log_ratio, entropy = policy_terms(steps, actor)
     ratio = log_ratio.exp()
     advantage = entries[keys.ADVANTAGE].squeeze(-1)
     epsilon = config.clip_epsilon
@@ -183,6 +237,10 @@ def mappo_losses(
         -config.entropy_coeff * mean_entropy,
         config.critic_coeff * error,
     ]
+    if START in entries:
+        log = cast(LegalCategorical, policy).logits
+        divergence = (log.exp() * (log - entries[START])).sum(-1)
+        losses.append((divergence * ready).sum() / n_decisions)
     with torch.no_grad():
         divergence = (ratio - 1 - log_ratio) * ready
         beyond = ((ratio - 1).abs() > epsilon) * ready
@@ -192,16 +250,18 @@ def mappo_losses(
     return torch.stack(losses), numbers
 
 
-def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
-    """Log-ratios of importance, and entropies (estimated by one draw if continuous), [*, N], on
-    steps [*]."""
+def policy_terms(
+    steps: TensorDictBase, actor: ProbabilisticActor
+) -> tuple[Distribution, Tensor, Tensor]:
+    """Policies on steps [*], log-ratios of importance, and entropies (estimated by one draw if
+    continuous), [*, N]."""
     with set_recurrent_mode(True):
         policy = actor.get_dist(steps)
     log_ratio = policy.log_prob(steps[keys.ACTION]) - steps[keys.ACTION_LOG_PROB]
     if isinstance(policy, TanhNormal):
         _, log_prob = policy.rsample_and_log_prob()
-        return log_ratio, -log_prob
-    return log_ratio, policy.entropy()
+        return policy, log_ratio, -log_prob
+    return policy, log_ratio, policy.entropy()
 
 
 @torch.no_grad()
@@ -223,6 +283,8 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     decides_next = next_step[keys.READY].unsqueeze(-1)
     lmbda: Any = torch.where(decides_next, config.lmbda, 1.0)
     reward = next_step[keys.REWARD]
+    if config.team:
+        reward = torch.lerp(reward, reward.mean(-2, keepdim=True), config.team)
     advantage, target = generalized_advantage_estimate(
         config.gamma, lmbda, value, next_value, reward, *ends, time_dim=-3
     )

@@ -1,4 +1,4 @@
-"""Actors: a model's network, with a memory, a skip connection, or one network for each UAV, and a
+"""Actors: a model's network, with a memory, a prior, or one network for each UAV, and a
 policy."""
 
 import torch
@@ -16,9 +16,10 @@ from damian.models.memory import AgentGRU
 from damian.models.separate import SeparateNetworks
 from damian.server.layout import Layout, layout_at
 
-FIRST_WEIGHT, LEAST = 8.0, 1e-3
-"""Initial weight of a skip connection, and the lower bound of the probabilities of which it takes
-the log."""
+FIRST_WEIGHTS = {"gain": 40.0, "choice": 2.0}
+"""Initial weights of the gains of actions, and of the action that gains most."""
+FIRST_LOG_WEIGHT, LEAST = 8.0, 1e-3
+"""Initial weight of the logs of probabilities of a detection, and the lower bound of these."""
 
 
 def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
@@ -29,10 +30,10 @@ def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
     def make(n_out: int, *out_keys: NestedKey) -> TensorDictModule:
         if not model.recurrent:
             network = _network(model, layout, n_out, shape)
-            return _module(network, keys.OBSERVATION, model, layout, out_keys)
-        head = nn.Linear(model.hidden[-1], n_out)
+            return _module(network, [keys.OBSERVATION], model, layout, out_keys)
+        head = model.make_head(layout, n_out)
         memory = AgentGRU(*model.make_encoder(layout), model.hidden[-1])
-        after = _module(head, keys.HIDDEN, model, layout, out_keys)
+        after = _module(head, [keys.HIDDEN, keys.OBSERVATION], model, layout, out_keys)
         return TensorDictSequential([memory, after])  # type: ignore[list-item]
 
     actor = with_distribution(env, make)
@@ -49,38 +50,55 @@ def _network(model: ModelConfig, layout: Layout, n_out: int, observed: torch.Siz
 
 def _module(
     network: nn.Module,
-    in_key: NestedKey,
+    in_keys: list[NestedKey],
     model: ModelConfig,
     layout: Layout,
     out_keys: tuple[NestedKey, ...],
 ) -> TensorDictModule:
-    """A network from an entry to the parameters of the actions' distribution."""
-    normal = len(out_keys) == 2
-    if model.skip:
-        should = "needs a probability for each discrete action: observation.belief=[belief_gain]"
-        checks.require("belief_gain" in layout and not normal, "model.skip", True, should)
-        skipping = SkipConnection(network, layout["belief_gain"].columns)
-        return TensorDictModule(
-            skipping, in_keys=[in_key, keys.OBSERVATION], out_keys=list(out_keys)
-        )
-    module = nn.Sequential(network, NormalParamExtractor()) if normal else network
-    return TensorDictModule(module, in_keys=[in_key], out_keys=list(out_keys))
+    """A network from entries, of which the observation is the last, to the parameters of the
+    actions' distribution."""
+    if len(out_keys) == 2:
+        checks.require(not model.prior, "model.prior", True, "needs discrete actions")
+        network = NormalParameters(network, NormalParamExtractor())
+    elif model.prior:
+        network = Prior(network, layout)
+    return TensorDictModule(network, in_keys=in_keys, out_keys=list(out_keys))
 
 
-class SkipConnection(nn.Module):
-    """A network's outputs, zero at first, plus the logs of the observation's ``columns`` times a
+class NormalParameters(nn.Sequential):
+    """A network, and then what makes location and scale of its outputs."""
+
+    def forward(self, *read: Tensor) -> tuple[Tensor, Tensor]:
+        """Location and scale [*, n] each."""
+        network, extract = self
+        return extract(network(*read))
+
+
+class Prior(nn.Module):
+    """A network's outputs, zero at first, plus what the script would gain by each action, times a
     weight."""
 
-    def __init__(self, network: nn.Module, columns: slice) -> None:
+    def __init__(self, network: nn.Module, layout: Layout) -> None:
         super().__init__()
         self.network = network
-        self.columns = columns
-        self.weight = nn.Parameter(torch.tensor(FIRST_WEIGHT))
+        self.log = "belief_gain" in layout
+        first = [FIRST_LOG_WEIGHT]
+        if self.log:
+            self.columns = [layout["belief_gain"].columns]
+        else:
+            should = "needs gains: observation.actions=true, or observation.belief=[belief_gain]"
+            checks.require("actions" in layout, "model.prior", True, should)
+            self.columns = [layout["actions"].columns_of(name) for name in FIRST_WEIGHTS]
+            first = [*FIRST_WEIGHTS.values()]
+        self.weight = nn.Parameter(torch.tensor(first))
         last = [each for each in network.modules() if isinstance(each, nn.Linear)][-1]
         for parameter in last.parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, features: Tensor, observation: Tensor) -> Tensor:
-        """Logits [*, A] of the network's input [*, H] and observations [*, F]."""
-        log = observation[..., self.columns].clamp(min=LEAST).log()
-        return self.network(features) + self.weight * log
+    def forward(self, *read: Tensor) -> Tensor:
+        """Logits [*, A] from what the network reads, of which observations [*, F] are the last."""
+        logits = self.network(*read)
+        for columns, weight in zip(self.columns, self.weight, strict=True):
+            gain = read[-1][..., columns]
+            logits = logits + weight * (gain.clamp(min=LEAST).log() if self.log else gain)
+        return logits

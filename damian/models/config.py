@@ -33,7 +33,7 @@ class ModelConfig(Settings):
 
     A model of your own has a dataclass derived from this class, with fields for its own settings,
     that implements ``make_network``, from which actor, critic and action values are made. A memory,
-    a skip connection, and networks for each UAV combine with it. ``model=package.module:Name``
+    a prior, and networks for each UAV combine with it. ``model=package.module:Name``
     chooses it.
     """
 
@@ -52,7 +52,11 @@ class ModelConfig(Settings):
         "episode.",
         choices=("none", "gru"),
     )
-    skip: bool = setting(False, "The actor begins by preferring actions of high ``belief_gain``.")
+    prior: bool = setting(
+        False,
+        "The actor begins by preferring actions of high ``belief_gain``, or else of high ``gain`` "
+        "among ``observation.actions``.",
+    )
     shared: bool = setting(
         True, "All UAVs share one actor; if not, each has one of its own, for unequal UAVs."
     )
@@ -90,6 +94,11 @@ class ModelConfig(Settings):
         encode = resolved("damian.models.mlp:activated")
         return encode(self.make_network(layout, self.hidden[-1]), self.activation), self.hidden[-1]
 
+    def make_head(self, layout: "Layout", n_out: int) -> "nn.Module":
+        """What an actor with a memory has behind it: from the memory's state
+        [*, ``hidden[-1]``] and the observation [*, F] to [*, n_out]."""
+        return resolved("damian.models.mlp:LinearHead")(self.hidden[-1], n_out)
+
 
 @MODELS.register("mlp")
 @dataclass
@@ -102,3 +111,32 @@ class MlpConfig(ModelConfig):
     def make_encoder(self, layout: "Layout") -> "tuple[nn.Module, int]":
         """All hidden layers but the last one, in whose place the memory is."""
         return resolved("damian.models.mlp:make_encoder")(self, layout.width)
+
+
+@MODELS.register("sets")
+@dataclass
+class SetsConfig(ModelConfig):
+    """Rows of other UAVs, detections, requests and actions through layers that rows share.
+
+    What it computes does not change with the order of the rows. With ``observation.actions`` each
+    action's logit follows from its own row and from a context, which is made of sums and maxima
+    over the other rows and of all other columns.
+    """
+
+    name: str = "sets"
+    width: int = setting(32, "Width of the layers that read a row.", low=1, high=16384)
+
+    def make_network(self, layout: "Layout", n_out: int) -> "nn.Module":
+        encoder, _ = self.make_encoder(layout)
+        joined = resolved("damian.models.sets:Joined")
+        return joined(encoder, self.make_head(layout, n_out))
+
+    def make_encoder(self, layout: "Layout") -> "tuple[nn.Module, int]":
+        encoder = resolved("damian.models.sets:SetEncoder")(self, layout, self.width)
+        return encoder, self.hidden[-1]
+
+    def make_head(self, layout: "Layout", n_out: int) -> "nn.Module":
+        if "actions" not in layout or n_out == 1:
+            return super().make_head(layout, n_out)
+        make = resolved("damian.models.sets:ActionHead")
+        return make(self, layout["actions"], self.hidden[-1], self.width)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from torch import nn
+from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from damian.models.config import ModelConfig
@@ -32,3 +32,11 @@ def make_encoder(config: ModelConfig, n_in: int) -> tuple[nn.Module, int]:
 def activated(network: nn.Module, activation: str) -> nn.Module:
     """A network whose outputs pass an activation function."""
     return nn.Sequential(network, ACTIVATIONS[activation]())
+
+
+class LinearHead(nn.Linear):
+    """A last layer that reads nothing but features."""
+
+    def forward(self, features: Tensor, observation: Tensor) -> Tensor:  # type: ignore[override]
+        """Outputs [*, n_out] of features [*, n_in]."""
+        return super().forward(features)

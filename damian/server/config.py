@@ -28,7 +28,7 @@ class ObservationConfig(Settings):
         "source_time, "
         "agent_distances, coverage, mean_distance, mean_distance_not_spotting, "
         "mean_distance_spotting, "
-        "spotting_agents, others, ages, coverage_map, requests.",
+        "spotting_agents, others, ages, coverage_map, requests, detections.",
     )
     ctde: bool = setting(False, "Whether the actor observes only the local features.")
     time_scale: float | None = setting(
@@ -47,6 +47,14 @@ class ObservationConfig(Settings):
         False,
         "Whether each UAV knows its own messages at once, not when the server has them, as in the "
         "paper.",
+    )
+    actions: bool = setting(
+        False,
+        "Whether each actor observes what each discrete action offers: where it leads, the ground, "
+        "sources and requests there.",
+    )
+    detections: int = setting(
+        3, "Number of newest detections of each source that ``detections`` tells.", low=1, high=16
     )
     belief: list[str] = setting(
         [],
@@ -93,7 +101,7 @@ class ObservationConfig(Settings):
     def actor(self) -> list[str]:
         """Features of the actor's observation, in order."""
         features = [*self.local_features, *self.belief, *self.timed] if self.ctde else self.critic
-        return [*features, "age"] if self.age else features
+        return [*features, *["age"] * self.age, *["actions"] * self.actions]
 
     @property
     def critic(self) -> list[str]:

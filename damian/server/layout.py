@@ -32,9 +32,9 @@ class Block:
     """What the values are, in a sentence."""
     entries: tuple[str, ...] = ()
     """What each value of the last dimension is, as far as it has a name."""
-    rows: bool = False
-    """Whether the first dimension lists things, those that do not exist as zeros; the last value of
-    a row is 1 if it is known."""
+    rows: str = ""
+    """What the first dimension lists, such as ``others``, if it lists things; those that do not
+    exist are zeros. Blocks that list the same have the same things in the same order."""
 
     @property
     def width(self) -> int:
@@ -45,6 +45,11 @@ class Block:
     def columns(self) -> slice:
         """The block's columns in the observation."""
         return slice(self.first, self.first + self.width)
+
+    def columns_of(self, entry: str) -> slice:
+        """The columns, in the observation, of what ``entries`` names so."""
+        first = self.first + self.entries.index(entry)
+        return slice(first, self.first + self.width, self.shape[-1])
 
     def of(self, observation: Tensor) -> Tensor:
         """The block's values in observations [*, F], in its shape, [*, ...]."""

@@ -248,9 +248,10 @@ class Server:
 
     def layouts(self, features: Features) -> tuple[Layout, Layout]:
         """The layouts of the actors' and the critic's observations, from features of any worlds."""
-        return layout_of(features, self.observation.actor), layout_of(
-            features, self.observation.critic
-        )
+        tables = self._context.tables
+        observed = self.observation
+        actor, critic = (layout_of(features, x, tables) for x in (observed.actor, observed.critic))
+        return actor, critic
 
     def observe_with_own_messages(
         self,

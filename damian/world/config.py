@@ -496,6 +496,11 @@ class WorldConfig(Settings):
         return False
 
     @property
+    def seeks_source(self) -> bool:
+        """Whether anything is won by finding a source."""
+        return True
+
+    @property
     def is_windy(self) -> bool:
         """Whether there may be wind."""
         drawn = {"wind.speed", "wind.gusts"} & {*self.randomise}

@@ -61,7 +61,7 @@ def build_tables(
     masks = [_overlap(words)]
     for polygon, places in zip(polygons, points, strict=True):
         outside = _outside(polygon, places, offsets)
-        masks.append(_packed(outside))
+        masks.append(packed_bits(outside))
     cells_per_metre = (_GRID - 1) / (4 * radius)
     return FootprintTables(torch.cat(masks), cells_per_metre)
 
@@ -187,7 +187,7 @@ def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleets: Tensor) 
         overlaps = _overlap_rows(fleet).movedim(-1, 0)
         rows = torch.cat([outside, overlaps])
         masks = _or_rows(tables.masks, rows.flatten(1))
-        counts = _bit_count(masks.view(*ids.shape[:-1], -1))
+        counts = bit_count(masks.view(*ids.shape[:-1], -1))
         # Summed as floats (exact: small integers), which compiles to a much faster loop than int64.
         lost = counts.sum(-1, dtype=fleet.dtype)
         shares.append(1 - lost / n_samples)
@@ -221,7 +221,7 @@ def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
     return combined
 
 
-def _bit_count(words: Tensor) -> Tensor:
+def bit_count(words: Tensor) -> Tensor:
     """Number of 1 bits of each int64 (H. S. Warren, Hacker's Delight, 2nd ed., 5-1)."""
     # The shift repeats the sign bit, hence a mask after each.
     upper_ones = (words >> 1).bitwise_and_(0x5555555555555555)
@@ -270,14 +270,14 @@ def _overlap(words: int) -> Tensor:
     axis = np.linspace(-2, 2, _GRID, dtype=np.float32)
     offsets = samples.T[:, None] - axis[:, None]
     dx2, dy2 = np.square(offsets)  # [G, S] each
-    table = torch.stack([_packed(row + dy2 < 1) for row in dx2])
+    table = torch.stack([packed_bits(row + dy2 < 1) for row in dx2])
     border = [0, -1]
     table[border] = 0
     table[:, border] = 0
     return table.view(-1, words)
 
 
-def _packed(bits: np.ndarray) -> Tensor:
+def packed_bits(bits: np.ndarray) -> Tensor:
     """Booleans, 64 packed into one int64: ``[*, 64 * W]`` -> ``[*, W]``."""
     packed = np.packbits(bits, axis=-1, bitorder="little")
     return torch.from_numpy(packed.view(np.int64))

@@ -27,7 +27,7 @@ from damian.server.features.others import of_others
 from damian.server.layout import Layout
 
 
-@feature("global", [None, None], low=-1.0, rows=True)
+@feature("global", [None, None], low=-1.0, rows="others")
 def heard(v: FeatureCache) -> Tensor:
     """What the UAV holds of each other UAV, [*, N, N - 1, K] with K = 2 ``observation.window`` + 5.
 

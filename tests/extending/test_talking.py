@@ -102,7 +102,7 @@ OWN = "observation.own=true"
         ([OWN, "actions.kind=continuous"], False),
         ([OWN, "model.rnn=gru"], False),
         ([OWN, "model.shared=false"], False),
-        ([OWN, "observation.belief=[belief_gain]", "model.skip=true"], False),
+        ([OWN, "observation.belief=[belief_gain]", "model.prior=true"], False),
         ([OWN, "learner=sac"], False),
         (
             [

@@ -56,7 +56,7 @@ def batches(env: EnvBase, actor: torch.nn.Module, steps: int, n: int) -> Iterato
 
 def ratios(learner: Mappo, batch: TensorDictBase) -> torch.Tensor:
     """Importance ratios in the loss, [B, T, N]."""
-    return policy_terms(batch.clone(), learner.actor)[0].detach().exp()
+    return policy_terms(batch.clone(), learner.actor)[1].detach().exp()
 
 
 @both_kinds_and_motions

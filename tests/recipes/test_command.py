@@ -281,10 +281,10 @@ def test_a_folder_that_cannot_be_written_is_one_line(capsys, tmp_path, monkeypat
 
 def test_a_belief_by_which_nothing_is_won_is_left_out_and_said():
     with pytest.warns(
-        UserWarning, match="observation.belief and model.skip: left out, because nothing"
+        UserWarning, match="observation.belief and model.prior: left out, because nothing"
     ):
         config = settings("scenario=patrol", "aware=belief")
-    assert (config.observation.belief, config.model.skip) == ([], False)
+    assert (config.observation.belief, config.model.prior) == ([], False)
 
 
 def test_a_learner_is_judged_by_what_it_reads_not_by_the_shape_of_its_name():

@@ -27,7 +27,7 @@ torch.save([torch.as_tensor(each) for each in session.run(None, given)], "onnx.p
 HISTORY = ["delay.history=2"]
 GRU = ["model=gru"]
 CONTINUOUS = ["learner=sac", "actions=continuous", "learner.warm_up=8", "learner.batch_size=8"]
-BELIEF = ["observation.belief=[belief_gain]", "model.skip=true"]
+BELIEF = ["observation.belief=[belief_gain]", "model.prior=true"]
 BELIEF += ["observation.global_features=[agent_distances]"]  # for three UAVs alone
 OWN = ["model.shared=false", "source.count=2", "observation.belief=[belief_moments]"]
 

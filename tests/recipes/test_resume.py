@@ -31,6 +31,8 @@ SLOW_CLOCKS = [
     "clock.system=16s",
 ]
 FEW = ["learner.prediction_steps=2", "learner.prediction_batch=8", "learner.prediction_buffer=64"]
+SETS = ["model=sets", "observation.actions=true", "model.prior=true", "reward=coverage"]
+SETS += ["learner.warm_up=2", "learner.near_start=200", "learner.anneal=true", "learner.team=0.5"]
 CASES = {
     "recurrent": [
         "delay.obs=2",
@@ -41,6 +43,7 @@ CASES = {
     ],
     "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1"],
     "sac bursts": [*SAC, "scenario=tracking", "delay=burst", "delay.history=2"],
+    "sets": [*SETS, "delay.obs=2", "aware=timeline", "model.rnn=gru"],
     "everything": [*WHOLE, "settle=true", "learner.steps=16", "frames=512"],
     "triggered": TRIGGERED,
     "slow clocks": [*SLOW_CLOCKS, "frames=512"],
@@ -72,7 +75,7 @@ def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case):
     check_equal(whole, other)
     made = len((whole / "metrics.csv").read_text().splitlines()) - 1
     assert updates[0] <= made - 6  # 6 were in the checkpoint
-    has_memory = case in ("recurrent", "sac", "sac bursts", "everything")
+    has_memory = case in ("recurrent", "sets", "sac", "sac bursts", "everything")
     assert any(name.startswith("replay/") for name in files(whole)) == has_memory
 
 

@@ -1,6 +1,15 @@
 """Features: what observations and rewards are computed from, one file for each family."""
 
-from damian.server.features import belief, coverage, others, place, requests, source, timeline  # noqa: F401
+from damian.server.features import (  # noqa: F401
+    actions,
+    belief,
+    coverage,
+    others,
+    place,
+    requests,
+    source,
+    timeline,
+)
 from damian.server.features.base import (
     FEATURES,
     FeatureCache,

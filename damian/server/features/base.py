@@ -25,6 +25,10 @@ MakeTable = Callable[[Simulation, ObservationConfig], Any]
 """Makes what a feature looks up: tensors, or (nested) tuples and mappings of tensors, moved with
 the device."""
 
+Entries = tuple[str, ...] | Callable[[Simulation, ObservationConfig], tuple[str, ...]]
+"""Names of values; a function, which is then among the feature's tables, where they depend on the
+settings."""
+
 
 class ServerContext(NamedTuple):
     """What the server knows besides the messages."""
@@ -210,10 +214,10 @@ class Feature(NamedTuple):
     """Lowest possible value."""
     high: float = 1.0
     """Highest possible value."""
-    entries: tuple[str, ...] = ()
+    entries: Entries = ()
     """What each value of the last dimension is."""
-    rows: bool = False
-    """Whether the first dimension lists things, as in ``damian.server.layout.Block``."""
+    rows: str = ""
+    """What the first dimension lists, as in ``damian.server.layout.Block``."""
     tables: tuple[MakeTable, ...] = ()
     """What the feature looks up."""
 
@@ -230,8 +234,8 @@ def feature(
     high: float = 1.0,
     name: str | None = None,
     *,
-    entries: Sequence[str] = (),
-    rows: bool = False,
+    entries: Sequence[str] | Callable = (),
+    rows: str = "",
     tables: Sequence[MakeTable] = (),
 ) -> Callable[[Callable[[FeatureCache], Tensor]], Feature]:
     """Decorator that makes a feature of a function.
@@ -251,8 +255,9 @@ def feature(
             size.
         name: a short name under which settings know it, too.
         entries: what each value of the last dimension is.
-        rows: whether the first dimension lists things whose order does not matter, those that do
-            not exist as zeros; the last value of a row is 1 if it is known.
+        rows: what the first dimension lists, if it lists things whose order does not matter, such
+            as ``others``; those that do not exist are zeros. Features that list the same have the
+            same things in the same order.
         tables: functions of the simulation and the settings of the observation, each of which
             makes, once, something that the feature looks up by ``cache.table(function)``.
 
@@ -263,9 +268,11 @@ def feature(
     """
     checks.one_of("scope of a feature", scope, ("local", "global", "belief", "timeline", "actor"))
     looked_up = (*tables, source_grid) if scope == "belief" else tuple(tables)
+    looked_up += (entries,) if callable(entries) else ()
 
     def declare(compute: Callable[[FeatureCache], Tensor]) -> Feature:
-        declared = Feature(compute, scope, tuple(shape), low, high, tuple(entries), rows, looked_up)
+        named = entries if callable(entries) else tuple(entries)
+        declared = Feature(compute, scope, tuple(shape), low, high, named, rows, looked_up)
         return FEATURES.register(name)(declared) if name else declared
 
     return declare
@@ -298,7 +305,7 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
     cache = FeatureCache(messages, context)
     found = {}
     for name in names:
-        found[name] = feature_of(name).compute(cache)
+        found[name] = cache(feature_of(name).compute)
         _check_shape(name, found[name], messages.time.shape)
     return found
 
@@ -320,14 +327,16 @@ def observe_own(known: Messages, context: ServerContext, names: list[str]) -> di
     sender = known.time.dim() - 1
     found = {}
     for name in names:
-        values = feature_of(name).compute(cache)
+        values = cache(feature_of(name).compute)
         if values.shape[sender] != 1:
             values = cache.wanted(values)
         found[name] = values.squeeze(sender)
     return found
 
 
-def layout_of(features: Mapping[str, Tensor], names: Sequence[str]) -> Layout:
+def layout_of(
+    features: Mapping[str, Tensor], names: Sequence[str], tables: Mapping[MakeTable, Any]
+) -> Layout:
     """The layout of an observation of these features, from values [Q, N, ...] of each."""
     found = Layout()
     for name in names:
@@ -338,7 +347,7 @@ def layout_of(features: Mapping[str, Tensor], names: Sequence[str]) -> Layout:
             declared.low,
             declared.high,
             meaning=declared.meaning,
-            entries=declared.entries,
+            entries=tables[declared.entries] if callable(declared.entries) else declared.entries,
             rows=declared.rows,
         )
     return found

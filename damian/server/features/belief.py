@@ -34,7 +34,7 @@ def goals_of_actions(simulation: Simulation, _: ObservationConfig) -> Tensor:
 
 
 @feature("belief", [None], name="belief_gain", tables=[goals_of_actions])
-def _belief_gain(v: FeatureCache) -> Tensor:
+def belief_gain(v: FeatureCache) -> Tensor:
     """Probability of detecting any source next from where each discrete action leads, [*, N, A].
 
     Actions begin at the latest landing point, are taken to be flown at once, and lead to the

@@ -60,7 +60,7 @@ def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
     return (total / others.clamp(min=1)).clamp(max=1)
 
 
-@feature("global", [OTHERS, 5], low=-1.0, name="others", entries=WAYS, rows=True)
+@feature("global", [OTHERS, 5], low=-1.0, name="others", entries=WAYS, rows="others")
 def _others(v: FeatureCache) -> Tensor:
     """The nearest other UAVs, the nearest first, [*, N, 4, 5]; zeros stand for those that do not
     exist.

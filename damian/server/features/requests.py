@@ -27,7 +27,7 @@ def known_requests(messages: Messages) -> tuple[Tensor, Tensor]:
     low=-1.0,
     name="requests",
     entries=["east", "north", "age", "open"],
-    rows=True,
+    rows="requests",
 )
 def _requests(v: FeatureCache) -> Tensor:
     """The open requests that are nearest to where the UAV stands or will land, the nearest first,

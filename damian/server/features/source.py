@@ -5,13 +5,33 @@ import math
 import torch
 from torch import Tensor
 
+from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature
+from damian.world.simulation import Simulation
+
+_FRESH = 10.0
+"""After this number of steps a detection is no longer new."""
+
+
+def columns_of_detections(simulation: Simulation, _: ObservationConfig) -> tuple[str, ...]:
+    """What each value of ``detections`` is in a scenario."""
+    n_sources = len(simulation.sources)
+    which = [f"source {i + 1}" for i in range(n_sources)] if n_sources > 1 else []
+    return ("east", "north", "newness", *which, "known")
 
 
 def _any_has_detected(v: FeatureCache) -> Tensor:
     """Whether any UAV has ever detected a source, [*, 1]."""
     detected = v.messages.detected_time >= 0
     return detected.flatten(-2).any(-1, keepdim=True)
+
+
+def known_sources(v: FeatureCache) -> tuple[Tensor, Tensor]:
+    """Where each source was detected last, by any UAV [m], [*, K, 2], and whether it was, [*, K]."""
+    times = v.messages.detected_time
+    newest = times.argmax(-2, keepdim=True).unsqueeze(-1)
+    places = v.messages.detected_position.take_along_dim(newest, -3).squeeze(-3)
+    return places, times.amax(-2) >= 0
 
 
 def _to_source(v: FeatureCache) -> Tensor:
@@ -110,3 +130,47 @@ def _spotting_agents(v: FeatureCache) -> Tensor:
 def _spotted(v: FeatureCache) -> Tensor:
     """Whether the UAV detects the source, 0 or 1, [*, N]."""
     return v.messages.spotted.to(v.scale.dtype)
+
+
+def number_of_detections(simulation: Simulation, observation: ObservationConfig) -> int:
+    """How many detections of each source ``detections`` tells."""
+    return min(observation.detections, simulation.config.agents)
+
+
+@feature(
+    "global",
+    [None, None],
+    low=-1.0,
+    name="detections",
+    entries=columns_of_detections,
+    rows="detections",
+    tables=[number_of_detections],
+)
+def _detections(v: FeatureCache) -> Tensor:
+    """The newest detections of each source, at most one of each UAV, the newest first,
+    [*, N, K D, C] for ``observation.detections`` D.
+
+    Of each: the way to where the UAV heard it from where the observer is bound for, east and north,
+    over half the largest vertex distance of the region; how new it is, from 1 down to 0 after ten
+    steps; which source, 1 in one of K columns if there are several; and 1. Zeros stand for those
+    that do not exist.
+    """
+    messages = v.messages
+    times = messages.detected_time.transpose(-2, -1)  # [*, K, N]
+    newest = times.argsort(dim=-1, descending=True, stable=True)
+    newest = newest[..., : v.table(number_of_detections)]
+    times = times.take_along_dim(newest, -1)  # [*, K, D]
+    places = messages.detected_position.transpose(-3, -2)
+    places = places.take_along_dim(newest.unsqueeze(-1), -2)
+    own = v.wanted(messages.target)[..., None, None, :]
+    ways = v.scaled(places.unsqueeze(-4) - own).clamp(-1, 1)  # [*, n, K, D, 2]
+    age = (v.context.now[..., None, None] - times) / (_FRESH * v.context.dt)
+    n_sources = times.shape[-2]
+    told = [(1 - age).clamp(0, 1).unsqueeze(-1), torch.ones_like(age).unsqueeze(-1)]
+    if n_sources > 1:
+        which = torch.eye(n_sources, device=age.device).unsqueeze(-2)
+        told.insert(1, which.expand(*age.shape, n_sources))
+    shared = torch.cat(told, -1).unsqueeze(-4)
+    rows = torch.cat([ways, shared.expand(*ways.shape[:-1], -1)], -1)
+    exists = (times >= 0).unsqueeze(-1).unsqueeze(-4)
+    return (rows * exists).flatten(-3, -2)

@@ -41,7 +41,7 @@ def told_timeline(messages: Messages, context: ServerContext) -> Tensor:
     low=-1.0,
     name="timeline",
     entries=["east", "north", "known"],
-    rows=True,
+    rows="others",
 )
 def _timeline(v: FeatureCache) -> Tensor:
     """What is known of the four nearest other UAVs by when it was true,

@@ -1,0 +1,111 @@
+"""MAPPO from a policy that begins well: a critic that learns first, a penalty that fades, rewards of
+the team, and a learning rate that falls."""
+
+import pytest
+import torch
+from helpers import learning
+from tensordict import TensorDictBase
+
+from damian import keys, make_env
+from damian.common.errors import InputError
+from damian.envs.config import ScenarioConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.learners.mappo import START, Mappo, MappoConfig, add_advantages
+from damian.models.config import MlpConfig
+from damian.recipes.shared.learning import make_collector
+from damian.server.rewards import RewardConfig
+from damian.world.config import ActionConfig
+
+STEPS = 6
+
+
+def made(kind: str = "discrete", **changed) -> tuple[DelayedEnv, Mappo]:
+    """An environment of two worlds, and a learner that makes one step of the optimiser an
+    update."""
+    actions = ActionConfig(kind=kind)
+    reward = RewardConfig(coverage=1.0)
+    env = make_env(ScenarioConfig(actions=actions, reward=reward), 2, seed=0)
+    setup = learning(MlpConfig(hidden=[8]), worlds=2, frames=4 * 2 * STEPS)
+    config = MappoConfig(epochs=1, minibatches=1, lr=0.1, **changed)
+    return env, Mappo(env, config, setup)
+
+
+def updates(env: DelayedEnv, learner: Mappo, n: int) -> list[TensorDictBase]:
+    """Learn from n batches, which are returned."""
+    collector = make_collector(env, learner.actor, 2 * STEPS)
+    batches = []
+    for batch, _ in zip(collector, range(n), strict=False):
+        batches.append(batch.clone())
+        learner.learn(batch)
+    collector.shutdown()
+    return batches
+
+
+def weights(module) -> torch.Tensor:
+    return torch.cat([each.detach().flatten().clone() for each in module.parameters()])
+
+
+def test_the_critic_learns_first():
+    env, learner = made(warm_up=2)
+    before = weights(learner.actor), weights(learner.critic)
+    updates(env, learner, 2)
+    assert weights(learner.actor).equal(before[0])
+    assert not weights(learner.critic).equal(before[1])
+    updates(env, learner, 1)
+    assert not weights(learner.actor).equal(before[0])
+
+
+def test_the_learning_rate_falls_to_zero_at_the_end_of_the_run():
+    env, learner = made(anneal=True)
+    rates = []
+    for _ in range(5):
+        updates(env, learner, 1)
+        rates.append(learner.optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([0.1, 0.075, 0.05, 0.025, 0.0])
+
+
+def test_a_penalty_that_fades_holds_the_policy_near_its_start():
+    away = []
+    for coefficient in (0.0, 100.0):
+        torch.manual_seed(0)
+        env, learner = made(near_start=4 * 2 * STEPS, near_start_coeff=coefficient)
+        start = learner.start
+        (batch, *_) = updates(env, learner, 3)
+        q, p = (policy.get_dist(batch).logits.exp() for policy in (start, learner.actor))
+        mask = batch[keys.ACTION_MASK]
+        divergence = (p[mask] * (p[mask] / q[mask]).log()).sum() / mask[..., 0].numel()
+        learner._add_start(batch)
+        add_advantages(batch, learner.critic, learner.config)
+        entries = next(iter(learner._minibatches(batch)))
+        losses, _ = learner.losses(entries)
+        torch.testing.assert_close(losses[3], divergence)
+        share = learner._weights_of_losses()[3]
+        assert share == pytest.approx(coefficient / 4), "three quarters have passed"
+        away.append(divergence.item())
+    assert away[1] < away[0] / 4
+    updates(env, learner, 1)
+    learner._add_start(batch.exclude(START, inplace=True))
+    assert START not in batch.keys(True), "it has faded"
+
+
+def test_a_penalty_needs_discrete_actions():
+    with pytest.raises(InputError, match=r"learner\.near_start: 10 needs discrete actions"):
+        made("continuous", near_start=10)
+
+
+def test_what_all_earn_is_what_each_learns_from():
+    env, learner = made(normalize_advantage=False)
+    (batch,) = updates(env, learner, 1)
+    reward = batch["next"][keys.REWARD]
+    assert (reward != reward[:, :, :1]).any()
+    targets = {}
+    for team in (0.0, 0.25, 1.0):
+        copy = batch.clone()
+        add_advantages(copy, learner.critic, MappoConfig(team=team))
+        targets[team] = copy[keys.VALUE_TARGET]
+    mean = batch.clone()
+    mean["next"][keys.REWARD] = reward.mean(-2, keepdim=True).expand_as(reward).clone()
+    add_advantages(mean, learner.critic, MappoConfig())
+    torch.testing.assert_close(targets[1.0], mean[keys.VALUE_TARGET])
+    mixed = torch.lerp(targets[0.0], targets[1.0], 0.25)
+    torch.testing.assert_close(targets[0.25], mixed)
