@@ -63,10 +63,11 @@ that have arrived, [B, K, C]."""
 OWN_BELIEF = (AGENTS, "belief")
 """The same as each UAV knows it, whose own messages are not delayed for it, [B, N, K, C]."""
 STOPS, OWN_STOPS = (AGENTS, "stops"), (AGENTS, "own_stops")
-"""By age in steps, where each UAV is known to have stopped, east and north [m], and 1, else zeros:
-by the messages that the server holds, and by all that it has sent itself, [B, N, slots, 3]."""
+"""By age in steps, where each UAV is known to have stopped, east and north [m], what happened there
+(``Messages.events``), and 1, else zeros: by the messages that the server holds, and by all that it
+has sent itself, [B, N, slots, 3 + E]."""
 HEARD_STOPS = (AGENTS, "heard_stops")
-"""The same by what has reached a UAV directly, [B, N, N, slots, 3] (receiver, sender)."""
+"""The same by what has reached a UAV directly, [B, N, N, slots, 3 + E] (receiver, sender)."""
 LINK_DELAY = (AGENTS, "link_delay")
 """Delays of the messages sent directly in this step, [B, N, N] (receiver, sender); -1 for lost
 ones."""

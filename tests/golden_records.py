@@ -155,6 +155,7 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         serves=place.new_zeros(*place.shape[:-1], 0),
         trail=torch.zeros(*zeros.shape, 2, dtype=torch.long),
         landed=torch.zeros(*zeros.shape, 2),
+        events=torch.zeros(*zeros.shape, 2, 0),
         readings=torch.zeros(*zeros.shape, 0),
     )
     server = ServerContext(

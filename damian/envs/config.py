@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 from damian.common import checks
 from damian.common.fields import Settings, setting
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
+from damian.server.config import EVENTS, EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import FOOTPRINT, WorldConfig
 
 if TYPE_CHECKING:
@@ -133,6 +133,12 @@ class ScenarioConfig(WorldConfig):
         self.refuse(
             asked and not self.requests.slots, "requests.rate", "is 0, so that no request appears"
         )
+        told = self.seeks_source or self.requests.slots
+        wrong = self.tells_events and not (observation.timeline and told)
+        problem = (
+            f"has {EVENTS}, which need observation.timeline, and a source or requests that count"
+        )
+        self.refuse(wrong, "observation.global_features", problem)
         never = episode.discharged_share is not None and not self.battery.enabled
         self.refuse(never, "episode.discharged_share", "needs battery.enabled=true")
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
@@ -148,6 +154,10 @@ class ScenarioConfig(WorldConfig):
     @property
     def tells_truth(self) -> bool:
         return self.reward.detection == "truth"
+
+    @property
+    def tells_events(self) -> bool:
+        return EVENTS in self.observation.global_features
 
     @property
     def seeks_source(self) -> bool:

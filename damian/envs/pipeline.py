@@ -216,7 +216,7 @@ def timeline_transforms(
         out_key,
         delay_key=delay_key,
         sent_key=keys.MESSAGE_SENT,
-        encode=server.stop_places,
+        encode=server.stop_facts,
         ages=server.stop_ages,
         group=group,
     )

@@ -67,15 +67,15 @@ def server_recompute(
 
 def timeline_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     """What is known of stops after each stored step, by all that has arrived by now,
-    [T, B, N, slots, 3]."""
+    [T, B, N, slots, 3 + E]."""
     messages = steps[next_key(keys.MESSAGE)]
     ages = server.stop_ages(messages)
-    places, told = told_slots(server.stop_places(messages), ages, server.observation.timeline)
+    facts, told = told_slots(server.stop_facts(messages), ages, server.observation.timeline)
     arrived = steps[next_key(keys.MESSAGE_SENT)]
     if next_key(keys.DELAY) in steps.keys(True):
         arrived = arrived & _arrived(steps)
     told = (told & arrived.unsqueeze(-1)).unsqueeze(-1)
-    new = torch.cat([places, torch.ones_like(places[..., :1])], -1)
+    new = torch.cat([facts, torch.ones_like(facts[..., :1])], -1)
 
     def advance(known: Tensor, step: int) -> Tensor:
         older = F.pad(known[..., :-1, :], (0, 0, 1, 0))  # a step older

@@ -138,7 +138,7 @@ class Mappo:
         """Write the logits of the first policy into a batch, while it is to stay near that."""
         if self.start and self.progress.frames < self.config.near_start:
             with torch.no_grad(), set_recurrent_mode(True):
-                batch[START] = self.start.get_dist(batch).logits
+                batch[START] = cast(LegalCategorical, self.start.get_dist(batch)).logits
 
     def _weights_of_losses(self) -> list[float]:
         """Factors of ``LOSSES`` in this update."""
@@ -168,8 +168,9 @@ class Mappo:
             self.optimizer.step()
             terms.append(torch.cat([losses.detach(), numbers, norm.view(1)]))
         # A number that is read at once would make the device wait at every minibatch.
-        names = (*LOSSES[: len(losses)], *NUMBERS, "gradient_norm")
         means = torch.stack(terms).double().mean(0)
+        n_losses = len(means) - len(NUMBERS) - 1
+        names = (*LOSSES[:n_losses], *NUMBERS, "gradient_norm")
         return dict(zip(names, means.tolist(), strict=True))
 
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:

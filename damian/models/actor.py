@@ -68,7 +68,7 @@ def _module(
 class NormalParameters(nn.Sequential):
     """A network, and then what makes location and scale of its outputs."""
 
-    def forward(self, *read: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, *read: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         """Location and scale [*, n] each."""
         network, extract = self
         return extract(network(*read))

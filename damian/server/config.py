@@ -7,6 +7,9 @@ from typing import Any, ClassVar
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
 
+EVENTS = "events"
+"""The feature for which messages tell what happened at each stop."""
+
 
 @dataclass
 class ObservationConfig(Settings):
@@ -28,7 +31,7 @@ class ObservationConfig(Settings):
         "source_time, "
         "agent_distances, coverage, mean_distance, mean_distance_not_spotting, "
         "mean_distance_spotting, "
-        "spotting_agents, others, ages, coverage_map, requests, detections.",
+        "spotting_agents, others, ages, coverage_map, requests, detections, events.",
     )
     ctde: bool = setting(False, "Whether the actor observes only the local features.")
     time_scale: float | None = setting(

@@ -21,7 +21,7 @@ from damian.server.belief import SourceGrid
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext, feature_of, layout_of, observe, observe_own, stack
 from damian.server.features.base import check_features, source_grid
-from damian.server.features.timeline import stop_ages, stop_places
+from damian.server.features.timeline import stop_ages, stop_facts
 from damian.server.layout import Layout
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.termination import Status, status
@@ -300,9 +300,10 @@ class Server:
         context = self._known(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
         return observe_own(known, context._replace(belief=belief, timeline=timeline), names)
 
-    def stop_places(self, rows: Tensor) -> Tensor:
-        """Where the stops have been of which packed messages [*, M] tell [m], [*, S, 2]."""
-        return stop_places(self.messages(rows), self._context)
+    def stop_facts(self, rows: Tensor) -> Tensor:
+        """Where the stops have been of which packed messages [*, M] tell [m], and what happened
+        there, [*, S, 2 + E]."""
+        return stop_facts(self.messages(rows), self._context)
 
     def stop_ages(self, rows: Tensor) -> Tensor:
         """How long ago those were when the message was generated [steps], [*, S]; -1 for none."""

@@ -496,6 +496,11 @@ class WorldConfig(Settings):
         return False
 
     @property
+    def tells_events(self) -> bool:
+        """Whether messages tell what was heard and served at each stop."""
+        return False
+
+    @property
     def seeks_source(self) -> bool:
         """Whether anything is won by finding a source."""
         return True

@@ -31,6 +31,8 @@ class Widths(NamedTuple):
     truths: int = 0
     """Number of sources of which messages tell the true detections, too: K if rewards follow
     them."""
+    events: int = 0
+    """Number of events that messages tell of each stop."""
 
 
 ONE_SOURCE = Widths()
@@ -84,6 +86,9 @@ class Messages(NamedTuple):
     stop."""
     landed: Annotated[Tensor, Column(None)]
     """Time at which each of these stops began [s], [*, N, S]; -1 before the episode."""
+    events: Annotated[Tensor, Column(None)]
+    """Whether each source was heard when each of these stops began, and, if there are requests,
+    whether one was served, 0 or 1, [*, N, S, E]; E is 0 if it is not told."""
     readings: Annotated[Tensor, Column(None)]
     """Readings of the user's sensors, beside each other in the order of the settings, [*, N, K]."""
 
@@ -91,7 +96,7 @@ class Messages(NamedTuple):
     def blank(cls, trail: Tensor, widths: Widths = ONE_SOURCE) -> "Messages":
         """Messages of zeros, without a detection, of UAVs with the landing points ``trail``
         [*, N, S]."""
-        width = _FIXED + sum(_variable(widths)) + 2 * trail.shape[-1]
+        width = _FIXED + sum(_variable(widths)) + (2 + widths.events) * trail.shape[-1]
         blank = cls.unpack(torch.zeros(*trail.shape[:-1], width, device=trail.device), widths)
         unknown = ("detected_time", "true_time", "requests", "served")
         never = {name: getattr(blank, name) - 1 for name in unknown}
@@ -115,9 +120,10 @@ class Messages(NamedTuple):
         environment.
         """
         *variable, readings = _variable(widths)
-        stops = (rows.shape[-1] - _FIXED - sum(variable) - readings) // 2
+        stops = (rows.shape[-1] - _FIXED - sum(variable) - readings) // (2 + widths.events)
         fixed = [column.width for column in _COLUMNS if column.width]
-        parts = [*rows.split([*fixed, *variable, stops, stops, readings], -1)]
+        told = stops * widths.events
+        parts = [*rows.split([*fixed, *variable, stops, stops, told, readings], -1)]
         fields = []
         for part, (width, dtype) in zip(parts, _COLUMNS, strict=True):
             field = part.squeeze(-1) if width == 1 else part
@@ -127,6 +133,7 @@ class Messages(NamedTuple):
             detected_position=found.detected_position.unflatten(-1, (widths.sources, 2)),
             true_position=found.true_position.unflatten(-1, (widths.truths, 2)),
             requests=found.requests.unflatten(-1, (widths.requests, 3)),
+            events=found.events.unflatten(-1, (stops, widths.events)),
         )
 
     @staticmethod
@@ -165,8 +172,8 @@ class Messages(NamedTuple):
 
 _HINTS = get_type_hints(Messages, include_extras=True)
 _COLUMNS: list[Column] = [hint.__metadata__[0] for hint in _HINTS.values()]
-_ROWS = ("detected_position", "true_position", "requests")
-"""Fields that have a row for each source or request."""
+_ROWS = ("detected_position", "true_position", "requests", "events")
+"""Fields that have a row for each source, request or stop."""
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
 """Number of columns of all fields whose number does not depend on the settings; they come first."""
 

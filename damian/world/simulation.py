@@ -46,7 +46,9 @@ class Simulation:
         n_sources = len(self.sources)
         n_requests = config.requests.slots
         n_truths = n_sources if config.tells_truth else 0
-        self.widths = Widths(n_sources, n_readings, n_requests, n_truths)
+        n_events = n_sources * config.seeks_source + (n_requests > 0)
+        n_events *= config.tells_events
+        self.widths = Widths(n_sources, n_readings, n_requests, n_truths, n_events)
         regions = regions_of(config.region, rng)
         longest = max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
@@ -202,9 +204,10 @@ class Simulation:
         detected = self._reported(state, in_reach, on_ground.unsqueeze(-1))
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         stops = self.vehicles.new_stop(state, on_ground, action_valid)
-        trail, landed = self._stops(state, times, stops)
         lands = on_ground if stops is None else stops
         state, served, serves = self._serve(state, now, lands)
+        happens = self._events(detected, serves)
+        trail, landed, events = self._stops(state, times, happens, stops)
         sent = state.sent
         position = state.position[..., :2]
         known = sent.detected_time, sent.detected_position
@@ -233,6 +236,7 @@ class Simulation:
             serves=serves,
             trail=trail,
             landed=landed,
+            events=events,
             readings=self._readings(state),
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
@@ -285,16 +289,27 @@ class Simulation:
         false_alarm = listens & (share < alarm)
         return torch.where(in_reach, share >= miss, false_alarm)
 
-    def _stops(self, state: State, now: Tensor, added: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Landing points and times [s] of each UAV's latest stops, newest first, [B, N, S] each."""
+    def _events(self, detected: Tensor, serves: Tensor) -> Tensor:
+        """What happens at a stop that begins now, as in ``Messages``, [B, N, E]."""
+        heard = detected if self.config.seeks_source else detected[..., :0]
+        happens = torch.cat([heard.to(serves.dtype), serves], -1)
+        return happens[..., : self.widths.events]
+
+    def _stops(
+        self, state: State, now: Tensor, events: Tensor, added: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Landing points and times [s] of each UAV's latest stops, newest first, [B, N, S] each,
+        and what happened there, [B, N, S, E]."""
         sent = state.sent
         trail = _prepended(state.goal, sent.trail)
         landed = _prepended(now, sent.landed)
+        happened = torch.cat([events.unsqueeze(-2), sent.events[..., :-1, :]], -2)
         if added is not None:
             added = added.unsqueeze(-1)
             trail = torch.where(added, trail, sent.trail)
             landed = torch.where(added, landed, sent.landed)
-        return trail, landed
+            happened = torch.where(added.unsqueeze(-1), happened, sent.events)
+        return trail, landed, happened
 
     def _serve(self, state: State, now: Tensor, lands: Tensor) -> tuple[State, Tensor, Tensor]:
         """Let requests appear, and the UAVs that land serve some, as in ``Messages``."""

@@ -116,7 +116,7 @@ CASES: dict[str, dict[str, Any]] = {
     "late messages of two stops, timeline": {
         "delay": DelayConfig(obs=LATE),
         "observation": ObservationConfig(
-            ["spotted"], ["spotting_agents"], timeline=7, stops=2, own=True
+            ["spotted"], ["detections", "events"], timeline=7, stops=2, own=True
         ),
     },
     "late truth": {

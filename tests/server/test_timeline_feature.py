@@ -1,5 +1,5 @@
-"""The feature ``timeline``: slot k is where a UAV stood k steps ago, as far as that has arrived by
-now."""
+"""The features ``timeline`` and ``events``: slot k is where a UAV stood k steps ago, and what it
+heard and served there, as far as that has arrived by now."""
 
 import itertools
 
@@ -11,12 +11,14 @@ from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.config import ScenarioConfig
 from damian.server.config import ObservationConfig
+from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.world.config import RegionConfig
+from damian.world.config import RegionConfig, RequestConfig, SourceConfig
 
 SLOTS = 4
 AGENTS = 3
 UNIFORM = {"law": "uniform", "low": 0, "high": 6}
+QUIET = RequestConfig(rate=0.0)
 CASES = {
     "no delay": {},
     "delays beyond the slots, losses": {"delay": DelayConfig(obs=UNIFORM, loss=0.2)},
@@ -31,9 +33,11 @@ def scenario(own: bool = True, stops: int | None = None, **changed) -> ScenarioC
         "agents": AGENTS,
         "region": RegionConfig(kind="random", pool=2, lattice_step=60.0),
         "observation": ObservationConfig(
-            ["place"], [], own=own, window=1, timeline=SLOTS, stops=stops
+            ["place"], ["events"], own=own, window=1, timeline=SLOTS, stops=stops
         ),
         "episode": EpisodeConfig(max_steps=9),
+        "requests": RequestConfig(rate=30.0, most=4),
+        "source": SourceConfig(level_db=146.0),
     }
     return ScenarioConfig(**(sections | changed))
 
@@ -59,8 +63,16 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
         delay = delay.masked_fill(torch.eye(AGENTS, dtype=torch.bool) & own, 0)
     sent = server.messages(after[keys.MESSAGE])
     first = server.messages(steps[keys.MESSAGE])
+    happened, happened_first = (
+        torch.cat([each.spots.float(), each.serves], -1) for each in (sent, first)
+    )
     half = server.scales(sent) / 2
-    observed = env.layout["observation"]["timeline"].of(after[keys.OBSERVATION]).flatten(-2)
+    blocks = env.layout["observation"]
+    observed, events = (
+        blocks[name].of(after[keys.OBSERVATION]).flatten(-2) for name in ("timeline", "events")
+    )
+    assert blocks["events"].entries == ("heard source 1", "served")
+    assert happened.mean((0, 1, 2)).gt(0.05).all()
     for world, t, i in itertools.product(range(4), range(25), range(AGENTS)):
         ended = after[keys.DONE][world, :t].flatten().nonzero()
         begin = int(ended[-1]) + 1 if len(ended) else 0
@@ -68,9 +80,11 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
             first.position[world, begin],
             *sent.position[world, begin : t + 1],
         ]  # in this episode
+        events_then = [happened_first[world, begin], *happened[world, begin : t + 1]]
         now = len(places) - 1
         targets = []
         rows = torch.zeros(AGENTS, SLOTS + 1, 3)
+        told_events = torch.zeros(AGENTS, SLOTS, 2)
         for j in range(AGENTS):
             arrived = [0]  # the message of the reset
             for g in range(1, now + 1):
@@ -80,17 +94,23 @@ def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arri
             for told in {g - older for g in arrived for older in range(min(stops or SLOTS, g + 1))}:
                 if now - told < SLOTS:
                     rows[j, now - told] = torch.tensor([*places[told][j], 1.0])
+                    told_events[j, now - told] = events_then[told][j]
                     seen += 1
         rows[..., :2] = (rows[..., :2] - targets[i]) / half[world, t] * rows[..., 2:]
         expected = sorted(
-            (float((targets[j] - targets[i]).norm()), rows[j].clamp(-1, 1).flatten().tolist())
+            (
+                float((targets[j] - targets[i]).norm()),
+                rows[j].clamp(-1, 1).flatten().tolist(),
+                told_events[j].flatten().tolist(),
+            )
             for j in range(AGENTS)
             if j != i
         )
         assert not observed[world, t, i, AGENTS - 1 :].any()
         if expected[1][0] - expected[0][0] > 1e-2:  # else in any order
-            values = torch.tensor([row for _, row in expected])
+            _, values, then = map(torch.tensor, zip(*expected, strict=True))
             assert observed[world, t, i, : AGENTS - 1].allclose(values, atol=1e-5), (world, t, i)
+            assert events[world, t, i, : AGENTS - 1].equal(then), (world, t, i)
     assert seen > 500
 
 
@@ -99,3 +119,9 @@ def test_a_timeline_needs_the_order_of_generation():
         InputError, match=r"observation\.timeline: 4 does not go with delay\.order=arrival"
     ):
         scenario(delay=DelayConfig(obs=2, order="arrival"))
+
+
+def test_events_need_a_timeline_and_something_that_happens():
+    for changed in ({"observation": ObservationConfig([], ["events"])}, {"requests": QUIET}):
+        with pytest.raises(InputError, match=r"has events, which need observation\.timeline"):
+            scenario(reward=RewardConfig(coverage=1.0, spotted=0.0), **changed)

@@ -304,8 +304,8 @@ def _actions(v: FeatureCache) -> Tensor:
     of open requests, and the age of the oldest in the footprint; the ``belief_gain``; and the
     nearest target of another UAV. ``gain``: what the UAV gains in its task, as a rule of thumb has
     it, less a little for the way; ``choice``: 1 for the legal action of the largest gain;
-    ``legal``: whether the UAV may choose it. What a scenario does not have is left out. In flight, actions begin at the
-    destination.
+    ``legal``: whether the UAV may choose it. What a scenario does not have is left out. In flight,
+    actions begin at the destination.
     """
     names = v.table(columns_of_actions)
     tables = v.table(action_tables)
@@ -332,7 +332,7 @@ def _actions(v: FeatureCache) -> Tensor:
         found[name] = _number(ground & ~known.unsqueeze(-2)) / full
     gain = found["in turn"]
     if "source" in names:
-        found["source"], found["own source"] = _best_places(v, *v(known_sources))
+        found["source"], found["own source"] = _best_places(v, *known_sources(v))
         gain = _if_any(found["own source"], gain)
     if "request" in names:
         requests, unserved = known_requests(v.messages)

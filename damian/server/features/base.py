@@ -60,8 +60,9 @@ class ServerContext(NamedTuple):
     """Probability that each source is in each cell, [*, K, C]; None: as after these first
     messages."""
     timeline: Tensor | None = None
-    """By sender and age in steps, where it is known to have stopped, east and north [m], and 1,
-    else zeros, [*, N, slots, 3]; None: as after these first messages."""
+    """By sender and age in steps, where it is known to have stopped, east and north [m], what
+    happened there (``Messages.events``), and 1, else zeros, [*, N, slots, 3 + E]; None: as after
+    these first messages."""
     coverage: KnownCoverage | None = None
     """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be
     computed."""

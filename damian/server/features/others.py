@@ -78,7 +78,7 @@ def _others(v: FeatureCache) -> Tensor:
 @feature("global", [OTHERS], name="ages")
 def _ages(v: FeatureCache) -> Tensor:
     """Ages of what is known of the UAVs that ``others`` describes, over ten seconds, [*, N, 4]."""
-    known = _of_nearest(v, known_ages(v).unsqueeze(-1))
+    known = of_nearest(v, known_ages(v).unsqueeze(-1))
     return four(known.clamp(max=1)).squeeze(-1)
 
 
@@ -104,7 +104,7 @@ def _nearest(v: FeatureCache) -> Tensor:
     return found + (found >= itself)
 
 
-def _of_nearest(v: FeatureCache, table: Tensor) -> Tensor:
+def of_nearest(v: FeatureCache, table: Tensor) -> Tensor:
     """The rows of a table [*, N, F] for the nearest other UAVs of each, [*, N, 4, F]."""
     nearest = v(_nearest).unsqueeze(-1)
     return table.unsqueeze(-3).take_along_dim(nearest, -2)
@@ -117,7 +117,7 @@ def ways_to_nearest(v: FeatureCache, places: Tensor) -> Tensor:
     ``places`` [*, N, P, 3]: east, north, and 1 if it is known, else 0.
     """
     own = v.wanted(v.messages.target)[..., None, None, :]
-    nearest = _of_nearest(v, places.flatten(-2))
+    nearest = of_nearest(v, places.flatten(-2))
     place, known = nearest.unflatten(-1, (-1, 3)).split([2, 1], -1)
     ways = v.scaled(place - own).clamp(-1, 1)
     return torch.cat([ways * known, known], -1)

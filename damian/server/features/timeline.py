@@ -4,15 +4,19 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
+from damian.server.config import EVENTS, ObservationConfig
 from damian.server.features.base import FeatureCache, ServerContext, feature
-from damian.server.features.others import OTHERS, four, ways_to_nearest
+from damian.server.features.others import OTHERS, four, of_nearest, ways_to_nearest
 from damian.transforms.timeline import told_slots
 from damian.world.messages import Messages
+from damian.world.simulation import Simulation
 
 
-def stop_places(messages: Messages, context: ServerContext) -> Tensor:
-    """Where the latest stops of which messages tell have been [m], [*, S, 2]."""
-    return gather_rows(context.points, messages.trail)
+def stop_facts(messages: Messages, context: ServerContext) -> Tensor:
+    """Where the latest stops of which messages tell have been [m], and what happened there,
+    [*, S, 2 + E]."""
+    places = gather_rows(context.points, messages.trail)
+    return torch.cat([places, messages.events], -1)
 
 
 def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
@@ -27,12 +31,18 @@ def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
 
 
 def told_timeline(messages: Messages, context: ServerContext) -> Tensor:
-    """What these messages alone tell, [*, slots, 3], as ``ServerContext.timeline``."""
-    facts = stop_places(messages, context)
+    """What these messages alone tell, [*, slots, 3 + E], as ``ServerContext.timeline``."""
+    facts = stop_facts(messages, context)
     as_of_now = messages._replace(time=context.now.unsqueeze(-1))
     ages = stop_ages(as_of_now, context)
-    places, told = told_slots(facts, ages, context.observation.timeline)
-    return torch.cat([places, told.unsqueeze(-1)], -1)
+    facts, told = told_slots(facts, ages, context.observation.timeline)
+    return torch.cat([facts, told.unsqueeze(-1)], -1)
+
+
+def known_stops(v: FeatureCache) -> Tensor:
+    """What is known of each UAV's stops by when they were, as ``ServerContext.timeline``."""
+    known = v.context.timeline
+    return told_timeline(v.messages, v.context) if known is None else known
 
 
 @feature(
@@ -53,11 +63,27 @@ def _timeline(v: FeatureCache) -> Tensor:
     UAV in flight. Ways begin where the observer is bound for.
     """
     messages = v.messages
-    context = v.context
-    known = context.timeline
-    if known is None:
-        known = told_timeline(messages, context)
+    known = v(known_stops)
+    known = torch.cat([known[..., :2], known[..., -1:]], -1)
     flies = messages.in_flight.to(known.dtype).unsqueeze(-1)
     destination = torch.cat([messages.target, flies], -1).unsqueeze(-2)
     ways = ways_to_nearest(v, torch.cat([known, destination], -2))
     return four(ways.flatten(-2)).unflatten(-1, ways.shape[-2:])
+
+
+def columns_of_events(simulation: Simulation, _: ObservationConfig) -> tuple[str, ...]:
+    """What each value of ``events`` is in a scenario."""
+    n_sources = len(simulation.sources) * simulation.config.seeks_source
+    heard = [f"heard source {i + 1}" for i in range(n_sources)]
+    return (*heard, *["served"] * (simulation.widths.requests > 0))
+
+
+@feature("global", [OTHERS, None, None], name=EVENTS, entries=columns_of_events, rows="others")
+def _events(v: FeatureCache) -> Tensor:
+    """What happened at the stops of which ``timeline`` tells, [*, N, 4, ``slots``, E].
+
+    In each slot whether the UAV heard each source when it landed there, and, if there are
+    requests, whether it served one; zeros if no message that has arrived tells of that step.
+    """
+    known = v(known_stops)[..., 2:-1]
+    return four(of_nearest(v, known.flatten(-2))).unflatten(-1, known.shape[-2:])

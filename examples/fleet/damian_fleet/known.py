@@ -273,5 +273,6 @@ def messages_of(
         serves=at.new_zeros(len(at), 0),
         trail=stops[..., 0],
         landed=torch.where(stops[..., 1] >= 0, stops[..., 1] * dt, -1.0),
+        events=at.new_zeros(*stops.shape[:-1], 0),
         readings=torch.tensor([each.readings for each in reports]).view(len(reports), -1),
     )
