@@ -16,8 +16,9 @@ from damian.common.tensors import distances, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import any_of, chance_of_staying, detection_chance, places, report_rows
-from damian.server.features.actions import FLIGHT_COST, LEAST_GAIN
+from damian.server.features.actions import FLIGHT_COST, LEAST_GAIN, footprint_bits
 from damian.server.features.requests import known_requests
+from damian.world.coverage import bit_count
 from damian.world.messages import Messages
 
 BLUR_M = 5.0
@@ -45,27 +46,12 @@ region."""
 def script_policy(env: DelayedEnv) -> TensorDictModule:
     """Build the stateless scripted policy, for an environment with ``message`` among its extras."""
     worlds = env.uav_env
-    n_regions, n_points = worlds.simulation.airspace.points.shape[:2]
-    n_pairs = n_regions * n_points**2
-    shown = f"{n_points} landing points"
-    should = "are too many for the scripted policy: take a larger step"
-    checks.require(n_pairs <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
-    scenario = worlds.scenario
-    seeks = scenario.seeks_source
-    believes = seeks and keys.BELIEF in available
-    own_messages = scenario.observation.own
+    believes = worlds.scenario.seeks_source and keys.BELIEF in available
+    own_messages = worlds.scenario.observation.own
     if believes:
         own_messages = keys.OWN_BELIEF in available
-    script = Coverer
-    if scenario.requests.slots:
-        script = Dispatcher
-    elif seeks and scenario.source.count > 1:
-        script = Rescuer
-    elif believes:
-        script = Searcher
-    elif seeks:
-        script = Seeker
+    script = _script_of(worlds, believes)
     message = keys.MESSAGE
     if keys.RECEIVED in available:
         message = keys.RECEIVED
@@ -78,6 +64,28 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
         arguments |= {"own_message": keys.MESSAGE}
     in_keys = {name: key for name, key in arguments.items() if key in available}
     return TensorDictModule(script(worlds), in_keys, [keys.ACTION])
+
+
+def script_without_belief(worlds: UavEnv) -> "Seeker":
+    """The script as a function of packed messages and legal actions alone."""
+    return _script_of(worlds, believes=False)(worlds)
+
+
+def _script_of(worlds: UavEnv, believes: bool) -> "type[Seeker]":
+    """The script for the task of some worlds."""
+    n_regions, n_points = worlds.simulation.airspace.points.shape[:2]
+    n_pairs = n_regions * n_points**2
+    shown = f"{n_points} landing points"
+    should = "are too many for the scripted policy: take a larger step"
+    checks.require(n_pairs <= MAX_PAIRS, "region.lattice_step", shown, should)
+    scenario = worlds.scenario
+    if scenario.requests.slots:
+        return Dispatcher
+    if not scenario.seeks_source:
+        return Coverer
+    if scenario.source.count > 1:
+        return Rescuer
+    return Searcher if believes else Seeker
 
 
 class Seeker:
@@ -107,11 +115,7 @@ class Seeker:
         self.real = points[..., 0].isfinite()
         self.points = points.nan_to_num(posinf=0.0)
         self.n_points = points.shape[1]
-        between = distances(self.points, self.points)
-        near = between <= self.radius
-        # A row is a landing point to cover, a column the one in whose footprint it lies.
-        real_rows = self.real.unsqueeze(-1)
-        self.near = (near & real_rows).float()
+        self.near = self.footprint_table(worlds)
 
     def __call__(
         self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None
@@ -132,8 +136,13 @@ class Seeker:
         action, _ = self.choose_landing(held, gain, region, mask)
         return action
 
+    def footprint_table(self, worlds: UavEnv) -> Tensor:
+        """1 for landing points (rows) in the footprints of others (columns), [R, L, L]."""
+        near = distances(self.points, self.points) <= self.radius
+        return (near & self.real.unsqueeze(-1)).float()
+
     def footprints(self, region: Tensor) -> Tensor:
-        """1 for landing points (rows) in the footprints of others (columns), [B or 1, L, L]."""
+        """The part of ``footprint_table`` for each world, [B or 1, L, ...]."""
         if len(self.near) == 1:
             return self.near
         return self.near[region]
@@ -327,6 +336,11 @@ class Coverer(Seeker):
     ahead.
     """
 
+    def footprint_table(self, worlds: UavEnv) -> Tensor:
+        """The landing points in the footprint of each, as bits, [R, L, W]."""
+        bits = footprint_bits(worlds.simulation.airspace.points, self.radius)
+        return bits.unflatten(0, self.points.shape[:2])
+
     def __call__(  # type: ignore[override]
         self, message: Tensor, own_message: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
@@ -338,7 +352,7 @@ class Coverer(Seeker):
         region = self.region_of(held)
         actions = []
         near = self.footprints(region)
-        claimed = torch.zeros(len(region), self.n_points, device=message.device)
+        claimed = near.new_zeros(len(region), near.shape[-1])
         uavs = torch.arange(message.shape[1], device=message.device)
         for uav in range(len(uavs)):  # what a UAV chooses depends on those before it
             legal = mask
@@ -352,25 +366,25 @@ class Coverer(Seeker):
             actions.append(action)
             if own_message is not None:  # the others do not know where it is
                 _, claims = self.choose_new(held, uav, claimed, near, None)
-            claimed = torch.maximum(claimed, claims)
+            claimed = claimed | claims
         return torch.cat(actions, 1)
 
     def choose_new(
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Action of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others, and what it
-        claims itself: the footprint in which it gains new ground, [B, L]."""
+        """Action of one UAV, [B, 1], where ground is not ``claimed`` by others, bits [B, W], and
+        what it claims itself: the footprint in which it gains new ground."""
         alone = _only(known, uav)
         # The next landing replaces the oldest one.
         latest = self.counted(alone)[:, 0, :-1] % self.n_points
-        own = _footprints_of(latest, near)
-        footprints = torch.cat([own, claimed.unsqueeze(1)], 1)
-        new = 1 - footprints.amax(1, keepdim=True)
+        taken = claimed
+        for stop in latest.unbind(-1):
+            taken = taken | _footprint_at(near, stop)
+        gain = bit_count(near & ~taken.unsqueeze(1)).sum(-1).float()
         region = self.region_of(known)
-        gain = new @ near
-        action, point = self.choose_landing(alone, gain, region, mask)
-        gains = gain.squeeze(1).gather(-1, point) > LEAST_GAIN
-        return action, _footprints_of(point, near).squeeze(1) * gains
+        action, point = self.choose_landing(alone, gain.unsqueeze(1), region, mask)
+        gains = gain.gather(-1, point) > LEAST_GAIN
+        return action, torch.where(gains, _footprint_at(near, point.squeeze(-1)), 0)
 
 
 class Rescuer(Coverer):
@@ -462,7 +476,7 @@ def _only(known: Messages, uav: int) -> Messages:
     return tree_map(lambda field: field[:, uav : uav + 1], known)
 
 
-def _footprints_of(point: Tensor, near: Tensor) -> Tensor:
-    """1 for the landing points in the footprints of those of these indices [B, P], [B, P, L]."""
-    rows = near.expand(len(point), -1, -1)
-    return rows.gather(1, point.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
+def _footprint_at(footprints: Tensor, point: Tensor) -> Tensor:
+    """The footprints [B or 1, L, W] of the landing points of these indices [B], [B, W]."""
+    rows = footprints.expand(len(point), -1, -1)
+    return rows.gather(1, point.view(-1, 1, 1).expand(-1, 1, rows.shape[-1])).squeeze(1)

@@ -49,9 +49,13 @@ def test_the_script_finds_the_same_new_ground_in_turn(words):
     last = steps["next"][:, -1]
     held = script.unpack(last[keys.RECEIVED if keys.RECEIVED in last.keys(True) else keys.MESSAGE])
     own = script.unpack(last[keys.MESSAGE]) if env.uav_env.scenario.observation.own else held
-    near = script.footprints(script.region_of(held))
-    claimed = torch.zeros(4, script.n_points)
-    largest = script.near.sum(1)[script.real].amax()
+    ground = env.uav_env.simulation.airspace.points
+    near = torch.cdist(ground, ground).nan_to_num(nan=torch.inf) <= script.radius
+    largest = near.sum(1).amax()
+    near = near[script.region_of(held)].float()
+    bits = script.footprints(script.region_of(held))
+    claimed = bits.new_zeros(4, bits.shape[-1])
+    taken_before = torch.zeros(4, script.n_points)
     for uav in range(env.n_agents):
         both = type(held)(
             *(
@@ -66,7 +70,7 @@ def test_the_script_finds_the_same_new_ground_in_turn(words):
         standing = torch.cdist(both.target[:, uav : uav + 1], places).argmin(-1).squeeze(-1)
         row = standing + script.region_of(held) * script.n_points
         goal = script.candidates.goals()[0, row]
-        for known, name in ((claimed, "in turn"), (torch.zeros_like(claimed), "new")):
+        for known, name in ((taken_before, "in turn"), (torch.zeros_like(taken_before), "new")):
             taken = known.unsqueeze(1)
             if latest.shape[-1]:
                 footprints = near.expand(4, -1, -1).gather(
@@ -76,8 +80,11 @@ def test_the_script_finds_the_same_new_ground_in_turn(words):
             gain = (1 - taken.amax(1, keepdim=True)) @ near
             gain = gain.squeeze(1).gather(-1, goal) / largest
             torch.testing.assert_close(offers[name][:, -1, uav], gain)
-        _, claims = script.choose_new(held, uav, claimed, near, None)
-        claimed = torch.maximum(claimed, claims)
+        _, claims = script.choose_new(held, uav, claimed, bits, None)
+        claimed = claimed | claims
+        number = torch.arange(script.n_points)
+        told = claimed.gather(1, (number // 64).expand(4, -1)) >> (number % 64) & 1
+        taken_before = told.float()
     assert (offers["in turn"] < offers["new"]).any(), "somebody is in somebody's way"
 
 
