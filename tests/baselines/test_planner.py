@@ -1,0 +1,98 @@
+"""The planner equals a plain loop over worlds, UAVs, actions and steps, and is above the script."""
+
+import pytest
+
+from damian import keys, make_env
+from damian.baselines.planner import Planner, planner_policy
+from damian.baselines.script import script_policy
+from damian.common.errors import InputError
+from damian.recipes.shared.environments import compose_scenario
+
+WORDS = ["scenario=delaybench/crowded", "region.initial_conditions=16", "actions.distances=[0,90]"]
+
+
+def made(*words, worlds=3):
+    return make_env(compose_scenario(*WORDS, *words), worlds, seed=5, extras=["message"])
+
+
+def loop(env, td, horizon):
+    """What the planner would choose, by one world, one UAV, one action and one step at a time."""
+    script = script_policy(env)
+    alone = made(worlds=1)
+    begin = env.uav_env.get_extra_state()
+    joint = script(td.clone())[keys.ACTION].clone()
+    for world in range(len(joint)):
+        rows = {name: table[world : world + 1] for name, table in begin.items()}
+        for uav in range(joint.shape[1]):
+            values = []
+            for action in range(env.uav_env.scenario.actions.n_actions):
+                alone.reset()
+                alone.uav_env.set_extra_state(rows)
+                chosen = joint[world : world + 1].clone()
+                chosen[0, uav] = action
+                total = 0.0
+                for _ in range(horizon):
+                    td = alone.step(alone.fake_tensordict().set(keys.ACTION, chosen))["next"]
+                    total += td[keys.REWARD].sum().item()
+                    chosen = script(td)[keys.ACTION]
+                values.append(total)
+            best = max(values)
+            if best > values[joint[world, uav]] + 1e-6:
+                joint[world, uav] = values.index(best)
+    return joint
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_the_planner_equals_a_plain_loop(horizon):
+    env = made()
+    planner = planner_policy(env, horizon)
+    td = env.reset()
+    differs = 0
+    for _ in range(3):
+        expected = loop(env, td, horizon)
+        chosen = planner(td.clone())[keys.ACTION]
+        assert chosen.equal(expected)
+        differs += (chosen != script_policy(env)(td.clone())[keys.ACTION]).sum().item()
+        td = env.step(td.set(keys.ACTION, chosen))["next"]
+    assert differs
+
+
+def test_the_planner_returns_more_than_the_script_and_tells_its_time():
+    env = made(worlds=8)
+    returns = {}
+    planner = planner_policy(env, 3)
+    for name, policy in (("script", script_policy(env)), ("planner", planner)):
+        env.set_seed(5)
+        rollout = env.rollout(15, policy, break_when_any_done=False)
+        returns[name] = rollout["next"][keys.REWARD].sum((1, 2)).mean()
+    assert returns["planner"] > returns["script"] + 0.5
+    assert len(planner.module.milliseconds) == 15
+
+
+def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same():
+    env = make_env(compose_scenario("scenario=requests"), 2, seed=5, extras=["message"])
+    planner = Planner(env.uav_env, 6, 2)
+    env.rollout(5, break_when_any_done=False)
+    state = env.uav_env.state
+    joint = planner.choice(state)
+    first = planner.values(state, joint, 0)
+    assert first.equal(planner.values(state, joint, 0)), "no hidden state"
+    held = joint.clone()
+    held[:, 0] = 0
+    same = planner.values(state, held, 0)
+    assert first.equal(same), "its own choice is replaced"
+    later = planner.values(state._replace(steps=state.steps), joint, 0)
+    other = planner.values(state._replace(seed=state.seed + 1), joint, 0)
+    assert later.equal(first)
+    assert not other.equal(first)
+
+
+@pytest.mark.parametrize(
+    ("word", "error"),
+    [("delay.obs=2", "plans on the present state"), ("actions=continuous", "needs discrete")],
+)
+def test_what_it_cannot_plan_is_refused(word, error):
+    scenario = compose_scenario("scenario=delaybench/crowded", word)
+    env = make_env(scenario, 1, extras=["message"])
+    with pytest.raises(InputError, match=error):
+        planner_policy(env)
