@@ -3,7 +3,7 @@ extend."""
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
@@ -136,15 +136,39 @@ class TrainConfig(ScenarioConfig):
 
 
 @dataclass
+class PlannerConfig(Settings):
+    """Settings of the planner (``damian.baselines.planner``)."""
+
+    section: ClassVar[str] = "planner"
+
+    horizon: int = setting(4, "Steps that it looks ahead.", low=1, high=1000)
+    samples: int = setting(
+        1, "Copies of a world for each action, for what is drawn.", low=1, high=1000
+    )
+
+
+@dataclass
+class EvaluateConfig(TrainConfig):
+    """All settings of ``damian evaluate``: those of ``damian train``, and a further policy."""
+
+    policy: str | None = setting(
+        None, "A policy to evaluate beside the others.", choices=("planner",)
+    )
+    planner: PlannerConfig = setting(PlannerConfig)
+
+
+@dataclass
 class FlyConfig(TrainConfig):
     """All settings of ``damian fly``: those of ``damian train``, and what to fly and to keep."""
 
     eval_episodes: int = setting(1, "Episodes to fly.")
     policy: str | None = setting(
         None,
-        "sampled (default with a checkpoint), deterministic, script (default without), or random.",
-        choices=(*STORED, "script", "random"),
+        "sampled (default with a checkpoint), deterministic, script (default without), random, or "
+        "planner.",
+        choices=(*STORED, "script", "random", "planner"),
     )
+    planner: PlannerConfig = setting(PlannerConfig)
     keep: str = setting(
         "all",
         "Keep all, or the best, median and worst episode (extremes).",

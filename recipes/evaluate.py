@@ -6,6 +6,7 @@ damian evaluate -m checkpoint=runs/first,runs/second delay.obs=0,2,4,8
 Words change settings of the run; what is not mentioned stays.
 """
 
+import statistics
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from omegaconf import DictConfig
 from tensordict.nn import InteractionType
 from torchrl.modules import ProbabilisticActor
 
+from damian.baselines.planner import planner_policy
 from damian.baselines.random import random_policy
 from damian.baselines.script import script_policy
 from damian.common.errors import InputError
@@ -21,11 +23,19 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.models.memory import add_recurrent_state
 from damian.runs.metrics import Evaluation, evaluate
-from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, save_results
+from damian.runs.run_folder import (
+    DETERMINISTIC,
+    PLANNER,
+    RANDOM,
+    SCRIPT,
+    TRAINED,
+    UNTRAINED,
+    save_results,
+)
 from damian.runs.training_state import load_networks
 
 from . import cli
-from .config import TrainConfig
+from .config import EvaluateConfig, TrainConfig
 from .shared.learning import own_code
 from .shared.runs import run_settings, save_config, start
 
@@ -126,6 +136,11 @@ def report(
     except InputError as error:  # the region is too large for the script, but not for the networks
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
+    if isinstance(config, EvaluateConfig) and config.policy == PLANNER:
+        planner = planner_policy(env, config.planner.horizon, config.planner.samples)
+        rows[PLANNER] = fly(planner)
+        spent = planner.module.milliseconds
+        print(f"planner: {statistics.median(spent):.0f} ms for a decision in all worlds at once")
     succeeds = config.episode.can_succeed
     table = save_results(rows, folder, succeeds, env.delays.obs.late, MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")

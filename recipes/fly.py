@@ -14,11 +14,14 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from damian.baselines.planner import planner_policy
 from damian.baselines.random import random_policy
 from damian.baselines.script import script_policy
+from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.models.memory import add_recurrent_state
+from damian.runs.run_folder import PLANNER, SCRIPT
 from damian.show.episode import Episode, record
 from damian.show.files import check_films, save_episode, summary
 from damian.show.geojson import origin_of
@@ -38,11 +41,18 @@ def fly(config: FlyConfig) -> list[Episode]:
         policy: TensorDictModuleBase = stored_actor(config, env)
         add_recurrent_state(env, policy)
     else:
-        policy = script_policy(env) if config.flown == "script" else random_policy(env)
+        policy = unlearnt_policy(config, env)
     with set_exploration_type(ExplorationType.DETERMINISTIC if likely else ExplorationType.RANDOM):
         rollout = env.rollout(config.horizon, policy, break_when_any_done=False)
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "seed": config.seed}
     return record(rollout, env.uav_env, {**about, "overrides": list(config.overrides)})
+
+
+def unlearnt_policy(config: FlyConfig, env: DelayedEnv) -> TensorDictModuleBase:
+    """The script, the planner, or random actions."""
+    if config.flown == PLANNER:
+        return planner_policy(env, config.planner.horizon, config.planner.samples)
+    return script_policy(env) if config.flown == SCRIPT else random_policy(env)
 
 
 def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:

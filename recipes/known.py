@@ -22,14 +22,22 @@ from damian.common.text_files import read_text
 from damian.compare.config import CompareConfig
 from damian.learners.config import LEARNERS
 
-from .config import ExportConfig, FitConfig, FlyConfig, ResultsConfig, SubmitConfig, TrainConfig
+from .config import (
+    EvaluateConfig,
+    ExportConfig,
+    FitConfig,
+    FlyConfig,
+    ResultsConfig,
+    SubmitConfig,
+    TrainConfig,
+)
 
 CONF = Path(__file__).parents[1] / "conf"
 """Folder of the configuration files: one for each program, and in folders one for each option of a
 group."""
 SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
-    "evaluate": TrainConfig,
+    "evaluate": EvaluateConfig,
     "fly": FlyConfig,
     "compare": CompareConfig,
     "fit": FitConfig,

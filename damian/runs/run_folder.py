@@ -27,6 +27,7 @@ TRAINED = "trained"
 UNTRAINED = "untrained"
 SCRIPT = "script"
 RANDOM = "random"
+PLANNER = "planner"
 DETERMINISTIC = ", deterministic"
 """Ending of the name of a policy whose most likely actions are taken, not drawn from its
 distribution."""
