@@ -93,6 +93,12 @@ class LearnerConfig(Settings):
     steps: int = setting(
         32, "Steps between two updates, if clock.system is not set.", low=1, high=checks.STEPS
     )
+    team: float = setting(
+        0.0,
+        "Share of the mean reward of all UAVs in what each learns from, instead of its own.",
+        low=0,
+        high=1,
+    )
     talks: bool = setting(
         False, "Whether an actor may read the rows of other UAVs, who then talk without delay."
     )
@@ -163,12 +169,6 @@ class MappoConfig(LearnerConfig):
     normalize_value: bool = setting(
         False,
         "The critic learns values of mean 0 and deviation 1, whatever the scale of the rewards.",
-    )
-    team: float = setting(
-        0.0,
-        "Share of the mean reward of all UAVs in what each learns from, instead of its own.",
-        low=0,
-        high=1,
     )
     warm_up: int = setting(0, "Updates in which only the critic learns.", low=0, high=checks.STEPS)
     near_start: int = setting(

@@ -90,7 +90,9 @@ class Sac:
         for _ in range(self.config.updates):
             sample = decisions.sample(self.config.batch_size)
             numbers = self.update(
-                transitions(steps, order, sample, self.config.gamma, self.observed)
+                transitions(
+                    steps, order, sample, self.config.gamma, self.observed, self.config.team
+                )
             )
             rounds.append(torch.stack([numbers[name] for name in NUMBERS]))
         # A number that is read at once would make the device wait at every update.

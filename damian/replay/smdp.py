@@ -49,7 +49,12 @@ def find_decisions(
 
 
 def transitions(
-    steps: TensorDictBase, order: Tensor, decisions: Decisions, gamma: float, observed: list[str]
+    steps: TensorDictBase,
+    order: Tensor,
+    decisions: Decisions,
+    gamma: float,
+    observed: list[str],
+    team: float = 0.0,
 ) -> TensorDict:
     """Turn K decisions into transitions of single agents, [K], in the form that TorchRL's losses
     read.
@@ -58,7 +63,7 @@ def transitions(
     step; ``steps_to_next_obs`` [K, 1] is the number of steps by which the next value is to be
     discounted. ``order`` is the index in ``steps`` [*, B] of each of T consecutive steps, from
     which the decisions count; ``observed`` names the agents' entries that a transition has before
-    and after the decision.
+    and after the decision. ``team`` is the share of the mean reward of all agents in each one's.
     """
     begin, world, agent, end = decisions
     before = (order[begin], world, agent)
@@ -74,8 +79,11 @@ def transitions(
         -1
     )  # [H, K]
     index = order[torch.minimum(step, end)], world
-    rewards = after["reward"].squeeze(-1)[*index, agent] * (step <= end)
-    reward = (gamma ** (step - begin) * rewards).sum(0)
+    earned = after["reward"].squeeze(-1)
+    rewards = earned[*index, agent]
+    if team:
+        rewards = torch.lerp(rewards, earned[index].mean(-1), team)
+    reward = (gamma ** (step - begin) * rewards * (step <= end)).sum(0)
     at_end = {"reward": reward.unsqueeze(-1), **{key: after[key][last] for key in observed}}
     ends = {key: steps[next_key(key)][last[:2]] for key in (keys.DONE, keys.TERMINATED)}
     n = len(begin)

@@ -55,11 +55,12 @@ def random_steps(seed: int) -> TensorDict:
     return TensorDict({"agents": agents, "next": {"agents": after, **ends}}, [T, B])
 
 
-def test_a_transition_has_the_observations_before_and_after_it_and_its_discounted_reward():
+@pytest.mark.parametrize("team", [0.0, 0.25])
+def test_a_transition_has_the_observations_before_and_after_it_and_its_discounted_reward(team):
     steps = random_steps(0)
     order = torch.arange(4, T + 4) % T
     decisions = find_decisions(*flags(0))
-    batch = transitions(steps, order, decisions, 0.9, ["observation"])
+    batch = transitions(steps, order, decisions, 0.9, ["observation"], team)
     before = steps[order]
     after = steps["next"][order]
     for k, (begin, world, agent, end) in enumerate(
@@ -71,7 +72,8 @@ def test_a_transition_has_the_observations_before_and_after_it_and_its_discounte
         assert batch["next", "agents", "observation"][k].equal(observation)
         for key in ("done", "terminated"):
             assert batch["next", key][k].equal(after[key][end, world])
-        rewards = after["agents", "reward"][begin : end + 1, world, agent, 0].tolist()
+        earned = after["agents", "reward"][begin : end + 1, world, :, 0]
+        rewards = ((1 - team) * earned[:, agent] + team * earned.mean(-1)).tolist()
         expected = sum(0.9**k * reward for k, reward in enumerate(rewards))
         assert batch["next", "agents", "reward"][k].item() == pytest.approx(expected, rel=1e-5)
         assert batch["steps_to_next_obs"][k].item() == end - begin + 1
