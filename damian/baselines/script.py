@@ -18,16 +18,10 @@ from damian.envs.uav_env import UavEnv
 from damian.server.belief import any_of, chance_of_staying, detection_chance, places, report_rows
 from damian.server.features.actions import FLIGHT_COST, LEAST_GAIN, footprint_bits
 from damian.server.features.requests import known_requests
+from damian.server.features.search import search_weights, seeking_of
 from damian.world.coverage import bit_count
 from damian.world.messages import Messages
 
-BLUR_M = 5.0
-"""Standard deviation of a detection's place [m]: landing points stand for the ground around
-them."""
-TRUST = 0.9
-"""Confidence, in [0, 1], that there is no source in a footprint in which a UAV hears nothing."""
-RECENT = 3.0
-"""A detection is recent until the source can have moved by this many footprint radii."""
 PROBABLE = 0.1
 """If a UAV detects the source with this probability somewhere in the next step, it leaves its own
 ground."""
@@ -106,10 +100,7 @@ class Seeker:
         self.dt = scenario.clock.dt
         self.candidates = simulation.candidates
         self.actions = scenario.actions
-        self.speed = 0.0
-        if source.motion == "dynamic":
-            self.speed = max(source.speed, source.local_speed)
-        self.emits = source.emits
+        self.seeking = seeking_of(source, self.dt)
         self.hears_all = scenario.requests.range is None
         points = simulation.airspace.points
         self.real = points[..., 0].isfinite()
@@ -129,9 +120,8 @@ class Seeker:
         if age is not None:
             time = time + age.squeeze(-1) * self.dt
         now = time.amax(-1, keepdim=True)
-        likely, recent = self.believe(held, ground, now)
-        fresh = self.fresh(held, ground)
-        weight = torch.where(recent, likely, fresh * likely)
+        landed = gather_rows(self.points.flatten(0, 1), self.counted(held))
+        weight = search_weights(held, ground, landed, now, self.radius, self.seeking)
         gain = weight @ self.footprints(region)
         action, _ = self.choose_landing(held, gain, region, mask)
         return action
@@ -165,51 +155,6 @@ class Seeker:
             base = region.unsqueeze(-1) * self.n_points
             return self.best_action(nearest + base, gain, left, mask)
         return self.best_move(held, gain, flown, left, ground)
-
-    def fresh(self, held: Messages, ground: Tensor) -> Tensor:
-        """1 for landing points [B, L, 2] nearest to the UAV and outside its latest footprints,
-        [B, N, L]."""
-        distance = distances(held.target, ground)
-        nearest = distance.amin(1, keepdim=True)
-        own = distance <= nearest
-        points = self.points.flatten(0, 1)
-        landed = gather_rows(points, self.counted(held))
-        from_trail = distances(landed, ground.unsqueeze(1))
-        outside = (from_trail > self.radius).all(-2)
-        return (own & outside).float()
-
-    def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-        """How likely the source is at each landing point [B, L, 2], relative to the best one,
-        [B, 1, L].
-
-        The place of a detection grows uncertain with its age: the way of the source at full speed
-        counts as two standard deviations. A footprint in which a UAV on the ground hears nothing
-        ``now`` [s] makes it less likely there. Also returns whether the latest detection is recent,
-        [B, 1, 1].
-        """
-        detected = held.detected_time.squeeze(-1)
-        has_detection = detected >= 0
-        since = torch.where(has_detection, now - detected, torch.inf).unsqueeze(-1)
-        from_detection = distances(held.detected_position.squeeze(-2), ground)
-        outside = (from_detection - self.radius).clamp(min=0)
-        deviation = BLUR_M + self.speed * since / 2
-        log_detected = -(outside / deviation).square() / 2
-        log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0)
-        half_step = self.dt / 2
-        heard_now = held.time > now - half_step
-        silent = ~held.spotted & ~held.in_flight & heard_now
-        inside = distances(held.position, ground) <= self.radius
-        covered = inside & silent.unsqueeze(-1)
-        anyone_covers = covered.any(1, keepdim=True)
-        latest = since.amin(1, keepdim=True)
-        emits = torch.where(latest < half_step, 1.0, self.emits)
-        confidence = TRUST * emits
-        log_silent = torch.log1p(-confidence * anyone_covers)
-        log = log_detected.sum(1, keepdim=True) + log_silent
-        highest = log.amax(-1, keepdim=True)
-        moved = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
-        recent = moved <= RECENT * self.radius
-        return (log - highest).exp(), recent
 
     def best_action(
         self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from damian import keys
 from damian.baselines.random import random_policy
-from damian.baselines.script import BLUR_M, RECENT, TRUST, Coverer, Seeker, script_policy
+from damian.baselines.script import Coverer, Seeker, script_policy
 from damian.delays.config import DelayConfig
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.server.config import ObservationConfig
+from damian.server.features.search import BLUR_M, RECENT, TRUST, likely_places
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig, action_table, displacement
@@ -131,7 +132,9 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
         target=target,
     )
     ground = policy.points[[0, 0]]
-    likely, recent = policy.believe(held, ground, torch.full((2, 1), 9.0))
+    likely, recent = likely_places(
+        held, ground, torch.full((2, 1), 9.0), policy.radius, policy.seeking
+    )
     for world, spots in enumerate(held.spotted.tolist()):
         ages = [9 - time if time >= 0 else math.inf for time in detected[world].tolist()]
         confidence = TRUST * (1.0 if min(ages) == 0 else 0.7)
@@ -149,12 +152,12 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
             for age, detected_at in zip(ages, places[1, world].tolist(), strict=True):
                 outside = max(math.dist(detected_at, place) - radius, 0.0)
                 if age < math.inf:
-                    log -= (outside / (BLUR_M + policy.speed * age / 2)) ** 2 / 2
+                    log -= (outside / (BLUR_M + policy.seeking.speed * age / 2)) ** 2 / 2
             expected.append(log)
         best = max(expected)
         found = likely[world, 0].tolist()
         assert found == pytest.approx([math.exp(log - best) for log in expected], abs=1e-4)
-        assert recent[world].item() == (min(ages) * policy.speed <= RECENT * radius)
+        assert recent[world].item() == (min(ages) * policy.seeking.speed <= RECENT * radius)
 
 
 @pytest.mark.parametrize("obs", [0, 3])

@@ -12,6 +12,7 @@ from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature, footprint_radii
 from damian.server.features.belief import belief_gain
 from damian.server.features.requests import known_requests
+from damian.server.features.search import Seeking, search_weights, seeking_of
 from damian.server.features.source import known_sources
 from damian.world.battery import battery_of, charge_gain, cruise_range, flight_drain, vertical_drain
 from damian.world.coverage import bit_count, packed_bits
@@ -55,6 +56,11 @@ class ActionTables(NamedTuple):
     """The landing points in the footprint of each, as bits, [V*R*L, W] for V radii."""
     full: Tensor
     """Their largest number in any footprint of this radius, [V*R*L]."""
+    inside: Tensor
+    """The same as ids within the region, L where there are fewer than most, [V*R*L, P]; [0, P] if
+    no single source is sought."""
+    seeking: Seeking
+    """What is known of the source."""
     ground: Tensor
     """Landing points of the regions [m], [R, L, 2]."""
     instant: bool
@@ -103,7 +109,9 @@ def action_tables(simulation: Simulation, _: ObservationConfig) -> ActionTables:
     battery = battery_of(values, length.new_zeros(0))
     speed = values.get("motion.max_speed", length)
     acceleration = values.get("motion.max_acceleration", length)
+    airspace = simulation.airspace
     drains = config.battery.enabled
+    seeks = config.seeks_source and len(simulation.sources) == 1
     numbers = [*battery, speed, acceleration, vehicles.levels]
     n_kinds = config.agents if any(isinstance(number, Tensor) for number in numbers) else 1
     each = length.unsqueeze(-1).expand(*length.shape, n_kinds)
@@ -114,7 +122,7 @@ def action_tables(simulation: Simulation, _: ObservationConfig) -> ActionTables:
     drain = torch.where(flies, flight_drain(vertical, each, battery), -rests)
     slow = _SLOW * simulation.dt
     radii = footprint_radii(simulation)
-    found = [footprint_bits(simulation.airspace.points, radius) for radius in radii]
+    found = [footprint_bits(airspace.points, radius) for radius in radii]
     sizes = [bit_count(bits).sum(-1).amax().float().expand(len(bits)) for bits in found]
     return ActionTables(
         goal=goal,
@@ -129,7 +137,9 @@ def action_tables(simulation: Simulation, _: ObservationConfig) -> ActionTables:
         else torch.full((n_kinds,), checks.METRES),
         footprints=torch.cat(found),
         full=torch.cat(sizes),
-        ground=simulation.airspace.points,
+        inside=_listed(torch.cat(found), airspace.max_points) if seeks else goal[:0],
+        seeking=seeking_of(config.source, simulation.dt),
+        ground=airspace.points,
         instant=vehicles.instant,
     )
 
@@ -154,6 +164,14 @@ def footprint_bits(points: Tensor, radius: float) -> Tensor:
             bits = F.pad(near, (0, n_bits - near.shape[-1]))
             found.append(packed_bits(bits.numpy()))
     return torch.cat(found)
+
+
+def _listed(bits: Tensor, n_points: int) -> Tensor:
+    """Which bits of [M, W] are set, [M, P], ``n_points`` where there are fewer than most."""
+    number = torch.arange(64 * bits.shape[-1])
+    is_set = (bits[:, number // 64] >> (number % 64)) & 1
+    n_most = int(is_set.sum(-1).amax())
+    return torch.where(is_set > 0, number, n_points).sort(-1).values[:, :n_most]
 
 
 def stands(v: FeatureCache) -> Tensor:
@@ -268,6 +286,19 @@ def _best_places(v: FeatureCache, places: Tensor, exists: Tensor) -> tuple[Tenso
     return close.amax(-1), (close * is_nearest).amax(-1)
 
 
+def source_gain(v: FeatureCache) -> Tensor:
+    """What listening where actions lead is worth by ``search_weights``, [*, n, A]."""
+    tables = v.table(action_tables)
+    ground = gather_rows(tables.ground, v.region).nan_to_num(posinf=0.0)
+    landed = gather_rows(v.context.points, v.trail)
+    now = v.context.now.unsqueeze(-1)
+    weights = search_weights(v.messages, ground, landed, now, v.radius, tables.seeking)
+    weights = F.pad(v.wanted(weights), (0, 1))
+    goal = gather_rows(tables.goal, v.wanted(v(stands)))
+    inside = gather_rows(tables.inside, v.tabled(goal))
+    return weights.unsqueeze(-2).expand(*goal.shape, -1).gather(-1, inside).sum(-1)
+
+
 def _if_any(gain: Tensor, other: Tensor) -> Tensor:
     """The gains [*, n, A] of UAVs that gain anything, of the rest ``other``."""
     return torch.where(gain.amax(-1, keepdim=True) > 0, gain, other)
@@ -333,7 +364,7 @@ def _actions(v: FeatureCache) -> Tensor:
     gain = found["in turn"]
     if "source" in names:
         found["source"], found["own source"] = _best_places(v, *known_sources(v))
-        gain = _if_any(found["own source"], gain)
+        gain = v(source_gain) / full if len(tables.inside) else _if_any(found["own source"], gain)
     if "request" in names:
         requests, unserved = known_requests(v.messages)
         place, appeared = requests.split([2, 1], -1)
