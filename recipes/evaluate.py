@@ -8,14 +8,14 @@ Words change settings of the run; what is not mentioned stays.
 
 import statistics
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import InteractionType
 from torchrl.modules import ProbabilisticActor
 
-from damian.baselines.planner import planner_policy
+from damian.baselines.planner import Planner, planner_policy
 from damian.baselines.random import random_policy
 from damian.baselines.script import script_policy
 from damian.common.errors import InputError
@@ -139,7 +139,7 @@ def report(
     if isinstance(config, EvaluateConfig) and config.policy == PLANNER:
         planner = planner_policy(env, config.planner.horizon, config.planner.samples)
         rows[PLANNER] = fly(planner)
-        spent = planner.module.milliseconds
+        spent = cast(Planner, planner.module).milliseconds
         print(f"planner: {statistics.median(spent):.0f} ms for a decision in all worlds at once")
     succeeds = config.episode.can_succeed
     table = save_results(rows, folder, succeeds, env.delays.obs.late, MEANING)
