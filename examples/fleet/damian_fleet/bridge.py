@@ -257,7 +257,7 @@ class Bridge:
         for answer in answers:  # after the acts of a pilot, so that none is taken for its own
             self._hear_answer(answer)
         self._check_limit()
-        if self.state in ("connect", "join") or (self.is_linked and self.state != "left"):
+        if self.state == "join" or (self.is_linked and self.state != "left"):
             getattr(self, f"_{self.state}")()
         self._keep_in_touch()
         if self._is_due("word", WORD):
@@ -809,7 +809,7 @@ class Bridge:
     # States.
 
     def _connect(self) -> None:
-        if "HEARTBEAT" not in self.seen or self.here is None or not (self.on_ground or self.in_air):
+        if not (self.on_ground or self.in_air):
             return
         if not (self.memory.vehicle or self._is_nameless) and self.now < self._since + IDENTITY:
             self.why = "which vehicle it is"

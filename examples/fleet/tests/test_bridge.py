@@ -236,6 +236,15 @@ def test_messages_up_to_five_seconds_late_are_no_boot_and_no_act():
     assert world.run(40, lambda: world.bridge.order.boots == 1)
 
 
+def test_while_the_clock_of_the_vehicle_is_not_known_all_that_it_says_may_be_late():
+    world = in_state("cruise")
+    world.vehicle.mute = ("TIMESYNC",)
+    world.start_again().run(4)
+    assert world.bridge.state == "connect", "all that it has heard may be late"
+    world.run(3)
+    assert world.bridge.state == "cruise", "by its messages alone, after so long"
+
+
 def test_another_bridge_has_it_and_both_say_so(caplog):
     caplog.set_level("INFO")
     world = in_state("ground")
