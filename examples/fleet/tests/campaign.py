@@ -203,8 +203,12 @@ class Uav(Link):
         quiet."""
         copter = self.copter
         fell = copter.crashed and copter.height > 2
-        lands = copter.mode == LAND and (self.last_command == LAND or self.state == "landing")
-        changed = [each for each in changed if each != "mode" or not lands or fell]
+        ends = self.state == "landing"  # as the bridge wants it
+        wanted = {
+            "mode": copter.mode == LAND and (ends or self.last_command == LAND),
+            "motors": ends and copter.landed and copter.height < 1,
+        }
+        changed = [each for each in changed if fell or not wanted.get(each)]
         if changed:
             self.act = (now, why)
             self.seen_at = None
