@@ -25,6 +25,7 @@ import torch
 from damian.baselines.random import random_policy
 from damian_fleet import program
 from damian_fleet.bridge import FLIGHT, Answer, Bridge, Memory
+from damian_fleet.order import LATEST
 from damian_fleet.program import config_of, make_fleets
 from damian_fleet.service import Clock, make_app
 from damian_fleet.store import Fleets
@@ -158,6 +159,8 @@ class Uav(Link):
         )
         self.memory = None
         self.epoch = 0.0
+        self.started = 0.0
+        self.boots = set()  # of its copter
         self.off_until = 0.0
         self.act = None
         self.seen_at = None
@@ -189,8 +192,9 @@ class Uav(Link):
         self.bridge = None
         self.off_until = until
 
-    def start_bridge(self, epoch):
+    def start_bridge(self, epoch, now):
         self.epoch = epoch
+        self.started = now
         self.start(Memory.model_validate_json(self.memory) if self.memory else None)
 
     @property
@@ -329,7 +333,7 @@ class Campaign:
         copter = uav.copter
         now = self.now
         if uav.bridge is None and now >= uav.off_until:
-            uav.start_bridge(self.rng.uniform(-HOUR, HOUR))
+            uav.start_bridge(self.rng.uniform(-HOUR, HOUR), now)
             uav.shown = {}
         links = [uav, uav.second] if uav.second else [uav]
         for link in links:
@@ -349,14 +353,11 @@ class Campaign:
             why = link.bridge.why
             is_as_told = copter.armed and copter.mode == GUIDED
             is_told = before in ("climb", "cruise") and is_as_told and "by somebody else" in why
-            is_told |= why.startswith("it has booted again")
-            if (
-                link is uav
-                and uav.act is None
-                and before != link.bridge.state == "watch"
-                and is_told
-            ):
-                self.break_("no act that was none", f"{uav.name} {before}: {link.bridge.why}")
+            is_told &= uav.act is None and before != link.bridge.state == "watch"
+            uav.boots.add(copter.booted)
+            boots = sum(at > uav.started - LATEST for at in uav.boots)
+            if link is uav and (is_told or link.bridge.order.boots > boots):
+                self.break_("no act that was none", f"{uav.name} {before}: {why}, {boots} boots")
             for message in messages:
                 message.pack(self.station)
             link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
