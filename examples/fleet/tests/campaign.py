@@ -479,9 +479,10 @@ class Campaign:
             copter.place = STARTS[ord(uav.name) - ord("A")]
             uav.strayed = True
             uav.known = np.inf
-        if uav.seen_at is not None and (uav.bridge is None or uav.bridge.state == "connect"):
+        knows = uav.bridge and uav.bridge.is_linked and uav.bridge.state != "connect"
+        if uav.seen_at is not None and not knows:
             uav.seen_at = self.now
-        is_heeded = uav.bridge is None or uav.bridge.state in ("watch", "left")
+        is_heeded = not knows or uav.bridge.state in ("watch", "left")
         if uav.seen_at is not None and not is_heeded and self.now > uav.seen_at + HEED:
             self.break_("a pilot's act is heeded", f"{uav.name} {uav.act}: {uav.bridge.state}")
         if not (uav.act or copter.failsafe or (uav.bridge and uav.bridge.state == "watch")):
