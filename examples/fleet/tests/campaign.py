@@ -717,7 +717,7 @@ INVARIANTS = (
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, default in (("seeds", 10), ("first", 0), ("faults", 100)):
+    for name, default in (("seeds", 20), ("first", 21000), ("faults", 50)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--log", action="store_true", help="what bridges say")
     given = parser.parse_args()
