@@ -21,7 +21,7 @@ is sent again until its effect is seen or its acknowledgement has come.
 
 **The pilot has the last word**: a mode, motors on or off, or an aim in the air that the bridge has
 not commanded, a move of the mode switch, a restart of the vehicle, and before the flight a refusal
-or a failsafe, lead to *watch* from every state; so does what has changed while the bridge was off.
+or a failsafe, lead to *watch* from every state; so does what may have changed while it was off.
 Nothing is commanded unless mode and motors were heard since the last command; if they are not for 5
 s: *watch*. Where a vehicle is in the air in GUIDED and nobody is known to command it, the bridge is
 silent: so its failsafe lands it. **To hand over again**, the pilot switches the vehicle from
@@ -257,7 +257,7 @@ class Bridge:
         for answer in answers:  # after the acts of a pilot, so that none is taken for its own
             self._hear_answer(answer)
         self._check_limit()
-        if self.state in ("connect", "join") or (self.is_linked and self.state != "left"):
+        if self.state == "join" or (self.is_linked and self.state != "left"):
             getattr(self, f"_{self.state}")()
         self._keep_in_touch()
         if self._is_due("word", WORD):
@@ -809,7 +809,7 @@ class Bridge:
     # States.
 
     def _connect(self) -> None:
-        if "HEARTBEAT" not in self.seen or self.here is None or not (self.on_ground or self.in_air):
+        if not (self.on_ground or self.in_air):
             return
         if not (self.memory.vehicle or self._is_nameless) and self.now < self._since + IDENTITY:
             self.why = "which vehicle it is"
@@ -825,8 +825,8 @@ class Bridge:
         if state in ("watch", "cruise", "landing") or (is_told and self.in_air):
             self._turn(state, "on as before")
             self.memory.mode = mode  # what has changed since, somebody else has done
-        elif state == "climb" and self.on_ground and not self.armed:
-            self._hands_off("motors off by somebody else")
+        elif state in ("arm", "climb") and self.on_ground and not self.armed:
+            self._hands_off("motors may have been on: off by somebody else")
         elif is_told and self.on_ground:
             self._turn("landing", "on the ground as before")
             self.memory.mode = mode

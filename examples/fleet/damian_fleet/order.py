@@ -3,7 +3,7 @@
 Some messages tell the time since the boot of the vehicle; the others are placed between those by
 the number that each message has, which begins again after 255. A late message is no restart: that
 is told by the answer to a request of the time (TIMESYNC), which is behind what was heard before the
-request was made.
+request was made. Until the clock is known, each message counts as ``LATEST`` late.
 """
 
 import bisect
@@ -49,6 +49,13 @@ class Order:
         new."""
         return self._upper if self._lower == -math.inf else min(self._lower, self._upper)
 
+    @property
+    def _is_known(self) -> bool:
+        """Whether the clock of the vehicle is known: by an answer, or by its messages for so
+        long."""
+        long = self._times[-1] - self._times[0] if self._times else 0.0
+        return self._lower > -math.inf or long > LATEST
+
     def ask_time(self, now: float) -> int:
         """The mark of a request of the time [ns]."""
         mark = round(now * 1e9)
@@ -83,7 +90,7 @@ class Order:
             sent = boot / 1e3
         else:
             place, sent = self._place(number, now)
-        late = max(now - self._ahead - sent, 0.0) if self._times else 0.0
+        late = max(now - self._ahead - sent, 0.0) if self._is_known else LATEST
         if boot is not None and late > LATE:
             self._mixed_until = (
                 now + LATEST
@@ -129,7 +136,7 @@ class Order:
         ):  # nothing tells but the count
             place = self._number + (number - self._number + 128) % 256 - 128
             self._number = max(self._number, place)
-            return place, vehicle
+            return place, vehicle - LATEST
         newest = self._numbers[-1] + self._rate * (vehicle - self._times[-1]) + 8 + 0.2 * self._rate
         place = number + math.floor((newest - number) / 256) * 256
         if now < self._mixed_until and vehicle - self._time_at(place - 256) < LATEST + 0.5:

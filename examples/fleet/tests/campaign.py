@@ -25,6 +25,7 @@ import torch
 from damian.baselines.random import random_policy
 from damian_fleet import program
 from damian_fleet.bridge import FLIGHT, Answer, Bridge, Memory
+from damian_fleet.order import LATEST
 from damian_fleet.program import config_of, make_fleets
 from damian_fleet.service import Clock, make_app
 from damian_fleet.store import Fleets
@@ -158,6 +159,8 @@ class Uav(Link):
         )
         self.memory = None
         self.epoch = 0.0
+        self.started = 0.0
+        self.boots = set()  # of its copter
         self.off_until = 0.0
         self.act = None
         self.seen_at = None
@@ -189,8 +192,9 @@ class Uav(Link):
         self.bridge = None
         self.off_until = until
 
-    def start_bridge(self, epoch):
+    def start_bridge(self, epoch, now):
         self.epoch = epoch
+        self.started = now
         self.start(Memory.model_validate_json(self.memory) if self.memory else None)
 
     @property
@@ -203,8 +207,12 @@ class Uav(Link):
         quiet."""
         copter = self.copter
         fell = copter.crashed and copter.height > 2
-        lands = copter.mode == LAND and (self.last_command == LAND or self.state == "landing")
-        changed = [each for each in changed if each != "mode" or not lands or fell]
+        ends = self.state == "landing"  # as the bridge wants it
+        wanted = {
+            "mode": copter.mode == LAND and (ends or self.last_command == LAND),
+            "motors": ends and copter.landed and copter.height < 1,
+        }
+        changed = [each for each in changed if fell or not wanted.get(each)]
         if changed:
             self.act = (now, why)
             self.seen_at = None
@@ -325,7 +333,7 @@ class Campaign:
         copter = uav.copter
         now = self.now
         if uav.bridge is None and now >= uav.off_until:
-            uav.start_bridge(self.rng.uniform(-HOUR, HOUR))
+            uav.start_bridge(self.rng.uniform(-HOUR, HOUR), now)
             uav.shown = {}
         links = [uav, uav.second] if uav.second else [uav]
         for link in links:
@@ -345,14 +353,11 @@ class Campaign:
             why = link.bridge.why
             is_as_told = copter.armed and copter.mode == GUIDED
             is_told = before in ("climb", "cruise") and is_as_told and "by somebody else" in why
-            is_told |= why.startswith("it has booted again")
-            if (
-                link is uav
-                and uav.act is None
-                and before != link.bridge.state == "watch"
-                and is_told
-            ):
-                self.break_("no act that was none", f"{uav.name} {before}: {link.bridge.why}")
+            is_told &= uav.act is None and before != link.bridge.state == "watch"
+            uav.boots.add(copter.booted)
+            boots = sum(at > uav.started - LATEST for at in uav.boots)
+            if link is uav and (is_told or link.bridge.order.boots > boots):
+                self.break_("no act that was none", f"{uav.name} {before}: {why}, {boots} boots")
             for message in messages:
                 message.pack(self.station)
             link.down.send(now, *(each for each in messages if self.goes_through(uav, link, each)))
@@ -474,9 +479,10 @@ class Campaign:
             copter.place = STARTS[ord(uav.name) - ord("A")]
             uav.strayed = True
             uav.known = np.inf
-        if uav.seen_at is not None and (uav.bridge is None or uav.bridge.state == "connect"):
+        knows = uav.bridge and uav.bridge.is_linked and uav.bridge.state != "connect"
+        if uav.seen_at is not None and not knows:
             uav.seen_at = self.now
-        is_heeded = uav.bridge is None or uav.bridge.state in ("watch", "left")
+        is_heeded = not knows or uav.bridge.state in ("watch", "left")
         if uav.seen_at is not None and not is_heeded and self.now > uav.seen_at + HEED:
             self.break_("a pilot's act is heeded", f"{uav.name} {uav.act}: {uav.bridge.state}")
         if not (uav.act or copter.failsafe or (uav.bridge and uav.bridge.state == "watch")):
@@ -711,7 +717,7 @@ INVARIANTS = (
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, default in (("seeds", 10), ("first", 0), ("faults", 100)):
+    for name, default in (("seeds", 20), ("first", 21000), ("faults", 50)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--log", action="store_true", help="what bridges say")
     given = parser.parse_args()
