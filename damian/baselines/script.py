@@ -17,7 +17,7 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import any_of, chance_of_staying, detection_chance, places, report_rows
 from damian.server.features.actions import FLIGHT_COST, LEAST_GAIN, footprint_bits
-from damian.server.features.requests import known_requests
+from damian.server.features.requests import assignments, known_requests
 from damian.server.features.search import search_weights, seeking_of
 from damian.world.coverage import bit_count
 from damian.world.messages import Messages
@@ -343,7 +343,7 @@ class Rescuer(Coverer):
         times = heard.sum(1).clamp(min=1).unsqueeze(-1)
         heard_places = known.detected_position * heard.unsqueeze(-1)
         place = heard_places.sum(1) / times
-        goal, assigned = _assigned(known.target, place, heard.any(1), uav)
+        goal, assigned = _goal_of(uav, known.target, place, heard.any(1))
         searched = self.searched(known, uav)
         goal = torch.where(assigned.unsqueeze(-1), goal, searched)
         region = self.region_of(known)
@@ -376,7 +376,7 @@ class Dispatcher(Rescuer):
     ) -> tuple[Tensor, Tensor]:
         requests, unserved = known_requests(known)
         places = requests[..., :2]
-        goal, assigned = _assigned(known.target, places, unserved, uav)
+        goal, assigned = _goal_of(uav, known.target, places, unserved)
         alone = _only(known, uav)
         other = alone.target[:, 0]
         if not self.hears_all:
@@ -389,31 +389,10 @@ class Dispatcher(Rescuer):
         return action, claimed
 
 
-def _assigned(uavs: Tensor, places: Tensor, wanted: Tensor, uav: int) -> tuple[Tensor, Tensor]:
-    """The place [B, 2] of those wanted [B, K] to which a UAV is assigned, and whether it is to any,
-    [B].
-
-    UAVs are at ``uavs`` [B, N, 2], places at [B, K, 2] m; of those left, the nearest pair is
-    assigned first.
-    """
-    unwanted = ~wanted.unsqueeze(1)
-    cost = distances(uavs, places).masked_fill(unwanted, torch.inf)
-    n_uavs, n_places = cost.shape[1:]
-    row = torch.arange(n_uavs, device=uavs.device)
-    column = torch.arange(n_places, device=uavs.device)
-    goal = places[:, 0].clone()
-    assigned = torch.zeros(len(uavs), dtype=torch.bool, device=uavs.device)
-    for _ in range(min(n_uavs, n_places)):
-        least, pair = cost.flatten(1).min(-1)
-        one = (pair // n_places).unsqueeze(-1)
-        place = (pair % n_places).unsqueeze(-1)
-        own = (one == uav) & least.isfinite().unsqueeze(-1)
-        goal = torch.where(own, _places_at(places, place).squeeze(1), goal)
-        assigned = assigned | own.squeeze(-1)
-        in_row = (row == one).unsqueeze(-1)
-        in_column = (column == place).unsqueeze(1)
-        cost = cost.masked_fill(in_row | in_column, torch.inf)
-    return goal, assigned
+def _goal_of(uav: int, targets: Tensor, places: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """The place [B, 2] to which a UAV is assigned, and whether it is to any, [B]."""
+    goal = assignments(targets, places, wanted)[:, uav]
+    return _places_at(places, goal.clamp(min=0).unsqueeze(-1)).squeeze(1), goal >= 0
 
 
 def _only(known: Messages, uav: int) -> Messages:

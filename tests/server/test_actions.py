@@ -177,7 +177,8 @@ def test_what_lies_where_actions_lead_equals_a_plain_loop():
                 place = torch.tensor(target[i])
                 start = (points - place).square().sum(-1).argmin()
                 goals = points[simulation.candidates.nearest[start]].tolist()
-                near = [k for k, at in heard.items() if nearest_uav(target, at) == i]
+                goal = assigned(target, heard).get(i)
+                near = [] if goal is None else [goal]
                 for action, goal in enumerate(goals):
                     others = [target[j] for j in range(env.n_agents) if j != i]
                     values = {
@@ -196,8 +197,18 @@ def closeness(goal, places, radius):
     return max((math.exp(-math.dist(goal, place) / radius) for place in places), default=0.0)
 
 
-def nearest_uav(targets, place):
-    return min(range(len(targets)), key=lambda j: math.dist(targets[j], place))
+def assigned(targets, places):
+    """The place of each UAV, by the nearest pair of those left, one pair after the other."""
+    found = {}
+    pairs = [
+        (math.dist(target, place), i, k)
+        for i, target in enumerate(targets)
+        for k, place in places.items()
+    ]
+    for _, i, k in sorted(pairs):
+        if i not in found and k not in found.values():
+            found[i] = k
+    return found
 
 
 def test_a_request_is_offered_where_it_is_open():
@@ -216,7 +227,8 @@ def test_a_request_is_offered_where_it_is_open():
             waiting = [r for r, s in zip(requests, served, strict=True) if 0 <= r[2] != s]
             targets = messages.target[world, step].tolist()
             for i in range(4):
-                own = [r[:2] for r in waiting if nearest_uav(targets, r[:2]) == i]
+                goals_of = assigned(targets, {k: r[:2] for k, r in enumerate(waiting)})
+                own = [waiting[goals_of[i]][:2]] if i in goals_of else []
                 for action in range(0, 40, 7):
                     goal = goals[messages.trail[world, step, i, 0], action].tolist()
                     inside = [r for r in waiting if math.dist(goal, r[:2]) <= radius]

@@ -11,7 +11,7 @@ from damian.common.tensors import distances, gather_rows
 from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature, footprint_radii
 from damian.server.features.belief import belief_gain
-from damian.server.features.requests import known_requests
+from damian.server.features.requests import assignments, known_requests
 from damian.server.features.search import Seeking, search_weights, seeking_of
 from damian.server.features.source import known_sources
 from damian.world.battery import battery_of, charge_gain, cruise_range, flight_drain, vertical_drain
@@ -249,11 +249,12 @@ def claimed(v: FeatureCache) -> Tensor:
 
 def _closeness(v: FeatureCache, places: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
     """exp(-distance/radius) from where actions lead to places [*, K, 2] that ``exists`` [*, K]
-    marks, [*, n, A, K]; and whether each wanted UAV is the nearest to it, [*, n, 1, K]."""
+    marks, [*, n, A, K]; and whether each wanted UAV is assigned to it, [*, n, 1, K]."""
     away = _from_goals(v, places)
     close = (-away / _radius(v)).exp() * exists[..., None, None, :]
-    nearest = distances(v.messages.target, places).argmin(-2, keepdim=True)
-    return close, (nearest == v(itself).unsqueeze(-1)).unsqueeze(-2)
+    goal = assignments(v.messages.target, places, exists)
+    place = torch.arange(places.shape[-2], device=places.device)
+    return close, v.wanted(goal.unsqueeze(-1) == place).unsqueeze(-2)
 
 
 def _from_goals(v: FeatureCache, places: Tensor) -> Tensor:
@@ -281,9 +282,9 @@ def goal_places(v: FeatureCache) -> Tensor:
 
 def _best_places(v: FeatureCache, places: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
     """Closeness of where actions lead to the nearest of places, as in ``_closeness``, and to the
-    nearest of those to which no other UAV is nearer, [*, n, A] each."""
-    close, is_nearest = _closeness(v, places, exists)
-    return close.amax(-1), (close * is_nearest).amax(-1)
+    one to which the UAV is assigned, [*, n, A] each."""
+    close, is_assigned = _closeness(v, places, exists)
+    return close.amax(-1), (close * is_assigned).amax(-1)
 
 
 def source_gain(v: FeatureCache) -> Tensor:
@@ -331,7 +332,7 @@ def _actions(v: FeatureCache) -> Tensor:
     full footprint: outside the UAV's own latest footprints (``new``), outside those of all UAVs
     (``new to all``), and outside its own and those that the UAVs before it will choose, if they
     choose as the script does (``in turn``). exp(-distance/radius) from there to the nearest known
-    source, and to the nearest of those to which no other UAV is nearer (``own source``); the same
+    source, and to that to which the script assigns the UAV (``own source``); the same
     of open requests, and the age of the oldest in the footprint; the ``belief_gain``; and the
     nearest target of another UAV. ``gain``: what the UAV gains in its task, as a rule of thumb has
     it, less a little for the way; ``choice``: 1 for the legal action of the largest gain;
@@ -374,7 +375,8 @@ def _actions(v: FeatureCache) -> Tensor:
         age = (v.context.now[..., None] - appeared.squeeze(-1)) / v.context.time_scale
         age = age.clamp(0, 1)[..., None, None, :]
         found["request age"] = (age * inside).amax(-1)
-        gain = _if_any(found["own request"], gain)
+        waits = (-gather_rows(tables.length, standing) / v.radius).exp()
+        gain = _if_any(found["own request"], waits)
     if "belief" in names:
         found["belief"] = v(belief_gain.compute)
         gain = found["belief"]

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from damian.common.tensors import distances
 from damian.server.features.base import FeatureCache, feature
 from damian.world.messages import Messages
 from damian.world.requests import is_open
@@ -19,6 +20,27 @@ def known_requests(messages: Messages) -> tuple[Tensor, Tensor]:
     knows = appeared.argmax(-2)[..., None, :, None]  # the one UAV, [*, 1, M, 1]
     requests = messages.requests.take_along_dim(knows, -3).squeeze(-3)
     return requests, is_open(requests, messages.served)
+
+
+def assignments(uavs: Tensor, places: Tensor, wanted: Tensor) -> Tensor:
+    """The place, of those ``wanted`` [*, K], to which each UAV is assigned, [*, N]; -1 for none.
+
+    UAVs are at [*, N, 2], places at [*, K, 2] m; of those left, the nearest pair is assigned first.
+    """
+    cost = distances(uavs, places).masked_fill(~wanted.unsqueeze(-2), torch.inf)
+    n_uavs, n_places = cost.shape[-2:]
+    row = torch.arange(n_uavs, device=uavs.device)
+    column = torch.arange(n_places, device=uavs.device)
+    goal = torch.full(cost.shape[:-1], -1, device=uavs.device)
+    for _ in range(min(n_uavs, n_places)):
+        least, pair = cost.flatten(-2).min(-1)
+        one = (pair // n_places).unsqueeze(-1)
+        place = (pair % n_places).unsqueeze(-1)
+        own = (row == one) & least.isfinite().unsqueeze(-1)
+        goal = torch.where(own, place, goal)
+        taken = (row == one).unsqueeze(-1) | (column == place).unsqueeze(-2)
+        cost = cost.masked_fill(taken, torch.inf)
+    return goal
 
 
 @feature(
