@@ -156,9 +156,6 @@ class FlyConfig(TrainConfig):
         "tools.",
         choices=("gif", "mp4", "png", "html", "geojson"),
     )
-    views: list[str] = setting(
-        ["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d")
-    )
     shown: list[str] = setting(
         [],
         "UAVs that films tell apart, by number; if none, all of up to 6, 3 of more.",

@@ -1,7 +1,7 @@
 """Fly episodes and keep each as file, film, figure or page: what is true, and what the server
 believes.
 
-damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
+damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]"
 damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"   (in one page, side by side)
 damian fly scenario=coverage agents=100 "shown=[4,17]"    (films tell these UAVs from the others)
 """
@@ -67,7 +67,7 @@ def show(config: FlyConfig, folder: Path) -> None:
         origin_of(next(iter(episodes.values())))  # refuses a region without a place on Earth
     save_config(config, folder)
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
-        save_episode(episode, folder / name, config.formats, config.views, config.shown)
+        save_episode(episode, folder / name, config.formats, config.shown)
     for name, episode in episodes.items():
         print(summary(name, episode))
 

@@ -1,7 +1,6 @@
 """Writes an episode as what people look at: film, figure, page and GeoJSON."""
 
 from collections.abc import Collection, Sequence
-from itertools import product
 from pathlib import Path
 
 from matplotlib.animation import FFMpegWriter
@@ -22,12 +21,11 @@ def check_films(formats: Collection[str]) -> None:
 
 
 def save_episode(
-    episode: Episode, file: Path, formats: Sequence[str], views: Sequence[str], shown: Sequence[str]
+    episode: Episode, file: Path, formats: Sequence[str], shown: Sequence[str]
 ) -> None:
     """Write an episode to ``file`` with the end ``.json``, and beside it all formats.
 
-    ``views`` are those of its films (gif, mp4), which tell the UAVs that are ``shown`` from the
-    others.
+    Pictures and films (gif, mp4) tell the UAVs that are ``shown`` from the others.
     """
     episode.save(file.with_suffix(".json"))
     if "png" in formats:
@@ -36,11 +34,9 @@ def save_episode(
         save_page([episode], file.with_suffix(".html"))
     if "geojson" in formats:
         save_geojson(episode, file.with_suffix(".geojson"))
-    films = [kind for kind in formats if kind in ("gif", "mp4")]
-    for kind, view in product(films, views):
-        save_film(
-            episode, file.with_name(f"{file.name}{'_3d' * (view == '3d')}.{kind}"), view, shown
-        )
+    for kind in ("gif", "mp4"):
+        if kind in formats:
+            save_film(episode, file.with_suffix(f".{kind}"), shown)
 
 
 def summary(name: str, episode: Episode) -> str:

@@ -71,9 +71,6 @@ class PlaybackConfig(OfflineConfig):
     formats: list[str] = setting(
         ["html"], "What to make of each.", choices=("gif", "mp4", "png", "html", "geojson")
     )
-    views: list[str] = setting(
-        ["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d")
-    )
     shown: list[str] = setting(
         [], "IDs of UAVs that films tell apart; if none, all of up to 6, 3 of more."
     )
@@ -105,7 +102,7 @@ def play_back(config: PlaybackConfig, words: Sequence[str]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for number, episode in enumerate(episodes):
         name = f"episode_{number}"
-        save_episode(episode, folder / name, config.formats, config.views, config.shown)
+        save_episode(episode, folder / name, config.formats, config.shown)
         print(summary(name, episode))
 
 
