@@ -1,5 +1,4 @@
-"""Figures of trainings, sweeps and comparisons: learning curves, scores with intervals,
-profiles."""
+"""Figures of trainings, sweeps and comparisons: learning curves, and scores with intervals."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,7 @@ from pandas.api.types import is_numeric_dtype
 
 from damian.common.plotting import STYLE, save_figure
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method, sign_of
-from damian.compare.statistics import Floats, bootstrap, normalised
+from damian.compare.statistics import Floats, bootstrap
 from damian.runs.metrics import Evaluation
 from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED, UNTRAINED
 
@@ -129,32 +128,6 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
         axis.set(title=f"{task}, delay {delay}", xlabel=score)
 
     save(path, _places(comparison), panel, (3.4, 2.8), width=3)
-
-
-def plot_profiles(comparison: Comparison, path: Path) -> None:
-    """Draw performance profiles: the share of runs, of all tasks, delays and seeds, above each
-    J_norm.
-
-    Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice". A
-    method without runs of some task or delay is left out.
-    """
-    scores = [comparison.scores(*place) for place in _places(comparison)]
-    names = [name for name in comparison.methods if all(name in found for found in scores)]
-
-    def panel(axis: Axes, _: str) -> None:
-        levels = np.linspace(-0.1, 1.1, _POINTS)
-        for name in names:
-            runs = []
-            for found in scores:
-                undelayed, random = found.iloc[:, :2].mean().to_numpy()
-                runs.append(normalised(found[name].to_numpy(), undelayed, random))
-            values = np.concatenate(runs)
-            known = values[~np.isnan(values)]
-            share = (known[:, None] > levels).mean(0)
-            axis.plot(levels, share, **_line_of(comparison, name))
-        axis.set(xlabel="J_norm (random 0, undelayed 1)", ylabel="share of runs above")
-
-    save(path, ["all"] if len(scores) > 1 else [], panel, (4.0, 3.0))
 
 
 def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
