@@ -152,9 +152,8 @@ class FlyConfig(TrainConfig):
     )
     formats: list[str] = setting(
         ["gif", "png"],
-        "What to make of each: films (gif, mp4), a figure (png), a page (html), or geojson for map "
-        "tools.",
-        choices=("gif", "mp4", "png", "html", "geojson"),
+        "What to make of each: films (gif, mp4), a figure (png), or a page (html).",
+        choices=("gif", "mp4", "png", "html"),
     )
     shown: list[str] = setting(
         [],

@@ -21,7 +21,6 @@ from damian.envs.uav_env import EXTRAS
 from damian.models.memory import add_recurrent_state
 from damian.show.episode import Episode, record
 from damian.show.files import check_films, save_episode, summary
-from damian.show.geojson import origin_of
 from damian.show.replay_page import save_page
 
 from . import cli
@@ -63,8 +62,6 @@ def show(config: FlyConfig, folder: Path) -> None:
         print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
         return
     episodes = kept(fly(config), config.keep)
-    if "geojson" in config.formats:
-        origin_of(next(iter(episodes.values())))  # refuses a region without a place on Earth
     save_config(config, folder)
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
         save_episode(episode, folder / name, config.formats, config.shown)

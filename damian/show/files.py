@@ -1,4 +1,4 @@
-"""Writes an episode as what people look at: film, figure, page and GeoJSON."""
+"""Writes an episode as what people look at: film, figure and page."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -8,7 +8,6 @@ from matplotlib.animation import FFMpegWriter
 from damian.common import checks
 from damian.show.episode import Episode
 from damian.show.film import save_film, save_picture
-from damian.show.geojson import save_geojson
 from damian.show.replay_page import save_page
 
 
@@ -32,8 +31,6 @@ def save_episode(
         save_picture(episode, file.with_suffix(".png"), shown)
     if "html" in formats:
         save_page([episode], file.with_suffix(".html"))
-    if "geojson" in formats:
-        save_geojson(episode, file.with_suffix(".geojson"))
     for kind in ("gif", "mp4"):
         if kind in formats:
             save_film(episode, file.with_suffix(f".{kind}"), shown)

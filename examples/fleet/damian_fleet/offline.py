@@ -2,7 +2,7 @@
 tells.
 
 damian-advise checkpoint=runs/FOLDER table=reports.csv instant=true
-damian-playback region=llanbedr journal=north.jsonl "formats=[html,geojson]" folder=north
+damian-playback region=llanbedr journal=north.jsonl "formats=[html,gif]" folder=north
 
 Words that are no settings of the program are those of damian train, which choose the scenario
 (such as region=llanbedr), or change that of the checkpoint.
@@ -69,7 +69,7 @@ class PlaybackConfig(OfflineConfig):
     journal: str = setting("", "Journal of a fleet, whose flight to show.")
     folder: str = setting("playback", "Folder for the episodes.")
     formats: list[str] = setting(
-        ["html"], "What to make of each.", choices=("gif", "mp4", "png", "html", "geojson")
+        ["html"], "What to make of each.", choices=("gif", "mp4", "png", "html")
     )
     shown: list[str] = setting(
         [], "IDs of UAVs that films tell apart; if none, all of up to 6, 3 of more."
