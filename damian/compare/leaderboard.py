@@ -1,20 +1,10 @@
-"""The leaderboard of delaybench: checks of a submission, and the tables of all submissions."""
-
-from collections.abc import Collection, Sequence
+"""The leaderboard of delaybench: checks of a submission."""
 
 import numpy as np
 import pandas as pd
 
 from damian.common import checks
-from damian.common.tables import markdown_table
-from damian.compare.comparison import (
-    HELD_OUT_MARK,
-    LATE_DATA,
-    RUN,
-    SIMULATOR,
-    means_over_seeds,
-    shown,
-)
+from damian.compare.comparison import HELD_OUT_MARK, LATE_DATA, RUN, SIMULATOR
 from damian.compare.config import EPISODES, Experiment
 
 NUMBERS = ["frames", "episodes", "return"]
@@ -69,53 +59,3 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
             bool(enough), f"{where}: seed", [*seeds], f"{few}, from {experiment.first_seed} on"
         )
         checks.in_range(f"{where}: episodes", int(runs["episodes"].min()), EPISODES)
-
-
-def leaderboard(submissions: Sequence[pd.DataFrame], delays: Collection[str]) -> str:
-    """Tables of all submissions, as Markdown: for each track and task, and of flights elsewhere."""
-    rows = pd.concat(submissions, ignore_index=True)
-    away = rows["task"].str.contains(HELD_OUT_MARK, regex=False)
-    parts = []
-    for regime in (LATE_DATA, SIMULATOR):
-        for task in rows.loc[~away & (rows["regime"] == regime), "task"].unique():
-            of_task = rows[~away & (rows["regime"] == regime) & (rows["task"] == task)]
-            parts += [f"## {task}, {regime}", _methods(of_task, [*delays])]
-    for method in rows.loc[away, "method"].unique():
-        flights = _flights(rows[away & (rows["method"] == method)])
-        parts += [f"## {method}, flown where it was not trained", flights]
-    return "\n\n".join(parts) + "\n"
-
-
-def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
-    """A line for each method, the best one under the first delay first, with a column for each
-    delay."""
-    present = [delay for delay in delays if (rows["delay"] == delay).any()]
-    means = rows.pivot_table(values="return", index="method", columns="delay")
-    lines = []
-    for method in means.sort_values(present, ascending=False).index:
-        runs = rows[rows["method"] == method]
-        cells = [_mean(runs[runs["delay"] == delay]) for delay in present]
-        one = runs.iloc[0]
-        steps = f"{runs['frames'].max() / 1e6:.2g}"
-        size = f"{int(one['parameters']):,}"
-        version = f"{one['damian']} ({str(one['commit'])[:7]})".removesuffix(" (several)")
-        lines.append((method, *cells, one["authors"], steps, size, version))
-    return markdown_table(
-        ["method", *present, "authors", "million steps", "parameters", "damian"], lines
-    )
-
-
-def _flights(rows: pd.DataFrame) -> str:
-    """A line for each held-out task, with a column for each delay of the training."""
-    trained = [*rows["delay"].unique()]
-    lines = []
-    for task, runs in rows.groupby("task", sort=False):
-        lines.append((task, *(_mean(runs[runs["delay"] == delay]) for delay in trained)))
-    return markdown_table(["flown in", *(f"trained under {delay}" for delay in trained)], lines)
-
-
-def _mean(runs: pd.DataFrame) -> str:
-    """Mean return with its interval and the number of seeds."""
-    if runs.empty:
-        return "-"
-    return f"{shown(means_over_seeds(runs[['return']]), 'return')} ({len(runs)})"
