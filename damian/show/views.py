@@ -165,26 +165,6 @@ class MapView:
     def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
         return self.axis.add_collection(PolyCollection(corners, **style))
 
-    def _marks_of_others(self, uavs: list[Uav]) -> list[Any]:
-        places = np.transpose([uav.path[-1, :2] for uav in uavs])
-        marks = self.axis.scatter(*places, s=_SMALL**2, color=OTHER, zorder=3.5)
-        marks.set_paths(
-            [DART.transformed(Affine2D().rotate(-uav.heading).scale(0.5)) for uav in uavs]
-        )
-        return [marks]
-
-    def _mark_of(self, uav: Uav) -> list[Any]:
-        """A dart that points where the UAV flies, and a line to where the server believes it to
-        be."""
-        true = uav.path[-1, :2]
-        dart = DART.transformed(Affine2D().rotate(-uav.heading))
-        style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
-        drawn = self.axis.plot(*true, marker=dart, color=uav.colour, **style)
-        if uav.age > 0:
-            line = {"color": uav.colour, "linewidth": 1.1, "zorder": 3}
-            drawn += self.axis.plot(*np.stack([true, uav.believed]).T, ":", **line)
-        return drawn
-
 
 def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> None:
     """Draw a row for each of these UAVs, in its colour, with its messages over the time of
