@@ -152,8 +152,8 @@ class FlyConfig(TrainConfig):
     )
     formats: list[str] = setting(
         ["gif", "png"],
-        "What to make of each: films (gif, mp4), a figure (png), or a page (html).",
-        choices=("gif", "mp4", "png", "html"),
+        "What to make of each: a film (gif), a figure (png), a page (html).",
+        choices=("gif", "png", "html"),
     )
     shown: list[str] = setting(
         [],

@@ -1,22 +1,11 @@
 """Writes an episode as what people look at: film, figure and page."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib.animation import FFMpegWriter
-
-from damian.common import checks
 from damian.show.episode import Episode
 from damian.show.film import save_film, save_picture
 from damian.show.replay_page import save_page
-
-
-def check_films(formats: Collection[str]) -> None:
-    """Refuse a film that no program here can write."""
-    films = "mp4" not in formats or FFMpegWriter.isAvailable()
-    checks.require(
-        films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif"
-    )
 
 
 def save_episode(
@@ -24,16 +13,15 @@ def save_episode(
 ) -> None:
     """Write an episode to ``file`` with the end ``.json``, and beside it all formats.
 
-    Pictures and films (gif, mp4) tell the UAVs that are ``shown`` from the others.
+    Pictures and films tell the UAVs that are ``shown`` from the others.
     """
     episode.save(file.with_suffix(".json"))
     if "png" in formats:
         save_picture(episode, file.with_suffix(".png"), shown)
     if "html" in formats:
         save_page([episode], file.with_suffix(".html"))
-    for kind in ("gif", "mp4"):
-        if kind in formats:
-            save_film(episode, file.with_suffix(f".{kind}"), shown)
+    if "gif" in formats:
+        save_film(episode, file.with_suffix(".gif"), shown)
 
 
 def summary(name: str, episode: Episode) -> str:

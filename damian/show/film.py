@@ -8,7 +8,6 @@ from typing import Any, cast
 import matplotlib
 import numpy as np
 import torch
-from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from tensordict import TensorDictBase
 
-from damian.common.atomic_files import not_linked, write_atomically
+from damian.common.atomic_files import write_atomically
 from damian.common.plotting import STYLE, save_figure
 from damian.envs.uav_env import UavEnv
 from damian.show.episode import Episode, at_instant, episode_of
@@ -34,16 +33,9 @@ _STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5}
 
 
 def save_film(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
-    """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path."""
+    """Write a film of an episode as a GIF."""
     film = Film(episode, shown)
     steps = range(episode.n_steps + 1)
-    if path.suffix != ".gif":
-        writer = FFMpegWriter(STEPS_PER_SECOND)
-        with writer.saving(film.figure, str(not_linked(path)), DPI):
-            for step in [*steps, *[episode.n_steps] * LAST_STEPS]:
-                film.draw(step)
-                writer.grab_frame()
-        return
     pictures = (Image.fromarray(film.frame(step)) for step in steps)
     kept = {
         "method": Image.Quantize.MAXCOVERAGE,
