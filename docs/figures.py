@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import torch
+from leaderboard import FEWEST_SEEDS, NUMBERS, WORDS, delaybench
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
@@ -32,14 +33,12 @@ from damian.compare.comparison import (
     means_over_seeds,
     shown,
 )
-from damian.compare.leaderboard import FEWEST_SEEDS, NUMBERS, WORDS
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.recipes import cli
 from damian.recipes.compare import includes
 from damian.recipes.shared.environments import compose_scenario
 from damian.recipes.shared.sweeps import stored_results
-from damian.recipes.submit import delaybench
 from damian.runs.run_folder import RANDOM
 from damian.show.episode import record
 from damian.show.frame import frame_of

@@ -224,19 +224,3 @@ class ResultsConfig(Settings):
         self.refuse(
             len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare"
         )
-
-
-@dataclass
-class SubmitConfig(Settings):
-    """All settings of ``damian submit``."""
-
-    folder: str = setting("", "Folder of the comparison that has made the runs.")
-    method: str = setting("", "Name of the method in it.")
-    authors: str = setting("", "Who has made the method, separated by commas.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("folder", "method", "authors"):
-            self.refuse(
-                not getattr(self, name), name, "is missing: damian submit --help shows an example"
-            )
