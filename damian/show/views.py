@@ -38,9 +38,8 @@ _CORNERS = 48
 _SMALL = 8.0
 """Size of the mark of one of many [points]."""
 _HALO = [withStroke(linewidth=1.8, foreground="white")]
-_NAME = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points", "path_effects": _HALO}
-_AROUND = np.array([(1, 0.5), (1, -0.5), (-1, 0.5), (-1, -0.5), (0, 1), (0, -1), (1, 1), (-1, -1)])
-"""Where a name may stand beside its mark."""
+_NAME: dict[str, Any] = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points"}
+_NAME |= {"path_effects": _HALO, "ha": "center", "va": "center"}
 
 
 class MapView:
@@ -121,45 +120,16 @@ class MapView:
         return drawn
 
     def _names(self, frame: Frame) -> list[Any]:
-        """Name UAVs and rings where their names cover least."""
-        axis = self.axis
-        axis.apply_aspect()
+        """Name UAVs and rings, each in a direction of its own: names at one place lie apart."""
         uavs = [uav for uav in frame.uavs if uav.chosen]
-        named = [(uav, uav.path[-1, :2], _short(uav.id)) for uav in uavs]
-        named += [
-            (uav, uav.believed, f"{_short(uav.id)}, {uav.age:g} s") for uav in uavs if uav.age > 0
-        ]
-        shown = np.array([place for _, place, _ in named])
-        points = axis.transData.transform(shown) * 72 / axis.figure.dpi
-        covered = [np.stack([points - 5, points + 5], 1)]
         drawn: list[Any] = []
-        for (uav, _, text), anchor, place in zip(named, shown, points, strict=True):
-            half = np.array([2.4 * len(text), 4.0])
-            middles = place + np.concatenate([_AROUND * (half + near) for near in (5, 13, 24)])
-            middles = middles.clip(
-                half, np.multiply(axis.figure.bbox.size, 72 / axis.figure.dpi) - half
-            )
-            boxes = np.stack([middles - half, middles + half], 1)
-            low, high = np.concatenate(covered).transpose(1, 0, 2)
-            common = np.minimum(boxes[:, None, 1], high) - np.maximum(boxes[:, None, 0], low)
-            best = int(common.clip(0).prod(-1).sum(-1).round().argmin())
-            covered.append(boxes[best : best + 1])
-            line = {
-                "arrowstyle": "-",
-                "color": uav.ink,
-                "linewidth": 0.5,
-                "shrinkA": 0,
-                "shrinkB": 3,
-            }
-            style: dict[str, Any] = {
-                "color": uav.ink,
-                "arrowprops": line,
-                "ha": "center",
-                "va": "center",
-            }
-            drawn.append(
-                axis.annotate(text, tuple(anchor), tuple(middles[best] - place), **style, **_NAME)
-            )
+        for number, uav in enumerate(uavs):
+            name = _short(uav.id)
+            ring = [(uav.believed, f"{name}, {uav.age:g} s")] if uav.age > 0 else []
+            for half, (place, text) in enumerate([(uav.path[-1, :2], name), *ring]):
+                turn = np.pi * (2 * (number + 0.2) / len(uavs) + half)
+                away = ((10 + 2.4 * len(text)) * np.cos(turn), 13 * np.sin(turn))
+                drawn.append(self.axis.annotate(text, place, away, color=uav.ink, **_NAME))
         return drawn
 
     def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:

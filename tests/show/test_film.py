@@ -87,7 +87,7 @@ def test_charging_places_are_drawn_and_explained():
 def test_each_of_many_uavs_and_rings_has_a_mark_and_a_name_beside_the_others():
     film = Film(crowd(age=np.ones((4, 20))), [*map(str, range(20))])
     names = named(film)
-    texts = [*map(str, range(20)), *(f"{uav}, 1 s" for uav in range(20))]
+    texts = [text for uav in range(20) for text in (f"{uav}", f"{uav}, 1 s")]
     assert [name.get_text() for name in names] == texts
     assert len({tuple(np.round((*name.xy, *name.xyann), 2)) for name in names}) == 40
     assert len({(uav.colour, uav.edge) for uav in frame_of(film.episode, 0).uavs}) == 20
