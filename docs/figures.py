@@ -4,6 +4,7 @@ delaybench.
 python docs/figures.py    (make pictures)
 """
 
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import torch
+from leaderboard import FEWEST_SEEDS, NUMBERS, WORDS, delaybench
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
@@ -19,16 +21,24 @@ from torchrl.envs import GymEnv, TransformedEnv
 from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
 from damian.baselines.script import script_policy
 from damian.common.plotting import COLOURS, STYLE
-from damian.common.tables import read_csv
-from damian.compare.comparison import ENDS, RUN, TRAINED, Comparison
-from damian.compare.leaderboard import FEWEST_SEEDS, NUMBERS, WORDS, leaderboard
+from damian.common.tables import markdown_table, read_csv
+from damian.compare.comparison import (
+    ENDS,
+    HELD_OUT_MARK,
+    LATE_DATA,
+    RUN,
+    SIMULATOR,
+    TRAINED,
+    Comparison,
+    means_over_seeds,
+    shown,
+)
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.recipes import cli
 from damian.recipes.compare import includes
 from damian.recipes.shared.environments import compose_scenario
 from damian.recipes.shared.sweeps import stored_results
-from damian.recipes.submit import delaybench
 from damian.runs.run_folder import RANDOM
 from damian.show.episode import record
 from damian.show.frame import frame_of
@@ -205,6 +215,56 @@ def leaderboard_page() -> str:
     facts = submitted.drop(columns=[*RUN[:2], "seed", *NUMBERS]).drop_duplicates("method")
     few = ours.merge(facts[facts["authors"] == "DAMIAN"], on="method")
     return f"{LEADERBOARD}\n{leaderboard([submitted, few], delaybench().delays)}"
+
+
+def leaderboard(submissions: Sequence[pd.DataFrame], delays: Collection[str]) -> str:
+    """Tables of all submissions, as Markdown: for each track and task, and of flights elsewhere."""
+    rows = pd.concat(submissions, ignore_index=True)
+    away = rows["task"].str.contains(HELD_OUT_MARK, regex=False)
+    parts = []
+    for regime in (LATE_DATA, SIMULATOR):
+        for task in rows.loc[~away & (rows["regime"] == regime), "task"].unique():
+            of_task = rows[~away & (rows["regime"] == regime) & (rows["task"] == task)]
+            parts += [f"## {task}, {regime}", _methods(of_task, [*delays])]
+    for method in rows.loc[away, "method"].unique():
+        flights = _flights(rows[away & (rows["method"] == method)])
+        parts += [f"## {method}, flown where it was not trained", flights]
+    return "\n\n".join(parts) + "\n"
+
+
+def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
+    """A line for each method, the best one under the first delay first, with a column for each
+    delay."""
+    present = [delay for delay in delays if (rows["delay"] == delay).any()]
+    means = rows.pivot_table(values="return", index="method", columns="delay")
+    lines = []
+    for method in means.sort_values(present, ascending=False).index:
+        runs = rows[rows["method"] == method]
+        cells = [_mean(runs[runs["delay"] == delay]) for delay in present]
+        one = runs.iloc[0]
+        steps = f"{runs['frames'].max() / 1e6:.2g}"
+        size = f"{int(one['parameters']):,}"
+        version = f"{one['damian']} ({str(one['commit'])[:7]})".removesuffix(" (several)")
+        lines.append((method, *cells, one["authors"], steps, size, version))
+    return markdown_table(
+        ["method", *present, "authors", "million steps", "parameters", "damian"], lines
+    )
+
+
+def _flights(rows: pd.DataFrame) -> str:
+    """A line for each held-out task, with a column for each delay of the training."""
+    trained = [*rows["delay"].unique()]
+    lines = []
+    for task, runs in rows.groupby("task", sort=False):
+        lines.append((task, *(_mean(runs[runs["delay"] == delay]) for delay in trained)))
+    return markdown_table(["flown in", *(f"trained under {delay}" for delay in trained)], lines)
+
+
+def _mean(runs: pd.DataFrame) -> str:
+    """Mean return with its interval and the number of seeds."""
+    if runs.empty:
+        return "-"
+    return f"{shown(means_over_seeds(runs[['return']]), 'return')} ({len(runs)})"
 
 
 def plot_matrix(path: Path) -> None:

@@ -28,7 +28,7 @@ from damian.common.tables import write_csv
 from damian.common.text_files import named
 from damian.compare.comparison import HELD_OUT_MARK, NOT_LATE, RUN, Comparison
 from damian.compare.config import EPISODES, SEEDS, CompareConfig, HeldOut
-from damian.compare.figures import plot_curves, plot_profiles, plot_scores
+from damian.compare.figures import plot_curves, plot_scores
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.measures import BUILT_IN
@@ -58,7 +58,6 @@ from .train import train
 
 TABLE = "table.csv"
 CURVES = "curves.png"
-PROFILES = "profiles.png"
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
@@ -177,7 +176,6 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results.rows, missing)))
     plot_curves(comparison, folder / CURVES)
     plot_scores(comparison, folder / FIGURE)
-    plot_profiles(comparison, folder / PROFILES)
 
 
 def _notes(config: CompareConfig, rows: pd.DataFrame, missing: Sequence[str]) -> list[str]:

@@ -176,12 +176,8 @@ class FlyConfig(TrainConfig):
     )
     formats: list[str] = setting(
         ["gif", "png"],
-        "What to make of each: films (gif, mp4), a figure (png), a page (html), or geojson for map "
-        "tools.",
-        choices=("gif", "mp4", "png", "html", "geojson"),
-    )
-    views: list[str] = setting(
-        ["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d")
+        "What to make of each: a film (gif), a figure (png), a page (html).",
+        choices=("gif", "png", "html"),
     )
     shown: list[str] = setting(
         [],
@@ -252,19 +248,3 @@ class ResultsConfig(Settings):
         self.refuse(
             len(self.folders) not in (1, 2), "folders", "is not one folder, or two to compare"
         )
-
-
-@dataclass
-class SubmitConfig(Settings):
-    """All settings of ``damian submit``."""
-
-    folder: str = setting("", "Folder of the comparison that has made the runs.")
-    method: str = setting("", "Name of the method in it.")
-    authors: str = setting("", "Who has made the method, separated by commas.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("folder", "method", "authors"):
-            self.refuse(
-                not getattr(self, name), name, "is missing: damian submit --help shows an example"
-            )

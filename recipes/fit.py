@@ -6,7 +6,6 @@ damian fit log=journals/north.jsonl clock.simulation=0.5s           (the journal
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,9 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from damian.common.atomic_files import write_atomically
-from damian.common.plotting import COLOURS
 from damian.common.text_files import named
-from damian.compare.figures import save
 from damian.delays.clocks import are_right, check_clocks, in_order, note_on
 from damian.delays.law_fit import LawFit, fit_laws
 from damian.delays.logs import delays_of, read_log, steps_of, trace_rows
@@ -26,8 +23,7 @@ from .config import FitConfig
 
 
 def fit(config: FitConfig, folder: Path) -> None:
-    """Write the delays of a log of reports as a trace, and tell and draw which law fits them
-    best."""
+    """Write the delays of a log of reports as a trace, and tell which law fits them best."""
     log = Path(config.log)
     dt = config.clock.dt
     messages = in_order(read_log(log))
@@ -41,9 +37,7 @@ def fit(config: FitConfig, folder: Path) -> None:
     write_atomically(trace, "\n".join(["delay", *trace_rows(delays), ""]))
     print(summary(delays))
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
-    laws = fit_laws(steps_of(delays, dt))
-    print(law_summary(*laws, dt))
-    plot_fit(delays, laws[0], dt, folder / "fit.png")
+    print(law_summary(*fit_laws(steps_of(delays, dt)), dt))
     print(f"results: {folder}")
 
 
@@ -83,29 +77,6 @@ def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
     if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
         text += "\na bad fit: take the trace"
     return text
-
-
-def plot_fit(messages: pd.DataFrame, law: LawFit, dt: float, path: Path) -> None:
-    """Draw the share of the messages that are later than a delay, or lost: survival curves.
-
-    The law has a point at whole steps of ``dt`` seconds, to which a simulation rounds delays up.
-    """
-    delays = np.sort(messages.delay.dropna())
-    recorded = 1 - np.arange(len(delays) + 1) / len(messages)
-    later = 1 - law.chances[:-1].cumsum()
-    lost = law.chances[-1]
-    shown = later > max(lost, 0.1 / len(messages))  # rounding leaves a rest where nothing is later
-
-    def panel(axis: Any, _: str) -> None:
-        axis.step([0, *delays], recorded, where="post", color=COLOURS[0], label="recorded")
-        name = law.written["law"] if isinstance(law.written, dict) else "constant"
-        style: Any = {"markersize": 4, "color": COLOURS[1], "label": f"best law: {name}"}
-        axis.plot(np.arange(len(later))[shown] * dt, later[shown], "o", **style)
-        axis.set(xlabel="delay [s]", ylabel="share of messages later, or lost", yscale="log")
-        if lost:
-            axis.axhline(lost, color="0.5", linestyle=":", label="lost")
-
-    save(path, ["fit"], panel, (4.2, 3.0))
 
 
 @cli.program("fit")

@@ -1,7 +1,7 @@
 """Fly episodes and keep each as file, film, figure or page: what is true, and what the server
 believes.
 
-damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
+damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[gif]"
 damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"   (in one page, side by side)
 damian fly scenario=coverage agents=100 "shown=[4,17]"    (films tell these UAVs from the others)
 """
@@ -23,8 +23,7 @@ from damian.envs.uav_env import EXTRAS
 from damian.models.memory import add_recurrent_state
 from damian.runs.run_folder import PLANNER, SCRIPT
 from damian.show.episode import Episode, record
-from damian.show.files import check_films, save_episode, summary
-from damian.show.geojson import origin_of
+from damian.show.files import save_episode, summary
 from damian.show.replay_page import save_page
 
 from . import cli
@@ -66,18 +65,15 @@ def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:
 
 def show(config: FlyConfig, folder: Path) -> None:
     """Replay or fly episodes, and fill the run folder."""
-    check_films(config.formats)
     if config.replay:
         page = folder / "replay.html"
         save_page([Episode.load(Path(file)) for file in config.replay], page)
         print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
         return
     episodes = kept(fly(config), config.keep)
-    if "geojson" in config.formats:
-        origin_of(next(iter(episodes.values())))  # refuses a region without a place on Earth
     save_config(config, folder)
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
-        save_episode(episode, folder / name, config.formats, config.views, config.shown)
+        save_episode(episode, folder / name, config.formats, config.shown)
     for name, episode in episodes.items():
         print(summary(name, episode))
 

@@ -22,15 +22,7 @@ from damian.common.text_files import read_text
 from damian.compare.config import CompareConfig
 from damian.learners.config import LEARNERS
 
-from .config import (
-    EvaluateConfig,
-    ExportConfig,
-    FitConfig,
-    FlyConfig,
-    ResultsConfig,
-    SubmitConfig,
-    TrainConfig,
-)
+from .config import EvaluateConfig, ExportConfig, FitConfig, FlyConfig, ResultsConfig, TrainConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 """Folder of the configuration files: one for each program, and in folders one for each option of a
@@ -43,7 +35,6 @@ SCHEMAS: dict[str, type] = {
     "fit": FitConfig,
     "export": ExportConfig,
     "results": ResultsConfig,
-    "submit": SubmitConfig,
 }
 """Settings of the programs."""
 SYNONYMS = {

@@ -63,8 +63,6 @@ def commands(text: str) -> list[list[str]]:
 def shortened(words: list[str]) -> list[str]:
     """A command with tiny numbers."""
     words = [INSTEAD.get(word, word) for word in words]
-    if shutil.which("ffmpeg") is None:
-        words = [word.replace(",mp4", "") for word in words]
     if any(word.startswith("resume=") for word in words):
         return [re.sub(r"^frames=.*", "frames=128", word) for word in words]
     if any(word.startswith("replay=") for word in words):  # nothing is flown

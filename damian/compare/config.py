@@ -16,8 +16,7 @@ SEEDS = 10
 """Seeds of a comparison, if their number is not given; with fewer, a report is marked as
 developing."""
 EPISODES = 100
-"""With fewer episodes in an evaluation a report is marked as developing, and a submission is
-refused."""
+"""With fewer episodes in an evaluation a report is marked as developing."""
 SET_BY_COMPARISON = ("seed", "resume", "checkpoint", "logger", "hydra")
 """Keys that a comparison sets for each of its runs."""
 

@@ -1,5 +1,4 @@
-"""Figures of trainings, sweeps and comparisons: learning curves, scores with intervals,
-profiles."""
+"""Figures of trainings, sweeps and comparisons: learning curves, and scores with intervals."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,7 @@ from pandas.api.types import is_numeric_dtype
 
 from damian.common.plotting import STYLE, save_figure
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method, sign_of
-from damian.compare.statistics import Floats, bootstrap, normalised
+from damian.compare.statistics import Floats, bootstrap
 from damian.runs.metrics import Evaluation
 from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED, UNTRAINED
 
@@ -131,75 +130,27 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
     save(path, _places(comparison), panel, (3.4, 2.8), width=3)
 
 
-def plot_profiles(comparison: Comparison, path: Path) -> None:
-    """Draw performance profiles: the share of runs, of all tasks, delays and seeds, above each
-    J_norm.
-
-    Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical precipice". A
-    method without runs of some task or delay is left out.
-    """
-    scores = [comparison.scores(*place) for place in _places(comparison)]
-    names = [name for name in comparison.methods if all(name in found for found in scores)]
-
-    def panel(axis: Axes, _: str) -> None:
-        levels = np.linspace(-0.1, 1.1, _POINTS)
-        for name in names:
-            runs = []
-            for found in scores:
-                undelayed, random = found.iloc[:, :2].mean().to_numpy()
-                runs.append(normalised(found[name].to_numpy(), undelayed, random))
-            values = np.concatenate(runs)
-            known = values[~np.isnan(values)]
-            share = (known[:, None] > levels).mean(0)
-            axis.plot(levels, share, **_line_of(comparison, name))
-        axis.set(xlabel="J_norm (random 0, undelayed 1)", ylabel="share of runs above")
-
-    save(path, ["all"] if len(scores) > 1 else [], panel, (4.0, 3.0))
-
-
 def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
-    """Draw the returns of a sweep (lines of ``means``) over one setting, in a panel for each value
-    of others.
+    """Draw the returns of a sweep (lines of ``means``) with their 95 % intervals over one setting.
 
-    The setting along the axis has most values, and numbers if any has. The trained policy stands
-    with its 95 % intervals before those of the other panels, in grey. There are 40 panels at most.
+    That along the axis has most values, and numbers if any has; each value of the others, and each
+    policy, has a curve.
     """
     fitness = {key: (is_numeric_dtype(lines[key]), lines[key].nunique()) for key in groups}
-    along = max(groups, key=fitness.__getitem__, default="policy")
-    places: Any = lines[along]
-    names = [] if is_numeric_dtype(places) else [*places.unique()]
-    if names:
-        places = places.map(names.index)
-    others = [key for key in groups if key != along]
-    titles = [
-        "\n".join(f"{key}={line[key]}" for key in others) for line in lines.to_dict("records")
-    ]
-    placed = lines.assign(x=places, title=titles).sort_values("x")
-    columns = ["x", *("return" + end for end in ENDS)]
-    found = placed.groupby(["title", "policy"], sort=False)
-    curves = {key: each[columns].to_numpy().T for key, each in found}
+    along = max(groups, key=fitness.__getitem__, default="")
+    names = [*(key for key in groups if key != along), "policy"]
+    compared = lines[lines["policy"].isin([TRAINED, SCRIPT, RANDOM])]
 
-    def panel(axis: Axes, title: str) -> None:
-        for (place, policy), (x, value, low, high) in curves.items():
-            style: dict[str, Any] = {"color": METHOD_COLOURS[0], "marker": "o", "markersize": 4}
-            if policy == TRAINED and place == title:
-                error = np.nan_to_num([value - low, high - value])
-                axis.errorbar(x, value, error, label=policy, **style)
-            elif policy == TRAINED:
-                axis.plot(x, value, color="0.85", zorder=0, label="other panels")
-            elif place == title and policy in (SCRIPT, RANDOM):
-                style = _LEVEL | {"label": policy, "linestyle": "-." if policy == SCRIPT else ":"}
-                axis.plot(x, value, **style)
-        first: Any = axis.get_subplotspec()
-        axis.set(title=title, xlabel=along, ylabel="return" if first.is_first_col() else "")
-        if names:
-            axis.set_xticks(range(len(names)), [str(name)[:20] for name in names])
-            axis.margins(x=0.2)
-        elif 0 < 100 * places.min() <= places.max():
-            axis.set_xscale("log")
+    def panel(axis: Axes, _: str) -> None:
+        for values, found in compared.groupby(names, sort=False):
+            curve = found.sort_values(along)
+            value, low, high = (curve["return" + end].to_numpy() for end in ENDS)
+            error = np.nan_to_num([value - low, high - value])
+            label = " ".join(map(str, values))
+            axis.errorbar(curve[along], value, error, marker="o", markersize=4, label=label)
+        axis.set(xlabel=along, ylabel="return")
 
-    shown = list(dict.fromkeys(titles))[:40] if groups else []
-    save(path, shown, panel, (2.4, 2.2), width=4, sharey=True)
+    save(path, [*filter(None, [along])], panel, (4.4, 3.2))
 
 
 def look(methods: Mapping[str, Method], method: str) -> dict[str, Any]:
@@ -220,7 +171,6 @@ def save(
     draw: Callable[[Axes, Panel], None],
     size: tuple[float, float],
     width: int = 1,
-    sharey: bool = False,
 ) -> None:
     """Draw panels of this size [inches] in rows of ``width``, with one legend to the right of
     them."""
@@ -232,7 +182,7 @@ def save(
     with matplotlib.rc_context(STYLE):
         whole = (size[0] * width + 1.2, size[1] * height)
         figure = Figure(figsize=whole, layout="constrained")
-        axes = figure.subplots(height, width, squeeze=False, sharey=sharey).flat
+        axes = figure.subplots(height, width, squeeze=False).flat
         drawn: dict[str, Any] = {}
         for axis, panel in zip(axes, panels, strict=False):
             draw(axis, panel)

@@ -10,8 +10,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Space, flatten, flatten_space
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from damian.common import checks, counter_rng
@@ -108,113 +107,6 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         observed = observation if self._in_parts else {"": observation}
         told, rewards, more = self._delays.step(observed, {"": reward}, ended)
         return told[""], rewards[""], terminated, truncated, info | more[""]
-
-
-class DelayVectorWrapper(gymnasium.vector.VectorWrapper):
-    """Delays the B worlds of a Gymnasium vector environment as one batch, each as ``DelayWrapper``
-    does.
-
-    Its arguments are those of ``DelayWrapper``; the parts of an observation have one law. Each
-    world draws its own delays. New episodes begin as those of ``env`` do, in the same step or in
-    the next one.
-    """
-
-    def __init__(
-        self,
-        env: gymnasium.vector.VectorEnv[Any, Any, Any],
-        observation: Any = 0,
-        action: Any = 0,
-        reward: Any = 0,
-        *,
-        loss: Any = 0.0,
-        history: int = 0,
-        timeline: int = 0,
-        default: Any = None,
-        dt: float = 1.0,
-    ) -> None:
-        super().__init__(env)
-        mode = env.metadata.get("autoreset_mode")
-        self._worlds = [str(i) for i in range(env.num_envs)]
-        self._at_once = mode == AutoresetMode.SAME_STEP
-        known = self._at_once or mode == AutoresetMode.NEXT_STEP
-        should = "is no autoreset_mode in which episodes begin by themselves"
-        checks.require(known, "env", mode, should)
-        told: ByName = {
-            "observation": observation,
-            "action": action,
-            "reward": reward,
-            "loss": loss,
-        }
-        told |= {"history": history, "timeline": timeline, "dt": dt}
-        told["default"] = {} if default is None else dict.fromkeys(self._worlds, default)
-        space = env.single_observation_space
-        observed = dict.fromkeys(self._worlds, space)
-        acting = dict.fromkeys(self._worlds, env.single_action_space)
-        self._delays = Delays(observed, acting, told)
-        self.single_observation_space = self._delays.space("0", space)
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict]:
-        observations, infos = self.env.reset(seed=seed, options=options)
-        self._over: list[str] = []
-        firsts = self._by_world(self.env.observation_space, observations)
-        told, more = self._delays.reset(firsts, seed)
-        observations = self._batch(self.single_observation_space, told)
-        return observations, self._with(infos, more)
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        chosen = self._by_world(self.action_space, actions)
-        begin = self._over
-        going = {world: action for world, action in chosen.items() if world not in begin}
-        acted = chosen | self._delays.act(going)
-        executed = self._batch(self.env.single_action_space, acted)
-        observations, rewards, terminated, truncated, infos = self.env.step(executed)
-        now = self._by_world(self.env.observation_space, observations)
-        ended = np.flatnonzero(terminated | truncated)
-        over = [self._worlds[i] for i in ended]
-        final = {}
-        if self._at_once:
-            final = {world: infos["final_obs"][int(world)] for world in over}
-        paid = dict(zip(chosen, rewards.tolist(), strict=True))
-        observed = now | final
-        seen = {w: observed[w] for w in going}
-        earned = {w: paid[w] for w in going}
-        told, received, more = self._delays.step(seen, earned, over)
-        if self._at_once:
-            last = {w: {"final_obs": told[w], "final_info": more[w]} for w in over}
-            begin = over
-            infos = self._with(infos, last)
-        else:
-            self._over = over
-        if begin:
-            first, at_first = self._delays.begin({w: now[w] for w in begin})
-            told |= first
-            more |= at_first
-        paid |= received
-        rewards = np.array([*paid.values()], rewards.dtype)
-        observations = self._batch(self.single_observation_space, told)
-        infos = self._with(infos, more)
-        return observations, rewards, terminated, truncated, infos
-
-    def _by_world(self, space: Space[Any], things: Any) -> ByName:
-        """A batch as a dict by world."""
-        each = iterate(space, things)
-        return dict(zip(self._worlds, each, strict=True))
-
-    def _batch(self, space: Space[Any], things: ByName) -> Any:
-        """Things of all worlds in one batch."""
-        empty = create_empty_array(space, len(self._worlds))
-        in_order = [things[world] for world in self._worlds]
-        return concatenate(space, in_order, empty)
-
-    def _with(self, infos: ByName, more: ByName) -> ByName:
-        """Infos of the batch, which the environment may keep, with those of some worlds."""
-        infos = _copied(infos)
-        for world, info in more.items():
-            infos = self._add_info(infos, info, int(world))
-        return infos
 
 
 class Delays:
@@ -486,17 +378,6 @@ def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], Numbers, Numbers]:
     low = np.where(bounded, low, np.float32(0))
     width = np.where(bounded & (width > 0), width, np.float32(1))
     return space, low, width
-
-
-def _copied(infos: ByName) -> ByName:
-    """A copy of infos down to their arrays; what else they hold cannot always be copied."""
-    copied = dict(infos)
-    for name, each in infos.items():
-        if isinstance(each, dict):
-            copied[name] = _copied(each)
-        elif isinstance(each, np.ndarray):
-            copied[name] = each.copy()
-    return copied
 
 
 def _by_name(given: Any) -> bool:

@@ -26,7 +26,7 @@ damian.models.memory: AgentGRU
 damian.server.belief: report_rows
 damian.server.server: Features, Server
 damian.show.episode: Episode, at_instant, episode_of
-damian.show.files: check_films, save_episode, summary
+damian.show.files: save_episode, summary
 damian.show.geojson: on_earth
 damian.show.replay_page: PAGE
 damian.transforms: ObservationTimeline, StatefulTransform

@@ -56,12 +56,11 @@ class Flight:
         num_worlds: int,
         seed: int,
         render_mode: str | None = None,
-        view: str = "2d",
     ) -> None:
         if render_mode is not None:
             checks.one_of("render_mode", render_mode, RENDER_MODES)
         self.env = make_env(scenario, num_worlds, seed, extras=EXTRAS if render_mode else ())
-        self.film = LiveFilm(self.env.uav_env, view) if render_mode else None
+        self.film = LiveFilm(self.env.uav_env) if render_mode else None
 
     def observation_space(self, agent: int) -> Box:
         """What an agent observes, [F]."""

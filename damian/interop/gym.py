@@ -25,7 +25,6 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides
             the rest.
         render_mode: ``rgb_array``, or None.
-        view: of the pictures: ``2d``, from above, or ``3d``.
     """
 
     metadata = METADATA
@@ -35,10 +34,9 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         scenario: ScenarioConfig,
         seed: int = 0,
         render_mode: str | None = None,
-        view: str = "2d",
     ) -> None:
         one_uav(scenario)
-        self.flight = Flight(scenario, 1, seed, render_mode, view)
+        self.flight = Flight(scenario, 1, seed, render_mode)
         self.render_mode = render_mode
         self.observation_space = self.flight.observation_space(0)
         self.action_space = self.flight.action_space()

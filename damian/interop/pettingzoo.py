@@ -30,10 +30,9 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
         scenario: ScenarioConfig,
         seed: int = 0,
         render_mode: str | None = None,
-        view: str = "2d",
     ) -> None:
         self.metadata = {**METADATA, "name": "damian_v0", "is_parallelizable": True}
-        self.flight = Flight(scenario, 1, seed, render_mode, view)
+        self.flight = Flight(scenario, 1, seed, render_mode)
         self.render_mode = render_mode
         self.possible_agents = [f"uav_{number}" for number in range(scenario.agents)]
         self.agents: list[str] = []

@@ -1,1 +1,1 @@
-"""An episode as data, and what shows it: films, figures, GeoJSON and replay pages."""
+"""An episode as data, and what shows it: films, figures and replay pages."""

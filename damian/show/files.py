@@ -1,46 +1,27 @@
-"""Writes an episode as what people look at: film, figure, page and GeoJSON."""
+"""Writes an episode as what people look at: film, figure and page."""
 
-from collections.abc import Collection, Sequence
-from itertools import product
+from collections.abc import Sequence
 from pathlib import Path
 
-from matplotlib.animation import FFMpegWriter
-
-from damian.common import checks
 from damian.show.episode import Episode
 from damian.show.film import save_film, save_picture
-from damian.show.geojson import save_geojson
 from damian.show.replay_page import save_page
 
 
-def check_films(formats: Collection[str]) -> None:
-    """Refuse a film that no program here can write."""
-    films = "mp4" not in formats or FFMpegWriter.isAvailable()
-    checks.require(
-        films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif"
-    )
-
-
 def save_episode(
-    episode: Episode, file: Path, formats: Sequence[str], views: Sequence[str], shown: Sequence[str]
+    episode: Episode, file: Path, formats: Sequence[str], shown: Sequence[str]
 ) -> None:
     """Write an episode to ``file`` with the end ``.json``, and beside it all formats.
 
-    ``views`` are those of its films (gif, mp4), which tell the UAVs that are ``shown`` from the
-    others.
+    Pictures and films tell the UAVs that are ``shown`` from the others.
     """
     episode.save(file.with_suffix(".json"))
     if "png" in formats:
         save_picture(episode, file.with_suffix(".png"), shown)
     if "html" in formats:
         save_page([episode], file.with_suffix(".html"))
-    if "geojson" in formats:
-        save_geojson(episode, file.with_suffix(".geojson"))
-    films = [kind for kind in formats if kind in ("gif", "mp4")]
-    for kind, view in product(films, views):
-        save_film(
-            episode, file.with_name(f"{file.name}{'_3d' * (view == '3d')}.{kind}"), view, shown
-        )
+    if "gif" in formats:
+        save_film(episode, file.with_suffix(".gif"), shown)
 
 
 def summary(name: str, episode: Episode) -> str:

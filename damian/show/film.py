@@ -8,7 +8,6 @@ from typing import Any, cast
 import matplotlib
 import numpy as np
 import torch
-from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -16,16 +15,16 @@ from numpy.typing import NDArray
 from PIL import Image
 from tensordict import TensorDictBase
 
-from damian.common.atomic_files import not_linked, write_atomically
+from damian.common.atomic_files import write_atomically
 from damian.common.plotting import STYLE, save_figure
 from damian.envs.uav_env import UavEnv
 from damian.show.episode import Episode, at_instant, episode_of
 from damian.show.frame import INK, chosen_of, frame_of
-from damian.show.views import MapView, SpaceView, draw_messages, height_of_rows, legend_marks
+from damian.show.views import MapView, draw_messages, height_of_rows, legend_marks
 
 DPI = 100
 WIDTH, HEIGHT = 7.2, 4.6
-"""Width of a film, and height of the map or of the space [inches]."""
+"""Width of a film, and height of the map [inches]."""
 STEPS_PER_SECOND = 4
 """Steps that a film shows in a second."""
 LAST_STEPS = 6
@@ -33,17 +32,10 @@ LAST_STEPS = 6
 _STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5}
 
 
-def save_film(episode: Episode, path: Path, view: str = "2d", shown: Collection[str] = ()) -> None:
-    """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path."""
-    film = Film(episode, view, shown)
+def save_film(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
+    """Write a film of an episode as a GIF."""
+    film = Film(episode, shown)
     steps = range(episode.n_steps + 1)
-    if path.suffix != ".gif":
-        writer = FFMpegWriter(STEPS_PER_SECOND)
-        with writer.saving(film.figure, str(not_linked(path)), DPI):
-            for step in [*steps, *[episode.n_steps] * LAST_STEPS]:
-                film.draw(step)
-                writer.grab_frame()
-        return
     pictures = (Image.fromarray(film.frame(step)) for step in steps)
     kept = {
         "method": Image.Quantize.MAXCOVERAGE,
@@ -60,52 +52,37 @@ def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> N
     """Write the picture of the instant at which the server was most mistaken about where the UAVs
     were."""
     error = np.linalg.norm(episode.true - episode.believed, axis=-1).sum(-1)
-    film = Film(episode, shown=shown)
+    film = Film(episode, shown)
     film.draw(int(np.flatnonzero(error == error.max())[-1]))
     save_figure(film.figure, path, dpi=2 * DPI)
 
 
 class Film:
-    """Draws the instants of an episode into one figure; ``2d``: from above, ``3d``: in space.
+    """Draws the instants of an episode into one figure.
 
     ``shown`` are the IDs of the UAVs to tell apart; if there are none, all of up to six, or three
     of more.
     """
 
-    def __init__(self, episode: Episode, view: str = "2d", shown: Collection[str] = ()) -> None:
+    def __init__(self, episode: Episode, shown: Collection[str] = ()) -> None:
         self.episode = episode
         self.chosen = chosen_of(episode, shown)
         uavs = frame_of(episode, 0, self.chosen).uavs
         self.colours = {uav: uavs[uav].colour for uav in self.chosen}
         with matplotlib.rc_context(_STYLE):
             rows = height_of_rows(len(self.chosen))
-            height = HEIGHT
             low = rows + 1.0
-            size = (WIDTH, round(rows + height + 1.4, 1))
+            size = (WIDTH, round(rows + HEIGHT + 1.4, 1))
             self.figure = Figure(figsize=size, dpi=DPI)
             FigureCanvasAgg(self.figure)
 
-            def axes(*place: float, projection: str | None = None) -> Any:
-                return self.figure.add_axes(
-                    tuple(np.divide(place, size * 2)), projection=projection
-                )
+            def axes(*place: float) -> Any:
+                return self.figure.add_axes(tuple(np.divide(place, size * 2)))
 
-            if view == "3d":
-                room = np.array([5.1, height])
-                corner = (
-                    (0.15, low) + room / 2 - WIDTH
-                )  # of axes that are so large that they cut nothing
-                self.map = axes(*corner, 2 * WIDTH, 2 * WIDTH, projection="3d")
-                self.view: MapView | SpaceView = SpaceView(self.map, episode, DPI * room)
-                self.figure.text(
-                    0.65 / size[0], (low - 0.2) / size[1], self.view.scale, color="0.4"
-                )
-            else:
-                self.map = axes(0.65, low, 4.5, height)
-                self.view = MapView(self.map, episode)
-            self.charts = [axes(5.55, low + up * height, 1.45, 0.19 * height) for up in (0.33, 0)]
+            self.view = MapView(axes(0.65, low, 4.5, HEIGHT), episode)
+            self.charts = [axes(5.55, low + up * HEIGHT, 1.45, 0.19 * HEIGHT) for up in (0.33, 0)]
             self.lanes = axes(0.65, 0.5, 6.35, rows)
-            top = (5.35 / size[0], (low + height + 0.1) / size[1])
+            top = (5.35 / size[0], (low + HEIGHT + 0.1) / size[1])
             style = {
                 "loc": "upper left",
                 "bbox_to_anchor": top,
@@ -184,9 +161,8 @@ class LiveFilm:
     The environment, of one world, has the extras ``message``, ``state`` and ``reward_terms``.
     """
 
-    def __init__(self, env: UavEnv, view: str = "2d") -> None:
+    def __init__(self, env: UavEnv) -> None:
         self.env = env
-        self.view = view
         self._instants: list[TensorDictBase] = []
 
     def reset(self, outputs: TensorDictBase) -> None:
@@ -201,4 +177,4 @@ class LiveFilm:
         """The latest instant, as a film of the episode so far shows it, [height, width, 3]."""
         stacked = cast(TensorDictBase, torch.stack([each[0] for each in self._instants]))  # type: ignore[arg-type]
         episode = episode_of(stacked, self.env, {})
-        return Film(episode, self.view).frame(episode.n_steps)
+        return Film(episode).frame(episode.n_steps)

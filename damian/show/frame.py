@@ -1,5 +1,4 @@
-"""One instant of an episode, as every picture of it shows it: on the map, in space, and as
-GeoJSON."""
+"""One instant of an episode, as every picture of it shows it."""
 
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -23,7 +23,7 @@ _PLAIN = " !$&'()*+,-./:;<=>?@[]^_`{|}~\\\""
 """Characters that a data URL may hold as they are."""
 _TOLD = ("policy", "checkpoint", "seed", "world", "fleet")
 """What ``about`` says about an episode's flight, beside the overrides."""
-_NOT_FLOWN = (*_TOLD, "hydra", "formats", "views", "shown", "keep", "eval_episodes")
+_NOT_FLOWN = (*_TOLD, "hydra", "formats", "shown", "keep", "eval_episodes")
 """Overrides that say nothing of how an episode was flown, or that ``about`` repeats."""
 
 

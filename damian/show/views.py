@@ -1,7 +1,7 @@
-"""A map and the space above it, into which films and figures draw the frames of an episode."""
+"""A map, into which films and figures draw the frames of an episode."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import shapely
@@ -15,14 +15,10 @@ from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from damian.show.episode import LIKELY, Episode, Floats
 from damian.show.frame import INK, OTHER, Frame, Uav, limits
 
-TURN = 0.7
-"""Angle by which the space turns in each step [deg]."""
 HEAT = LinearSegmentedColormap.from_list("belief", [(0.45, 0.2, 0.6, 0.0), (0.45, 0.2, 0.6, 0.75)])
 """Colours of the belief about the sources."""
 _NORM = LogNorm(LIKELY, 1.0)
@@ -38,27 +34,16 @@ _CHARGES: dict[str, Any] = {"marker": _BOLT, "color": "#b8860b", "markersize": 9
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
 _ZONE = {"facecolor": "white", "edgecolor": _EDGE, "linewidth": 0.6, "hatch": "////"}
 _CORNERS = 48
-"""Corners of a footprint in space."""
-_SMALL, _HIGHEST = 8.0, 0.35
-"""Size of the mark of one of many [points], and share of the region's size to which heights are
-enlarged."""
+"""Corners of a footprint."""
+_SMALL = 8.0
+"""Size of the mark of one of many [points]."""
 _HALO = [withStroke(linewidth=1.8, foreground="white")]
-_NAME = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points", "path_effects": _HALO}
-_AROUND = np.array([(1, 0.5), (1, -0.5), (-1, 0.5), (-1, -0.5), (0, 1), (0, -1), (1, 1), (-1, -1)])
-"""Where a name may stand beside its mark."""
+_NAME: dict[str, Any] = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points"}
+_NAME |= {"path_effects": _HALO, "ha": "center", "va": "center"}
 
 
 class MapView:
     """The region from above, into which the frames of an episode are drawn, one after the other."""
-
-    height: ClassVar[tuple[float, ...]] = ()
-    """What a place on the ground has after east and north."""
-    fill: ClassVar = (0.07, 0.26)
-    """How opaque a footprint is: of a UAV that spots no source, and of one that does."""
-    source: ClassVar[dict[str, Any]] = {"markersize": 13, "zorder": 6}
-    """Style of the marks of sources and requests."""
-    trail: ClassVar[dict[str, Any]] = {"zorder": 3}
-    """Style of the latest ways of UAVs."""
 
     def __init__(self, axis: Any, episode: Episode) -> None:
         self.axis = axis
@@ -68,10 +53,8 @@ class MapView:
         lands = [shapely.get_coordinates(part.exterior) for part in _polygons(episode.region)]
         self._areas(lands, facecolor=_LAND, edgecolor=_EDGE, linewidth=1.2, zorder=0)
         self._areas(_zones(episode), zorder=0.6, **_ZONE)
-        axis.plot(
-            *episode.landing_points.T, *self.height, ".", color=_POINT, markersize=2, zorder=1
-        )
-        axis.plot(*_chargers(episode), *self.height, linestyle="", **_CHARGES)
+        axis.plot(*episode.landing_points.T, ".", color=_POINT, markersize=2, zorder=1)
+        axis.plot(*_chargers(episode), linestyle="", **_CHARGES)
         (west, south), (east, north) = limits(episode)
         axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
         axis.set(xlabel="east [m]", ylabel="north [m]")
@@ -87,194 +70,70 @@ class MapView:
             colours = [HEAT(_NORM(probability)) for _, probability in heat]
             drawn.append(self._areas(corners, facecolor=colours, edgecolor="none", zorder=0.5))
         for place in frame.requests:
-            drawn += self._plot(place, "s", "none", INK, **{**self.source, "markersize": 7})
+            drawn += self._plot(place, "s", "none", INK, markersize=7)
         for place, emits in frame.sources:
-            drawn += self._plot(place, "*", INK if emits else "white", INK, **self.source)
+            drawn += self._plot(place, "*", INK if emits else "white", INK, markersize=13)
         others = [uav for uav in frame.uavs if not uav.chosen]
         if others:  # small, and the denser their footprints, the darker
             shades = [to_rgba(OTHER, 0.3 if uav.spots else 0.09) for uav in others]
             drawn.append(
                 self._areas(list(map(self._print, others)), facecolor=shades, lw=0, zorder=1.5)
             )
-            drawn += self._marks_of_others(others)
+            places = np.transpose([uav.path[-1, :2] for uav in others])
+            marks = self.axis.scatter(*places, s=_SMALL**2, color=OTHER, zorder=3.5)
+            turned = [Affine2D().rotate(-uav.heading).scale(0.5) for uav in others]
+            marks.set_paths([DART.transformed(each) for each in turned])
+            drawn.append(marks)
         for uav in frame.uavs:
             drawn += self._uav(uav) if uav.chosen else []
         return drawn + self._names(frame)
 
     def _plot(self, place: Floats, marker: str, fill: str, color: str, **style: Any) -> list[Any]:
         """Mark a place on the ground, [2]."""
-        return self.axis.plot(
-            *place, *self.height, marker, color=color, markerfacecolor=fill, **style
-        )
+        style = {"zorder": 6, **style}
+        return self.axis.plot(*place, marker, color=color, markerfacecolor=fill, **style)
 
     def _print(self, uav: Uav) -> Floats:
         """Corners of a footprint, [C, 2]."""
         return uav.path[-1, :2] + self._circle
 
     def _uav(self, uav: Uav) -> list[Any]:
-        """Draw a UAV with its path and footprint, and where the server believes it to be."""
-        inside = to_rgba(uav.colour, self.fill[uav.spots])
+        """Draw a UAV with its path and footprint, as a dart that points where it flies, and a line
+        to where the server believes it to be."""
+        inside = to_rgba(uav.colour, 0.26 if uav.spots else 0.07)
         edge = {"edgecolor": uav.colour, "linewidth": 1.6 if uav.spots else 0.5}
         drawn = [self._areas([self._print(uav)], facecolor=inside, zorder=2, **edge)]
-        parts = list(np.stack([uav.path[:-1], uav.path[1:]], 1))
+        parts = list(np.stack([uav.path[:-1, :2], uav.path[1:, :2]], 1))
         if parts:
             fading = np.linspace(0.1, 0.7, len(parts))
-            drawn.append(
-                self._ways(parts, colors=uav.colour, alpha=fading, linewidths=1.6, **self.trail)
-            )
-        drawn += self._mark_of(uav)
+            trail = {"colors": uav.colour, "alpha": fading, "linewidths": 1.6, "zorder": 3}
+            drawn.append(self.axis.add_collection(LineCollection(parts, **trail)))
+        true = uav.path[-1, :2]
+        dart = DART.transformed(Affine2D().rotate(-uav.heading))
+        style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
+        drawn += self.axis.plot(*true, marker=dart, color=uav.colour, **style)
         if uav.age > 0:
+            line = {"color": uav.colour, "linewidth": 1.1, "zorder": 3}
+            drawn += self.axis.plot(*np.stack([true, uav.believed]).T, ":", **line)
             ring = {"markersize": 12, "markeredgewidth": 1.5, "zorder": 4}
             drawn += self._plot(uav.believed, "o", "none", uav.colour, **ring)
         return drawn
 
     def _names(self, frame: Frame) -> list[Any]:
-        """Name UAVs and rings where their names cover least."""
-        axis = self.axis
-        axis.apply_aspect()
+        """Name UAVs and rings, each in a direction of its own: names at one place lie apart."""
         uavs = [uav for uav in frame.uavs if uav.chosen]
-        named = [(uav, uav.path[-1], _short(uav.id)) for uav in uavs]
-        named += [
-            (uav, uav.believed, f"{_short(uav.id)}, {uav.age:g} s") for uav in uavs if uav.age > 0
-        ]
-        shown = np.array([self._seen(place) for _, place, _ in named])
-        points = axis.transData.transform(shown) * 72 / axis.figure.dpi
-        covered = [np.stack([points - 5, points + 5], 1)]
         drawn: list[Any] = []
-        for (uav, _, text), anchor, place in zip(named, shown, points, strict=True):
-            half = np.array([2.4 * len(text), 4.0])
-            middles = place + np.concatenate([_AROUND * (half + near) for near in (5, 13, 24)])
-            middles = middles.clip(
-                half, np.multiply(axis.figure.bbox.size, 72 / axis.figure.dpi) - half
-            )
-            boxes = np.stack([middles - half, middles + half], 1)
-            low, high = np.concatenate(covered).transpose(1, 0, 2)
-            common = np.minimum(boxes[:, None, 1], high) - np.maximum(boxes[:, None, 0], low)
-            best = int(common.clip(0).prod(-1).sum(-1).round().argmin())
-            covered.append(boxes[best : best + 1])
-            line = {
-                "arrowstyle": "-",
-                "color": uav.ink,
-                "linewidth": 0.5,
-                "shrinkA": 0,
-                "shrinkB": 3,
-            }
-            style: dict[str, Any] = {
-                "color": uav.ink,
-                "arrowprops": line,
-                "ha": "center",
-                "va": "center",
-            }
-            drawn.append(
-                axis.annotate(text, tuple(anchor), tuple(middles[best] - place), **style, **_NAME)
-            )
+        for number, uav in enumerate(uavs):
+            name = _short(uav.id)
+            ring = [(uav.believed, f"{name}, {uav.age:g} s")] if uav.age > 0 else []
+            for half, (place, text) in enumerate([(uav.path[-1, :2], name), *ring]):
+                turn = np.pi * (2 * (number + 0.2) / len(uavs) + half)
+                away = ((10 + 2.4 * len(text)) * np.cos(turn), 13 * np.sin(turn))
+                drawn.append(self.axis.annotate(text, place, away, color=uav.ink, **_NAME))
         return drawn
 
     def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
         return self.axis.add_collection(PolyCollection(corners, **style))
-
-    def _ways(self, parts: Sequence[Floats], **style: Any) -> Any:
-        return self.axis.add_collection(LineCollection([part[:, :2] for part in parts], **style))
-
-    def _marks_of_others(self, uavs: list[Uav]) -> list[Any]:
-        places = np.transpose([uav.path[-1, :2] for uav in uavs])
-        marks = self.axis.scatter(*places, s=_SMALL**2, color=OTHER, zorder=3.5)
-        marks.set_paths(
-            [DART.transformed(Affine2D().rotate(-uav.heading).scale(0.5)) for uav in uavs]
-        )
-        return [marks]
-
-    def _mark_of(self, uav: Uav) -> list[Any]:
-        """A dart that points where the UAV flies, and a line to where the server believes it to
-        be."""
-        true = uav.path[-1, :2]
-        dart = DART.transformed(Affine2D().rotate(-uav.heading))
-        style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
-        drawn = self.axis.plot(*true, marker=dart, color=uav.colour, **style)
-        if uav.age > 0:
-            line = {"color": uav.colour, "linewidth": 1.1, "zorder": 3}
-            drawn += self.axis.plot(*np.stack([true, uav.believed]).T, ":", **line)
-        return drawn
-
-    def _seen(self, place: Floats) -> Floats:
-        return place[:2]
-
-
-class SpaceView(MapView):
-    """The region and the space above it, which turns slowly; ``room`` is what it may fill [px],
-    [2]."""
-
-    height = (0.0,)
-    fill = (0.12, 0.35)
-    source: ClassVar = {"markersize": 12, "zorder": 5}
-    trail: ClassVar = {"zorder": 6}
-
-    def __init__(self, axis: Any, episode: Episode, room: Floats) -> None:
-        super().__init__(axis, episode)
-        self._dt = _step_of(episode)
-        axis.computed_zorder = (
-            False  # the middle of the large ground says nothing about what it hides
-        )
-        (west, south), (east, north) = limits(episode)
-        size = np.array([east - west, north - south])
-        highest = float(episode.position[..., 2].max())
-        height = 1.1 * max(highest, 0.001 * size.max())
-        times = max(1, round(float(f"{_HIGHEST * size.max() / height:.1g}"))) if highest else 1
-        axis.set(xlim=(west, east), ylim=(south, north), zlim=(0, height), proj_type="ortho")
-        axis.set_axis_off()
-        ground = shapely.get_coordinates(episode.region.buffer(self.radius)).T
-        corners = np.hstack([[*ground, np.full(ground.shape[1], up)] for up in (0, height)])
-        self._fit(corners, np.array([*size, times * height]) / size.max(), room)
-        heights = (
-            f", heights {f'{times} times as large' if times > 1 else 'to scale'}" if highest else ""
-        )
-        self.scale = f"{size[0]:.0f} m x {size[1]:.0f} m{heights}"
-
-    def draw(self, frame: Frame) -> list[Any]:
-        """Draw a frame, as it is seen by then; returns the artists that were drawn."""
-        self._turn(frame.time / self._dt)
-        return super().draw(frame)
-
-    def _turn(self, steps: float) -> None:
-        self.axis.view_init(elev=34, azim=-65 + TURN * steps)
-
-    def _fit(self, corners: Floats, shape: Floats, room: Floats) -> None:
-        """Draw a box of this shape so large that these corners in it, [3, C], are always in the
-        room."""
-        axis = self.axis
-        far = []
-        axis.set_box_aspect(shape)
-        axis.apply_aspect()
-        for angle in range(0, 360, 4):
-            self._turn(angle / TURN)
-            seen = np.transpose(
-                proj_transform(corners[0], corners[1], corners[2], axis.get_proj())[:2]
-            )
-            far.append(np.abs(axis.transData.transform(seen) - np.mean(axis.bbox, 0)).max(0))
-        axis.set_box_aspect(shape, zoom=float((room / 2 / np.max(far, 0)).min()))
-
-    def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
-        ground = [np.column_stack([each, np.zeros(len(each))]) for each in corners]
-        return self.axis.add_collection3d(Poly3DCollection(ground, **style))
-
-    def _ways(self, parts: Sequence[Floats], **style: Any) -> Any:
-        return self.axis.add_collection3d(Line3DCollection(parts, **style))
-
-    def _marks_of_others(self, uavs: list[Uav]) -> list[Any]:
-        style = {"color": OTHER, "markersize": 0.5 * _SMALL, "zorder": 3.5}
-        return self.axis.plot(*np.transpose([uav.path[-1] for uav in uavs]), "o", **style)
-
-    def _mark_of(self, uav: Uav) -> list[Any]:
-        """A ball, and a line down to what the UAV stands above."""
-        x, y, z = uav.path[-1]
-        drawn = self.axis.plot([x, x], [y, y], [0, z], color=uav.colour, lw=0.8, zorder=6)
-        style = {"markersize": 8, "markeredgecolor": uav.edge, "markeredgewidth": 0.8, "zorder": 7}
-        return drawn + self.axis.plot(x, y, z, "o", color=uav.colour, **style)
-
-    def _seen(self, place: Floats) -> Floats:
-        return np.array(
-            proj_transform(place[0], place[1], place[2:].sum(), self.axis.get_proj())[:2]
-        )
 
 
 def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> None:

@@ -25,7 +25,7 @@ def gymnasium_env(
 
     With ``num_envs`` it is many worlds, as ``gymnasium.make_vec("damian/Spotting-v0",
     num_envs=1024)`` makes them. ``options`` are further ones of ``UavGymEnv``
-    (``seed``, ``render_mode``, ``view``), or ``seed``.
+    (``seed``, ``render_mode``), or ``seed``.
     """
     scenario = compose_scenario(f"scenario={task}", "agents=1", *overrides)
     if num_envs is None:

@@ -42,7 +42,9 @@ def test_colours_of_methods_are_far_apart(seen):
 MEASURES = ["return", "success_rate", "steps", "perceived_return", "age"]
 
 
-def test_a_sweep_has_a_panel_for_each_value_with_the_other_panels_in_grey(tmp_path, monkeypatch):
+def test_a_sweep_has_a_curve_for_each_value_of_the_settings_that_are_not_along_the_axis(
+    tmp_path, monkeypatch
+):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     returns = {("none", 4): 2.0, ("none", 0): 9.0, ("timeline", 4): 7.0}
@@ -58,16 +60,16 @@ def test_a_sweep_has_a_panel_for_each_value_with_the_other_panels_in_grey(tmp_pa
     for keys in (groups, groups[:1], []):
         plot_sweep(means(rows, keys), keys, tmp_path / "figure.png")
     assert len(drawn) == 2  # without a setting there is nothing to draw
-    first, second = drawn[0].axes[:2]
-    assert (first.get_title(), second.get_title()) == ("aware=none", "aware=timeline")
-    assert first.get_xlabel() == "delay.obs"
-    trained, (error,) = first.containers[0][0], first.containers[0][2]
-    found = {
-        line.get_label(): line.get_xydata().tolist() for line in first.lines if line is not trained
+    axis = drawn[0].axes[0]
+    assert axis.get_xlabel() == "delay.obs"
+    found = {each.get_label(): each[0].get_xydata().tolist() for each in axis.containers}
+    assert found == {
+        "none trained": [[0, 9], [4, 2]],
+        "none script": [[0, -1], [4, -8]],
+        "timeline trained": [[4, 7]],
+        "timeline script": [[4, -3]],
     }
-    assert found == {"other panels": [[4, 7]], "script": [[0, -1], [4, -8]]}
-    assert trained.get_xydata().tolist() == [[0, 9], [4, 2]]
-    low, high = error.get_segments()[1][:, 1]
+    low, high = axis.containers[0][2][0].get_segments()[1][:, 1]
     assert low < 2 < high
     assert [label.get_text() for label in drawn[1].axes[0].get_xticklabels()] == [
         "none",

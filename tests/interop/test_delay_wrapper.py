@@ -1,7 +1,6 @@
 """Delays of environments of Gymnasium and PettingZoo: as the transforms delay those of TorchRL."""
 
 import copy
-from functools import partial
 
 import gymnasium
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sequence, Text, Tuple
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
 from torchrl.envs import Compose, GymEnv, TransformedEnv
@@ -27,7 +26,7 @@ from damian import (
 )
 from damian.common.errors import InputError
 from damian.delays.samplers import MessageContext
-from damian.interop import DelayVectorWrapper, DelayWrapper
+from damian.interop import DelayWrapper
 from damian.interop.pettingzoo import DelayParallelWrapper
 
 
@@ -298,17 +297,7 @@ class OneOverwrites(ParallelEnv):
         return tuple({"a": each} for each in self.inner.step(actions["a"]))
 
 
-class KeepsInfos(gymnasium.vector.VectorWrapper):
-    """Returns the same dict of infos in each step."""
-
-    def step(self, actions):
-        *found, infos = super().step(actions)
-        self.infos = getattr(self, "infos", {})
-        self.infos.update(infos)
-        return *found, self.infos
-
-
-@pytest.mark.parametrize("kind", ["whole", "in parts", "vector", "agent"])
+@pytest.mark.parametrize("kind", ["whole", "in parts", "agent"])
 def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
     default = np.full(1, 4, np.float32)
     late = {
@@ -323,20 +312,13 @@ def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
         inner = OneOverwrites()
         env = DelayParallelWrapper(inner, **late | {"default": {"a": default}})
         inner = inner.inner
-    elif kind == "vector":
-        vector = SyncVectorEnv([Overwrites] * 2, copy=False)
-        env = DelayVectorWrapper(KeepsInfos(vector), **late)
-        inner = vector.envs[1]
     else:
         inner = Overwrites()
         env = DelayWrapper(
             inner, **late | ({"observation": {"camera": 2}} if kind == "in parts" else {})
         )
-    of_agent = {"agent": lambda each: each["a"], "vector": lambda each: each}.get(
-        kind, lambda each: each
-    )
-    shape = (2, 1) if kind == "vector" else (1,)
-    default[:], action, rows = 9, np.zeros(shape, np.float32), []
+    of_agent = {"agent": lambda each: each["a"]}.get(kind, lambda each: each)
+    default[:], action, rows = 9, np.zeros(1, np.float32), []
     told = of_agent(env.reset(seed=0)[0])
     for step in range(1, 7):
         for each in told.values():
@@ -345,14 +327,13 @@ def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
         found = env.step({"a": action} if kind == "agent" else action)
         told, reward, info = (of_agent(found[i]) for i in (0, 1, -1))
         rows.append((copy.deepcopy(told), float(np.max(reward)), info))
-    last = (1,) if kind == "vector" else ()  # the last world
     seen, rewards, infos = zip(*rows, strict=True)
     held = [0, 0, 1, 2, 3, 4]
     now = [1, 2, 3, 4, 5, 6]
-    assert [each["camera"][last].item() for each in seen] == held
-    assert [each["gps"][last].item() for each in seen] == (now if kind == "in parts" else held)
-    assert seen[-1]["timeline"][last][2:, -2 if kind == "in parts" else 0].tolist() == [4, 3]
-    of_actions = [(each["action_history"][last] * 198 - 99).round().tolist() for each in seen]
+    assert [each["camera"].item() for each in seen] == held
+    assert [each["gps"].item() for each in seen] == (now if kind == "in parts" else held)
+    assert seen[-1]["timeline"][2:, -2 if kind == "in parts" else 0].tolist() == [4, 3]
+    of_actions = [(each["action_history"] * 198 - 99).round().tolist() for each in seen]
     assert of_actions == [[4, 4, 1], [4, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5], [4, 5, 6]]
     assert inner.executed == [4, 4, 1, 2, 3, 4]
     assert list(rewards) == [0, 0, 0, 1, 2, 3]
@@ -361,23 +342,15 @@ def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
 
 
 DRAWN = {"observation": Uniform(1, 4), "action": 1, "reward": Uniform(0, 3), "loss": 0.2}
-BY_TIME = {"observation": LOSSY, "action": 2, "reward": by_time}  # without chance
 
 
-@pytest.mark.parametrize(
-    ("wraps_each", "mode"), [(True, "NextStep"), (False, "NextStep"), (False, "SameStep")], ids=str
-)
-def test_environments_in_a_vector_are_those_alone(wraps_each, mode):
-    late = {**(DRAWN if wraps_each else BY_TIME), "history": 2, "timeline": 3}
-
-    def made(delayed: bool) -> gymnasium.Env:
+def test_wrapped_environments_in_a_vector_are_those_alone():
+    def made() -> gymnasium.Env:
         env = gymnasium.make("CartPole-v1", max_episode_steps=8)
-        return DelayWrapper(env, **late) if delayed else env
+        return DelayWrapper(env, **DRAWN, history=2, timeline=3)
 
-    mode = AutoresetMode(mode)
-    vector = SyncVectorEnv([partial(made, wraps_each)] * 3, autoreset_mode=mode)
-    vector = vector if wraps_each else DelayVectorWrapper(vector, **late)
-    singles = [made(True) for _ in range(3)]
+    vector = SyncVectorEnv([made] * 3)
+    singles = [made() for _ in range(3)]
     observations, infos = vector.reset(seed=4)
     firsts = [env.reset(seed=4 + i)[0] for i, env in enumerate(singles)]
     vector.action_space.seed(0)
@@ -394,14 +367,7 @@ def test_environments_in_a_vector_are_those_alone(wraps_each, mode):
             else:
                 firsts[i], reward, terminated, truncated, info = env.step(actions[i])
                 done[i] = terminated or truncated
-                at_end = infos
-                if done[i] and mode == AutoresetMode.SAME_STEP:
-                    assert data_equivalence(infos["final_obs"][i], firsts[i])
-                    at_end, done[i] = infos["final_info"], False
-                    assert at_end["age"][i] == info["age"]
-                    firsts[i], first_info = env.reset()
-                    info |= first_info
-                assert at_end["received"][i] == info["received"]
+                assert infos["received"][i] == info["received"]
             assert rewards[i] == reward
             assert infos["age"][i] == info["age"]
 
@@ -421,11 +387,6 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
             DelayWrapper(inner, **options)
     with pytest.raises(InputError, match="observation: camera is named, but the names are: none"):
         DelayWrapper(gymnasium.make("CartPole-v1"), {"camera": 2})
-    by_hand = SyncVectorEnv(
-        [partial(gymnasium.make, "CartPole-v1")], autoreset_mode=AutoresetMode.DISABLED
-    )
-    with pytest.raises(InputError, match=r"env: .*DISABLED is no autoreset_mode in which"):
-        DelayVectorWrapper(by_hand, 3)
     with pytest.raises(InputError, match=r"history: Sequence.* has no vectors of a fixed length"):
         DelayWrapper(Anything(Sequence(Discrete(2))), default=(), history=1)
     inner.observation_space = Dict(age=Discrete(3))

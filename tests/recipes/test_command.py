@@ -89,10 +89,6 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
         (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
         (["export", "damian:crowded/best.pt"], f"checkpoint: damian:crowded {POLICIES}"),
         (
-            ["submit", "folder=.", "method=x", "authors=x"],
-            "folder: . has no results.csv beside curves.csv: give the",
-        ),
-        (
             ["train", "resume=nowhere", "agents=4"],
             "agents=4: a resumed run keeps its configuration",
         ),

@@ -34,8 +34,8 @@ def printed_line(capsys) -> str:
 
 
 def test_a_run_folder_holds_configuration_episode_film_and_figure(fly, capsys):
-    folder = fly(*BADLY, "agents=2", "episode.max_steps=4", "formats=[gif,png,html,geojson]")
-    files = {"config.yaml", "run.json", "episode_0.json", "episode_0.geojson"}
+    folder = fly(*BADLY, "agents=2", "episode.max_steps=4", "formats=[gif,png,html]")
+    files = {"config.yaml", "run.json", "episode_0.json"}
     files |= {"episode_0.gif", "episode_0.png", "episode_0.html"}
     assert {path.name for path in folder.iterdir()} == files
     assert "4 steps" in printed_line(capsys)
@@ -98,10 +98,6 @@ def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(fly, c
     [
         (["policy=deterministic"], "policy: deterministic needs checkpoint"),
         (["agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
-        (
-            ["formats=[geojson]", "region=usecase"],
-            "geojson: its region has no latitude and longitude",
-        ),
     ],
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(

@@ -25,7 +25,7 @@ COMPARE = ["compare", "--config-dir=conf", "experiment=x", "seeds=1", HERE, f"ov
 EXPERIMENT = "{tasks: {t: [agents=2]}, methods: {undelayed: {delayed: false}}}"
 TABLE = "ID,source time,lat,lon\nA,NA,52.8110,-4.1283\n"
 LOG = "\n".join(["ID,time,receive time", *(f"A,{i},{i + 0.5}" for i in range(20)), ""])
-FILMS = ["formats=[gif,png,html,geojson]"]
+FILMS = ["formats=[gif,png,html]"]
 DOORS = {
     "train": (None, ["train", *TINY, HERE]),
     "off-policy": (None, ["train", *OFF_POLICY, "logger=csv", HERE]),

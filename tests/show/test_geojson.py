@@ -1,6 +1,8 @@
 """Episodes on real regions as GeoJSON: valid by RFC 7946, and where they should be."""
 
+import runpy
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +17,10 @@ from damian.envs.config import ScenarioConfig
 from damian.envs.pipeline import make_env
 from damian.server.config import ObservationConfig
 from damian.show.episode import record
-from damian.show.geojson import feature_collection
 from damian.world.regions.geodesy import to_local
 from damian.world.regions.sources import RegionConfig
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "geojson_episode.py"
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +37,9 @@ def episode():
     return record(
         env.rollout(10, random_policy(env)), env.uav_env, {"began": "2023-11-14T22:13:59.500Z"}
     )[0]
+
+
+feature_collection = runpy.run_path(str(EXAMPLE))["feature_collection"]
 
 
 def local(feature: dict, origin: tuple[float, float]) -> np.ndarray:

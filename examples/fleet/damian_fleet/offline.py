@@ -2,7 +2,7 @@
 tells.
 
 damian-advise checkpoint=runs/FOLDER table=reports.csv instant=true
-damian-playback region=llanbedr journal=north.jsonl "formats=[html,geojson]" folder=north
+damian-playback region=llanbedr journal=north.jsonl "formats=[html,gif]" folder=north
 
 Words that are no settings of the program are those of damian train, which choose the scenario
 (such as region=llanbedr), or change that of the checkpoint.
@@ -25,7 +25,7 @@ from damian.common.fields import Settings, rules, setting
 from damian.common.tables import write_csv
 from damian.common.text_files import named
 from damian.envs.config import ScenarioConfig
-from damian.show.files import check_films, save_episode, summary
+from damian.show.files import save_episode, summary
 from damian_fleet.advice import next_landings
 from damian_fleet.node import Node, for_uavs
 from damian_fleet.playback import episodes_of
@@ -68,12 +68,7 @@ class PlaybackConfig(OfflineConfig):
 
     journal: str = setting("", "Journal of a fleet, whose flight to show.")
     folder: str = setting("playback", "Folder for the episodes.")
-    formats: list[str] = setting(
-        ["html"], "What to make of each.", choices=("gif", "mp4", "png", "html", "geojson")
-    )
-    views: list[str] = setting(
-        ["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d")
-    )
+    formats: list[str] = setting(["html"], "What to make of each.", choices=("gif", "png", "html"))
     shown: list[str] = setting(
         [], "IDs of UAVs that films tell apart; if none, all of up to 6, 3 of more."
     )
@@ -93,7 +88,6 @@ def answer_table(config: AdviceConfig, words: Sequence[str]) -> None:
 
 def play_back(config: PlaybackConfig, words: Sequence[str]) -> None:
     """Write the flight of a journal as episodes, and what people look at."""
-    check_films(config.formats)
     scenario = scenario_of(config, words)
 
     @cache
@@ -105,7 +99,7 @@ def play_back(config: PlaybackConfig, words: Sequence[str]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for number, episode in enumerate(episodes):
         name = f"episode_{number}"
-        save_episode(episode, folder / name, config.formats, config.views, config.shown)
+        save_episode(episode, folder / name, config.formats, config.shown)
         print(summary(name, episode))
 
 

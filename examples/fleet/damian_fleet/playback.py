@@ -1,4 +1,4 @@
-"""The flight that a journal tells, as episodes, from which films, pages and GeoJSON are made.
+"""The flight that a journal tells, as episodes, from which films and pages are made.
 
 The server node takes the steps of the journal again. Positions are those that the UAVs reported, in
 hindsight, and between two reports on the straight way to the later one. Nobody knows where the

@@ -1,7 +1,6 @@
 """The programs without a service, run by their command lines: tables, journals, and refusals."""
 
 import csv
-import json
 import sys
 from pathlib import Path
 
@@ -109,7 +108,7 @@ def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(advise):
         "clock.simulation=0.5s",
         "folder=shown",
     ]
-    folder = advise(*words, "formats=[gif,geojson]", program=offline.playback) / "shown"
+    folder = advise(*words, "formats=[gif]", program=offline.playback) / "shown"
     episode = Episode.load(folder / "episode_0.json")
     assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
     assert np.diff(episode.time) == pytest.approx(0.5)
@@ -122,6 +121,3 @@ def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(advise):
     assert about["began"] == "2023-11-14T22:13:21.000Z", "when both had reported"
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == episode.n_steps + 1
-    features = json.loads((folder / "episode_0.geojson").read_text(encoding="utf-8"))["features"]
-    kinds = [each["properties"]["kind"] for each in features]
-    assert (kinds.count("track"), kinds.count("source track")) == (2, 0)

@@ -1,6 +1,6 @@
 """Check the runs of a method of delaybench, and write them as the one file of a submission.
 
-damian submit folder=runs/MYCOMPARISON method=mine "authors=A. Author, B. Author"
+python docs/leaderboard.py runs/MYCOMPARISON mine "A. Author, B. Author"
 
 The runs come from `damian compare` with the experiment delaybench, or one of your own that begins
 with it (docs/delaybench.md). What is submitted is the true return that damian's own evaluation has
@@ -8,28 +8,33 @@ found.
 """
 
 import shlex
+import sys
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
-from omegaconf import DictConfig
 from torch import Tensor
 
 from damian.common import checks
 from damian.common.tables import write_csv
-from damian.compare.comparison import RUN, TRAINED
-from damian.compare.config import Experiment
-from damian.compare.leaderboard import COLUMNS, check_submission
+from damian.compare.comparison import HELD_OUT_MARK, LATE_DATA, RUN, SIMULATOR, TRAINED
+from damian.compare.config import EPISODES, Experiment
+from damian.recipes import cli
+from damian.recipes.config import TrainConfig
+from damian.recipes.known import key_of
+from damian.recipes.shared.runs import changed_settings
+from damian.recipes.shared.sweeps import stored_results
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.run_folder import CHECKPOINT, RESULTS, read_results
 from damian.runs.run_record import read_record
 
-from . import cli
-from .config import SubmitConfig, TrainConfig
-from .known import key_of
-from .shared.runs import changed_settings
-from .shared.sweeps import stored_results
-
+NUMBERS = ["frames", "episodes", "return"]
+WORDS = ["task", "delay", "method", "authors", "regime", "damian", "commit", "settings"]
+COLUMNS = [*RUN, *NUMBERS, "parameters", *WORDS[3:]]
+"""Columns of a submission, which has a row for each run; ``settings`` are those of ``damian
+train``."""
+FEWEST_SEEDS = 5
 _NAMES = (
     "agents region motion wind source requests battery reward episode clock links randomise frames"
 )
@@ -102,19 +107,68 @@ def _count(value: object) -> int:
     return sum(map(_count, value.values())) if isinstance(value, dict) else 0
 
 
-def submit(config: SubmitConfig) -> None:
-    """Check a submission, and write its file."""
-    experiment = delaybench()
-    rows = submission(Path(config.folder), config.method, config.authors, experiment)
-    check_submission(rows, experiment, config.folder)
-    path = Path(f"{config.method}.csv")
-    write_csv(path, rows)
-    print(
-        f"{path}: {len(rows)} runs; add it to docs/results/leaderboard, and your files to "
-        "examples/extending"
+def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> None:
+    """Check a submission: its columns, places, seeds, episodes, numbers and words.
+
+    Raises:
+        InputError: the first thing that is wrong, and what would be right.
+    """
+    missing = [name for name in COLUMNS if name not in rows]
+    checks.require(not missing, path, missing, f"are missing; the columns are {', '.join(COLUMNS)}")
+    checks.require(len(rows) > 0, path, "it", "has no rows")
+    places = [*experiment.tasks]
+    places += [
+        f"{task}{HELD_OUT_MARK}{name}" for task in experiment.tasks for name in experiment.held_out
+    ]
+    for task in rows["task"].unique():
+        remedy = f'train in one that is, by experiment=delaybench "tasks=[{places[0]}]"'
+        should = f"is not of the leaderboard: {remedy}"
+        checks.require(task in places, f"{path}: task", task, should)
+    for name, known in (("delay", experiment.delays), ("regime", (LATE_DATA, SIMULATOR))):
+        for value in rows[name].unique():
+            checks.one_of(f"{path}: {name}", value, [*known])
+    for name in ("method", "regime", "damian"):
+        values = [*rows[name].unique()]
+        checks.require(len(values) == 1, f"{path}: {name}", values, "is not one for all rows")
+    for name in WORDS:
+        empty = rows[name].astype(str).str.strip().isin(["", "nan", "None"])
+        checks.require(not empty.any(), f"{path}: {name}", "it", "is empty")
+    changed = rows["commit"].astype(str).str.contains("+", regex=False)
+    checks.require(
+        not changed.any(), f"{path}: commit", rows["commit"].iloc[0], "has changes: commit them"
     )
+    finite = np.isfinite(rows[[*NUMBERS, "parameters"]].to_numpy(float)).all()
+    checks.require(bool(finite), path, "a number", "is not finite")
+    for place, runs in rows.groupby(RUN[:-1], sort=False):
+        where = f"{path}: {'/'.join(map(str, place))}"
+        seeds = runs["seed"]
+        checks.require(
+            not seeds.duplicated().any(), f"{where}: seed", [*seeds], "are not all different"
+        )
+        enough = len(seeds) >= FEWEST_SEEDS and seeds.min() >= experiment.first_seed
+        few = f"are too few, or too small: run compare again with keep=true seeds={FEWEST_SEEDS}"
+        checks.require(
+            bool(enough), f"{where}: seed", [*seeds], f"{few}, from {experiment.first_seed} on"
+        )
+        checks.in_range(f"{where}: episodes", int(runs["episodes"].min()), EPISODES)
 
 
-@cli.program("submit")
-def main(given: DictConfig) -> None:
-    submit(cli.checked(given, [], "submit"))
+def main() -> None:
+    """Check a submission, and write its file."""
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
+    with cli.one_line_errors("compare"):
+        folder, method, authors = sys.argv[1:]
+        experiment = delaybench()
+        rows = submission(Path(folder), method, authors, experiment)
+        check_submission(rows, experiment, folder)
+        path = Path(f"{method}.csv")
+        write_csv(path, rows)
+        print(
+            f"{path}: {len(rows)} runs; add it to docs/results/leaderboard, and your files to "
+            "examples/extending"
+        )
+
+
+if __name__ == "__main__":
+    main()
