@@ -64,7 +64,7 @@ RANGE = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in 
         (["train", "delay=3"], "delay: 3 is not an option of this group; write delay.obs=3"),
         (["train", "-m", "delay=none,papr"], "delay: papr is not one of"),
         (["train", "source.speed=3"], "source.speed: 3.0 means nothing with source=static"),
-        (["train", "model=3"], "model: 3 is not one of gru, mlp, small"),
+        (["train", "model=3"], "model: 3 is not one of gru, mlp, sets, "),
         (["train", "seed=0,1"], "Ambiguous value for argument 'seed=0,1' 1. To use it as a list"),
         (["train", "agents=two"], "agents: two is not a whole number"),
         (["train", "agents=0"], "agents: 0 is not between 1 and 1000"),
