@@ -16,9 +16,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
+from damian import Burst, ContextSampler, Geometric, Law, MessageContext, Sampler, Trace, Uniform
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Geometric, Law, Trace, Uniform
-from damian.delays.samplers import ContextSampler, MessageContext, Sampler
 from damian.transforms import StatefulTransform
 
 LONGEST = 6

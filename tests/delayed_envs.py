@@ -11,9 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.pipeline import make_env
+from damian import ClockConfig, DelayConfig, ScenarioConfig, make_env
 from damian.envs.uav_env import EXTRAS
 from damian.server.config import ObservationConfig
 

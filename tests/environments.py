@@ -10,8 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv
 
-from damian.delays.laws import Uniform
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv, Uniform
 
 
 class Kind(NamedTuple):

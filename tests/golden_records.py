@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from helpers import GOLDEN, nearest
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
+from damian import ScenarioConfig, UavEnv
 from damian.server.config import ObservationConfig
 from damian.server.features import ServerContext
 from damian.server.rewards import Counters

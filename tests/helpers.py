@@ -15,21 +15,18 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from twin import GLOBAL, LOCAL, Uav
 
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.uav_env import UavEnv
-from damian.learners.base import LearningSetup
-from damian.models.config import ModelConfig
-from damian.server.config import BUILT_IN, ObservationConfig
+from damian import ClockConfig, LearningSetup, ModelConfig, ScenarioConfig, UavEnv
+from damian.server.config import BUILT_IN, EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext
 from damian.server.features.place import battery_settings
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.battery import BatteryConfig
-from damian.world.landing import ActionConfig
+from damian.world.config import (
+    ActionConfig,
+    BatteryConfig,
+    MotionConfig,
+    RegionConfig,
+    SourceConfig,
+)
 from damian.world.messages import Messages
-from damian.world.motion import MotionConfig
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
 
 DATA = Path(__file__).parent / "data"
 

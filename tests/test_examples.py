@@ -17,7 +17,7 @@ from episodes import flight
 from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 
 import damian.transforms
-from damian.delays.laws import Uniform
+from damian import Uniform
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"

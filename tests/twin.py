@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import shapely
 
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, RewardConfig
 
 LOCAL = ["battery", "spotted"]
 GLOBAL = [

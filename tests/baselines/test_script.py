@@ -10,19 +10,13 @@ from helpers import everything, sent_messages, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from damian import keys
+from damian import DelayConfig, ScenarioConfig, keys, make_env
 from damian.baselines.random import random_policy
 from damian.baselines.script import BLUR_M, RECENT, TRUST, Coverer, Seeker, script_policy
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
+from damian.world.config import RegionConfig, SourceConfig
 from damian.world.landing import ActionConfig, action_table, displacement
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
 
 FIELD = [[0.0, 0.0], [400.0, 0.0], [400.0, 400.0], [0.0, 400.0]]
 STARTS = [[50.0, 50.0], [200.0, 200.0], [360.0, 260.0]]

@@ -4,15 +4,11 @@ import pytest
 import torch
 from helpers import SQUARE, square
 
-from damian import keys
+from damian import DelayConfig, keys, make_env
 from damian.baselines.script import Searcher, script_policy
-from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.world.landing import ActionConfig
-from damian.world.regions.sources import RegionConfig
+from damian.server.config import ObservationConfig, RewardConfig
+from damian.world.config import ActionConfig, RegionConfig
 
 
 def believing(own: bool = False, **changed) -> DelayedEnv:

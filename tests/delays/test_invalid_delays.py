@@ -7,13 +7,11 @@ import pytest
 from delay_twin import ACTION, Crowd, delayed, trace
 from helpers import square
 
+from damian import ActionDelay, ObservationDelay, RewardDelay, TableSampler, make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.laws import LONGEST, Burst, Lag, Law, Uniform
-from damian.delays.samplers import TableSampler
 from damian.delays.scenario import ScenarioDelays
-from damian.envs.pipeline import make_env
-from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 
 def delays(**settings) -> ScenarioDelays:

@@ -9,10 +9,9 @@ import torch
 from delay_twin import drawn
 from torch import Tensor
 
-from damian import compose_scenario
+from damian import Sampler, compose_scenario
 from damian.common import counter_rng
 from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform, in_steps, law_of
-from damian.delays.samplers import Sampler
 
 STREAMS, STEPS = 1000, 100
 """Size of a sample: 10^5 messages."""

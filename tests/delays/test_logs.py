@@ -6,9 +6,9 @@ import shlex
 import pytest
 from matplotlib.figure import Figure
 
+from damian import Trace
 from damian.common.errors import InputError
 from damian.delays.clocks import are_right, in_order
-from damian.delays.laws import Trace
 from damian.delays.logs import delays_of, read_log, trace_rows
 from damian.recipes.cli import settings
 from damian.recipes.command import main

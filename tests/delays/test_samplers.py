@@ -8,8 +8,8 @@ import torch
 from delay_twin import drawn
 from torch import Tensor
 
+from damian import Distance, Lag, Uniform
 from damian.common import counter_rng
-from damian.delays.laws import Distance, Lag, Uniform
 from damian.delays.samplers import ContextSampler, LinkSampler, MessageContext, Recorded, Sampler
 
 SENDERS = 20_000

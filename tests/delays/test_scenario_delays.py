@@ -10,10 +10,8 @@ from delay_twin import trace
 from delayed_envs import choices
 from helpers import all_same, play, square
 
+from damian import TableSampler, UavEnv, make_env
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.delays.samplers import TableSampler
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
 from damian.learners.config import MappoConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer

@@ -33,11 +33,8 @@ from delay_twin import LAWS as TABLES
 from delayed_envs import choices as uav_choices
 from helpers import everything, play
 
+from damian import ActionDelay, DelayConfig, Lag, ObservationDelay, RewardDelay, Uniform, make_env
 from damian.common import counter_rng
-from damian.delays.config import DelayConfig
-from damian.delays.laws import Lag, Uniform
-from damian.envs.pipeline import make_env
-from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 Route: Any = runpy.run_path(str(Path(__file__).parents[2] / "examples/extending/law.py"))["Route"]
 DT = 2.0

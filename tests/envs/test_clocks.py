@@ -8,14 +8,13 @@ from helpers import square
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
+from damian import ClockConfig, DelayConfig
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig
 from damian.learners.schedule import SystemClock
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, spotting, ticks
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig
 from damian.world.messages import Messages
 
 SPOTTED = torch.tensor([[False, True]])

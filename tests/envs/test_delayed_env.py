@@ -8,14 +8,17 @@ import torch
 from delayed_envs import DELAYS, after_steps, choices, delayed, every_delay
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, square
 from tensordict import TensorDictBase
-from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
+from torchrl.envs import EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from damian import (
+    ScenarioConfig,
+    compose_scenario,
+)
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
-from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
+from damian.envs.pipeline import make_env, make_transforms
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.keys import (
     ACTION,
@@ -23,33 +26,12 @@ from damian.keys import (
     EPISODE_REWARD,
     GLOBAL_OBSERVATION,
     MESSAGE,
-    OBSERVATION,
-    READY,
     RECEIVED,
     REWARD,
 )
-from damian.recipes.shared.environments import compose_scenario
-from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
-from damian.world.landing import ActionConfig
+from damian.world.config import ActionConfig
 
 # Without delays.
-
-
-def all_transforms(scenario: ScenarioConfig, n_worlds: int) -> DelayedEnv:
-    """An environment with every transform, each with a delay of 0."""
-    env = UavEnv(scenario, n_worlds, extras=EXTRAS, messages_only=True)
-    keys = {"sent_key": "ready", "valid_key": "action_valid"}
-    transforms = [
-        ActionDelay(0, ACTION, default=hold_action(scenario.actions), **keys),
-        *server_transforms(scenario, scenario.make_delays(), env.server, EXTRAS),
-        RewardDelay(0, REWARD),
-        CumulativeReward(1, 0.9, REWARD),
-        SampleAndHold(1, [OBSERVATION, GLOBAL_OBSERVATION]),
-        SampleAndHold(1, [OBSERVATION], ready_key=READY),
-    ]
-    delayed_env = DelayedEnv(env, Compose(*transforms))
-    delayed_env.set_seed(0)
-    return delayed_env
 
 
 def check_equals_undelayed(env: EnvBase, scenario: ScenarioConfig, n_steps: int = 25) -> None:
@@ -61,15 +43,6 @@ def check_equals_undelayed(env: EnvBase, scenario: ScenarioConfig, n_steps: int 
         [td.select(*expected[1].keys(True, True), strict=False) for td in outputs], expected
     )
     assert sum(td["done"].sum() for td in expected) > 0
-
-
-@both_kinds
-@both_motions
-def test_with_delays_of_0_all_transforms_output_what_the_environment_without_them_does(
-    motion, kind
-):
-    scenario = everything(motion, kind)
-    check_equals_undelayed(all_transforms(scenario, 8), scenario)
 
 
 def test_without_any_delay_there_are_no_transforms():

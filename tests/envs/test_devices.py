@@ -13,10 +13,10 @@ from torch import Tensor
 from torch._library.custom_ops import OPDEFS
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from damian import ScenarioConfig
 from damian.common import compiling, devices
 from damian.common.tensors import tree_map
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import Outputs
 from damian.transforms.base import Memory, StatefulTransform

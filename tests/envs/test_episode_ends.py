@@ -9,11 +9,10 @@ import torch
 from helpers import MOTIONS, act, both_motions, clock, fresh, one_uav, sent_messages, walking
 from tensordict import TensorDictBase
 
-from damian.envs.uav_env import UavEnv
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian import UavEnv
+from damian.server.config import EpisodeConfig, RewardConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
-from damian.world.motion import MotionConfig
+from damian.world.config import MotionConfig
 
 FAR = [[390.0, 10.0]]
 HERE, EAST = [[0.0, 0.0]], [[1.0, 0.25]]

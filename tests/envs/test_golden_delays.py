@@ -19,9 +19,8 @@ from golden_records import FEATURES, close, converted
 from helpers import DATA, GOLDEN, usecase
 from torch import Tensor
 
+from damian import ContextSampler, MessageContext, UavEnv
 from damian.delays.line import DelayLine
-from damian.delays.samplers import ContextSampler, MessageContext
-from damian.envs.uav_env import UavEnv
 from damian.server.config import ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages

@@ -3,13 +3,11 @@
 import pytest
 import torch
 from delayed_envs import choices
-from helpers import all_same, both_motions, everything, play
+from helpers import both_motions, everything, play
 from torchrl.envs.utils import check_env_specs
 
-from damian import keys
+from damian import ObservationDelay, keys, make_env
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.pipeline import make_env
-from damian.transforms import ObservationDelay
 
 LATE = {"law": "uniform", "low": 1, "high": 4}
 EXTRAS = ["message", "reward_terms"]
@@ -47,16 +45,6 @@ def test_the_specs_are_right(links, motion, extras):
     check_env_specs(env, break_when_any_done="both")
     assert keys.LINKED not in env.reset().keys(True, True)
     assert ("message" in extras) == (keys.MESSAGE in env.reset().keys(True, True))
-
-
-@both_motions
-@pytest.mark.parametrize("kind", ["updown", "matrix"])
-def test_links_without_delay_show_what_the_server_shows_if_nothing_is_delayed(motion, kind):
-    outputs = []
-    for name in ("server", kind):
-        env = make_env(everything(motion, links=LinkConfig(name)), 4, seed=2, extras=EXTRAS)
-        outputs.append(play(env, choices(env, 20)))
-    assert all_same(*outputs)
 
 
 @both_motions

@@ -7,10 +7,8 @@ import torch
 from delayed_envs import choices, delayed
 from helpers import FLYING, KEEPS_GOING, all_same, everything, play, square
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig
+from damian import ClockConfig, DelayConfig, UavEnv
 from damian.envs.pipeline import action_codes
-from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, OBSERVATION, READY, RECEIVED
 from damian.world.landing import action_table
 from damian.world.messages import Messages

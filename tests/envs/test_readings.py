@@ -7,12 +7,8 @@ from sensor_cases import GLOBAL, LOCAL, SENSORS
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian import ClockConfig, DelayConfig, ScenarioConfig, make_env
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 
 
 def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioConfig:

@@ -7,12 +7,11 @@ from typing import Any
 import pytest
 from helpers import square
 
+from damian import ClockConfig, make_env
 from damian.common.errors import InputError
 from damian.delays.config import LinkConfig
-from damian.envs.config import ClockConfig
-from damian.envs.pipeline import make_env
 from damian.server.config import ObservationConfig
-from damian.world.motion import MotionConfig
+from damian.world.config import MotionConfig
 
 OWN = ObservationConfig(own=True)
 BELIEF = ObservationConfig(belief=["belief_gain"])

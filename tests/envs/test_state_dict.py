@@ -10,8 +10,8 @@ from helpers import all_same, both_motions, everything, play, saved_and_loaded
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, StepCounter
 
+from damian import make_env
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.keys import ACTION
 

@@ -16,13 +16,10 @@ from helpers import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
+from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.keys import ACTION
 from damian.server.config import BUILT_IN
-from damian.world.landing import ActionConfig
+from damian.world.config import ActionConfig
 
 # Specs and TorchRL's rules.
 

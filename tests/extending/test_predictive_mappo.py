@@ -10,17 +10,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from damian import keys
-from damian.delays.config import DelayConfig
+from damian import DelayConfig, keys
 from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
 from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.runs.config import LoggerConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
-from damian.world.motion import MotionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import ActionConfig, MotionConfig
 
 NAME = "predictive_mappo:PredictiveMappoConfig"
 SMALL = MlpConfig(hidden=[16, 8])

@@ -10,11 +10,10 @@ from helpers import everything, learning
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
-from damian import keys
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv, keys
 from damian.models.config import MlpConfig
 from damian.replay.time_storage import TimeStorage
-from damian.world.landing import ActionConfig
+from damian.world.config import ActionConfig
 
 
 def learner_of(example, env, **changed):

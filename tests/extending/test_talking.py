@@ -9,10 +9,9 @@ from extensions import TINY
 from helpers import check_refused
 from tensordict import TensorDict
 
-from damian import keys, make_env
+from damian import ScenarioConfig, keys, make_env
 from damian.common.errors import InputError
 from damian.delays.config import LinkConfig
-from damian.envs.config import ScenarioConfig
 from damian.models.actor import make_actor
 from damian.recipes import cli
 from damian.recipes.shared import learning

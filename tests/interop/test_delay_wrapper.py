@@ -20,13 +20,13 @@ from damian import (
     ActionHistory,
     ContextSampler,
     CumulativeReward,
+    MessageContext,
     ObservationDelay,
     ObservationTimeline,
     RewardDelay,
     Uniform,
 )
 from damian.common.errors import InputError
-from damian.delays.samplers import MessageContext
 from damian.interop import DelayVectorWrapper, DelayWrapper
 from damian.interop.pettingzoo import DelayParallelWrapper
 
@@ -43,18 +43,6 @@ def lost_at_times(message: MessageContext) -> torch.Tensor:
 
 
 LOSSY = ContextSampler(lost_at_times, 5)
-
-
-def test_drawn_delays_have_their_frequencies():
-    env = DelayWrapper(
-        gymnasium.make("Pendulum-v1", max_episode_steps=3000), Uniform(0, 1), loss=0.5
-    )
-    env.reset(seed=0)
-    ages = [env.step(env.action_space.sample())[-1]["age"] for _ in range(3000)]
-    # The newest message is there with probability 1/4; else the one before, with 1/2, or an older
-    # one.
-    shares = np.bincount(ages, minlength=3)[:3] / 3000
-    assert shares == pytest.approx([1 / 4, 3 / 4 * 1 / 2, 3 / 8 * 1 / 2], abs=0.03)
 
 
 def test_delays_follow_from_the_seed_and_later_episodes_hold_nothing_of_earlier_ones():
@@ -202,20 +190,6 @@ def test_every_reward_is_received_once_and_the_info_tells_when_it_was_earned():
             found[step - age] = each
     assert found == dict(enumerate(earned))
     assert together
-
-
-@pytest.mark.parametrize("late", [0, torch.zeros_like], ids=["0", "a function that returns 0"])
-def test_without_delay_all_is_as_without_the_wrapper(late):
-    law = late if late == 0 else lambda message: torch.zeros_like(message.time)
-    plain = gymnasium.make("Pendulum-v1")
-    env = DelayWrapper(gymnasium.make("Pendulum-v1"), law, law, law)
-    assert env.observation_space == plain.observation_space
-    assert np.array_equal(plain.reset(seed=1)[0], env.reset(seed=1)[0])
-    for _ in range(20):
-        action = plain.action_space.sample()
-        (expected, *others, _), (found, *same, _) = plain.step(action), env.step(action)
-        assert np.array_equal(expected, found)
-        assert others == same
 
 
 def test_the_parts_of_an_observation_have_laws_of_their_own():
@@ -410,17 +384,11 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
     inner = Anything(Discrete(3))
     for options, message in (
         ({"reward": LOSSY}, "reward: .* loses messages"),
-        (
-            {"observation": {"sound": 1}},
-            "observation: sound is named, but the names are: place, word",
-        ),
         ({"action": {"left": 1}}, "action: left is named, but the names are: none"),
         ({"timeline": -1}, "timeline: -1 steps is not at least 0"),
     ):
         with pytest.raises(InputError, match=message):
             DelayWrapper(inner, **options)
-    with pytest.raises(InputError, match="observation: camera is named, but the names are: none"):
-        DelayWrapper(gymnasium.make("CartPole-v1"), {"camera": 2})
     by_hand = SyncVectorEnv(
         [partial(gymnasium.make, "CartPole-v1")], autoreset_mode=AutoresetMode.DISABLED
     )
@@ -589,34 +557,8 @@ def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
 
 
 @pytest.mark.parametrize("tells", [True, False])
-@pytest.mark.parametrize("again", [6, 7, 8])
-def test_who_comes_again_begins_anew(again, tells):
-    env = DelayParallelWrapper(
-        Relay(again, tells), {"b": 2}, {"b": 1}, {"b": 3}, history=4, timeline=4
-    )
-    env.reset()
-    rows = []
-    while env.agents:
-        rows.append([of.get("b") for of in env.step(dict.fromkeys(env.agents, 7))])
-    told, rewards = ([row[i] for row in rows] for i in (0, 1))
-    for t in range(
-        again, 10
-    ):  # it executes nothing in the step in which it comes, and then its default
-        seen = told[t - 1]
-        last = max(again, t - 2)
-        assert seen["observation"].tolist() == [last, -1 if last == again else 0]
-        assert seen["age"] == t - last
-        chosen = [7 if age < t - again else 0 for age in (3, 2, 1, 0)]
-        assert seen["action_history"].reshape(4, 50).argmax(-1).tolist() == chosen
-        assert seen["timeline"][:, -1].tolist() == [
-            t - age in {again, *range(again, t - 1)} for age in range(4)
-        ]
-    paid = [sum(each for each in part if each) for part in (rewards[:5], rewards[5:])]
-    assert paid == [sum(10**t for t in range(1, 6)), sum(10**t for t in range(again, 10))]
-
-
-@pytest.mark.parametrize("again", [6, 7, 8])
-def test_who_comes_again_begins_anew_in_the_transforms_too(again):
+@pytest.mark.parametrize("again", [6, 8])
+def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
     observation, action, reward = (("agents", each) for each in ("observation", "action", "reward"))
     delays = Compose(
         ActionDelay(1, action),
@@ -626,11 +568,11 @@ def test_who_comes_again_begins_anew_in_the_transforms_too(again):
         ActionHistory(3, action),
         ObservationTimeline(5, observation, delay_key="delay"),
     )
-    inner, env = (Relay(again, names="ab") for _ in range(2))
+    inner = Relay(again, names="ab")
     groups = {"agents": inner.possible_agents}
     relay = PettingZooWrapper(inner, use_mask=True, done_on_any=False, group_map=groups)
     reference = TransformedEnv(relay, delays)
-    env = DelayParallelWrapper(env, LOSSY, 1, by_time, history=3, timeline=5)
+    env = DelayParallelWrapper(Relay(again, tells, "ab"), LOSSY, 1, by_time, history=3, timeline=5)
     now = reference.reset()
     earned = dict.fromkeys("ab", 0.0)
     env.reset()

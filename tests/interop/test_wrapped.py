@@ -12,9 +12,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
-from damian import ObservationDelay, compose_scenario, keys
+from damian import ObservationDelay, compose_scenario, keys, make_env
 from damian.common.errors import InputError
-from damian.envs.pipeline import make_env
 from damian.interop import TASKS, UavGymEnv, UavVectorEnv
 from damian.interop.pettingzoo import UavParallelEnv
 

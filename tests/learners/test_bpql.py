@@ -10,16 +10,13 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian import keys
+from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.learners.config import BpqlConfig
 from damian.learners.sac import Sac
 from damian.models.config import MlpConfig
-from damian.replay.backupdate import BackupdateStorage
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig
 
 SMALL = MlpConfig(hidden=[16])
 LONGEST = 5

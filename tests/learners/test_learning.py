@@ -13,25 +13,18 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian import keys
+from damian import DelayConfig, ScenarioConfig, UavEnv, keys, make_env
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
-from damian.envs.uav_env import UavEnv
 from damian.learners.base import divergence
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.models.actor import make_actor
 from damian.models.config import MlpConfig
 from damian.models.critic import make_critic
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
+from damian.server.config import EpisodeConfig, RewardConfig
+from damian.world.config import ActionConfig, MotionConfig, RegionConfig
 from damian.world.messages import Messages
-from damian.world.motion import MotionConfig
-from damian.world.regions.sources import RegionConfig
 
 SMALL = MlpConfig(hidden=[16])
 REWARD = ("next", "agents", "reward")
@@ -40,16 +33,6 @@ REWARD = ("next", "agents", "reward")
 def scenario(**changes) -> ScenarioConfig:
     region = RegionConfig(min_area=20_000, max_area=40_000, initial_conditions=16)
     return ScenarioConfig(**{"agents": 3, "region": region, **changes})
-
-
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_a_policy_made_for_three_uavs_works_with_ten(kind):
-    actions = ActionConfig(kind=kind)
-    actor = make_actor(UavEnv(scenario(actions=actions), 2), SMALL)
-    ten = UavEnv(scenario(agents=10, actions=actions), 2)
-    rollout = ten.rollout(4, actor)
-    assert rollout["agents", "action"].shape[:3] == (2, 4, 10)
-    assert rollout["agents", "action_log_prob"].shape == (2, 4, 10)
 
 
 def collect(motion: str, kind: str):

@@ -14,10 +14,9 @@ from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.multiagent import MAPPOLoss
 
-from damian import keys
+from damian import keys, make_env
 from damian.common.compiling import COMPILE_OPTIONS, compiled
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.learners.mappo import (
     LOSS_KEYS,
     Mappo,
@@ -29,8 +28,8 @@ from damian.learners.mappo import (
 )
 from damian.models.config import MlpConfig
 from damian.models.memory import RECURRENT_KEYS, add_recurrent_state
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import ActionConfig
 
 SMALL = MlpConfig(hidden=[16, 8])
 CONFIG = MappoConfig(clip_epsilon=0.1, entropy_coeff=0.3, critic_coeff=0.7)

@@ -11,17 +11,15 @@ from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase, StepCounter
 
-from damian.delays.config import DelayConfig
+from damian import BackupdateStorage, DelayConfig, make_env
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
 from damian.models.actor import make_actor
 from damian.models.config import MlpConfig
 from damian.recipes.shared.learning import make_collector
-from damian.replay.backupdate import BackupdateStorage
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig
 
 GRU = MlpConfig(hidden=[16, 8], rnn="gru")
 ROUNDING = 3e-5

@@ -12,14 +12,13 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss
 
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv, make_env
 from damian.keys import OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.sac import Sac, SacConfig
 from damian.models.config import MlpConfig
 from damian.replay.time_storage import TimeStorage
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import ActionConfig
 
 SMALL = MlpConfig(hidden=[16])
 FAST = SacConfig(updates=2, batch_size=64, warm_up=0)

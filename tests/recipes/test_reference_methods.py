@@ -8,7 +8,6 @@ import torch
 from helpers import (
     KEEPS_GOING,
     MOTIONS,
-    all_same,
     both_kinds,
     both_motions,
     everything,
@@ -20,9 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from twin import GLOBAL, LOCAL
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.pipeline import make_env
+from damian import ClockConfig, DelayConfig, ScenarioConfig, make_env
 from damian.envs.uav_env import EXTRAS
 from damian.keys import PRIVILEGED_OBSERVATION as PRIVILEGED
 from damian.learners.config import MappoConfig, SacConfig
@@ -30,8 +27,7 @@ from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.server.config import ObservationConfig
-from damian.world.landing import ActionConfig
-from damian.world.signal_source import SourceConfig
+from damian.world.config import ActionConfig, SourceConfig
 from damian.world.state import Truth
 
 UNIFORM = {"law": "uniform", "low": 1, "high": 3, "probability": 0.3}
@@ -47,14 +43,6 @@ def rollout_of(scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS) -> li
     env = make_env(scenario, 4, extras=extras)
     generator = torch.Generator().manual_seed(3)
     return play(env, [random_actions(env.uav_env, generator) for _ in range(20)])
-
-
-@pytest.mark.sample(2)
-@both_motions
-@pytest.mark.parametrize(("obs", "longest"), [(UNIFORM, 3), (BURST, 4)], ids=["uniform", "burst"])
-def test_held_messages_arrive_as_with_a_constant_delay(obs, longest, motion):
-    held = rollout_of(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
-    assert all_same(held, rollout_of(everything(motion, delay=DelayConfig(obs=longest, history=2))))
 
 
 @both_motions

@@ -30,7 +30,6 @@ SLOW_CLOCKS = [
     "clock.server=4s",
     "clock.system=16s",
 ]
-FEW = ["learner.prediction_steps=2", "learner.prediction_batch=8", "learner.prediction_buffer=64"]
 CASES = {
     "recurrent": [
         "delay.obs=2",

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
-from damian.envs.pipeline import make_env
+from damian import make_env
 from damian.models.actor import make_actor
 from damian.models.critic import make_critic
 from damian.recipes import evaluate

@@ -13,11 +13,9 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from twin import GLOBAL, LOCAL
 
-from damian import keys
+from damian import ClockConfig, ScenarioConfig, keys, make_env
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
@@ -222,16 +220,3 @@ def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happe
             assert ends[steps, b].tolist() == true_ends[: len(steps), b].tolist()
     assert (~corrected["valid"]).any()
     assert corrected["next", "done"][corrected["reset_after"]].all()
-
-
-def test_a_saved_storage_continues_in_the_same_way():
-    env = training_env(everything(episode=EpisodeConfig(max_steps=9), delay=DelayConfig(obs=LATE)))
-    late, (one, other) = fly(env), (buffer_of(env, ["reward", "critic"]) for _ in range(2))
-    one.extend(late[:25].transpose(0, 1))
-    other.load_state_dict(one.state_dict())
-    assert other.storage.latest().equal(one.storage.latest())
-    for buffer in (one, other):
-        buffer.extend(late[25:].transpose(0, 1))
-    original = in_order(one)
-    loaded = in_order(other)
-    assert all(original[key].equal(loaded[key]) for key in original.keys(True, True))

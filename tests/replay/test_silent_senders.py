@@ -5,16 +5,15 @@ from helpers import square
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from damian import keys
-from damian.delays.config import DelayConfig
+from damian import DelayConfig, keys
 from damian.keys import next_key
-from damian.learners.mappo import MappoConfig
+from damian.learners.config import MappoConfig
 from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, replay_buffer
 from damian.runs.config import LoggerConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.motion import MotionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import MotionConfig
 
 
 def truth(env, steps: TensorDictBase) -> Tensor:

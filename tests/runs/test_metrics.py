@@ -13,23 +13,17 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, StepCounter
 
-from damian import keys
+from damian import BackupdateStorage, DelayConfig, ScenarioConfig, keys, make_env
 from damian.baselines.random import random_policy
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
 from damian.envs.nodes import EpisodeTotals
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
-from damian.replay.backupdate import BackupdateStorage
 from damian.runs.checkpoint import plain
 from damian.runs.metrics import EpisodeLog, HindsightReturns, evaluation
 from damian.runs.metrics_log import MetricsLog, TensorBoard
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.server import Server
-from damian.server.termination import EpisodeConfig
+from damian.world.config import SourceConfig
 from damian.world.messages import Messages
-from damian.world.signal_source import SourceConfig
 
 HORIZON = 24
 BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}

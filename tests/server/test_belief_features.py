@@ -8,12 +8,9 @@ import torch
 from belief_twin import chance_at, emission_of
 from helpers import everything, square, walking
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
+from damian import ScenarioConfig, UavEnv, feature, make_env
 from damian.server.belief import places, predict
 from damian.server.config import ObservationConfig
-from damian.server.features import feature
 from damian.server.features.belief import BELIEF_RINGS, BELIEF_SECTORS
 from damian.world.config import SourceConfig
 

@@ -7,11 +7,11 @@ from helpers import SQUARE, everything
 from torch import Tensor
 from twin import GLOBAL, LOCAL
 
+from damian import UavEnv
 from damian.common.tensors import tree_map
-from damian.envs.uav_env import UavEnv
 from damian.server.config import ObservationConfig
+from damian.world.config import RegionConfig
 from damian.world.messages import Messages
-from damian.world.regions.sources import RegionConfig
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 5])

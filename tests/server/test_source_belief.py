@@ -10,7 +10,7 @@ from belief_twin import belief, chance_at
 from helpers import everything, square, walking
 from torch import Tensor
 
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv
 from damian.server.belief import (
     SourceGrid,
     _advance,
@@ -22,7 +22,7 @@ from damian.server.belief import (
     empty_window,
     latest,
 )
-from damian.world.signal_source import SourceConfig
+from damian.world.config import SourceConfig
 
 LONGEST = 4
 

@@ -6,12 +6,10 @@ import itertools
 import pytest
 import torch
 
-from damian import keys, make_env
+from damian import ScenarioConfig, keys, make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ScenarioConfig
-from damian.server.config import ObservationConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.world.config import RegionConfig
 
 SLOTS = 4

@@ -9,15 +9,13 @@ import torch
 from geojson_pydantic import FeatureCollection
 from shapely.geometry import shape
 
+from damian import DelayConfig, ScenarioConfig, make_env
 from damian.baselines.random import random_policy
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
 from damian.server.config import ObservationConfig
 from damian.show.episode import record
 from damian.show.geojson import feature_collection
+from damian.world.config import RegionConfig
 from damian.world.regions.geodesy import to_local
-from damian.world.regions.sources import RegionConfig
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,8 @@ import shapely
 from chromium import chromium, problems, resize
 from episodes import NO_SOURCE, SQUARE, crowd, flight
 
-from damian import compose_scenario
+from damian import compose_scenario, make_env
 from damian.baselines.random import random_policy
-from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.show.episode import record
 from damian.show.replay_page import save_page

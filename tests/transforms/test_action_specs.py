@@ -16,7 +16,7 @@ from torchrl.data import (
 )
 from torchrl.envs import EnvBase, TransformedEnv
 
-from damian.transforms import ActionDelay, ActionHistory
+from damian import ActionDelay, ActionHistory
 
 GROUP = (3, 2)
 """Worlds, and agents in each of them."""

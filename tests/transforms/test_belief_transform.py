@@ -12,17 +12,13 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
-from damian import keys
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
+from damian import BackupdateStorage, DelayConfig, ScenarioConfig, keys, make_env
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
-from damian.replay.backupdate import BackupdateStorage
 from damian.server.belief import SourceGrid, build_source_grid
 from damian.server.config import ObservationConfig
+from damian.world.config import MotionConfig
 from damian.world.messages import Messages
-from damian.world.motion import MotionConfig
 from damian.world.signal_source import footprint_radius
 
 LONGEST = 7

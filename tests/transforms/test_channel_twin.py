@@ -15,10 +15,9 @@ from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
+from damian import Channel, ContextSampler, MessageContext
 from damian.common import counter_rng
 from damian.delays.laws import Burst, Law, Trace, Uniform, law_of, sampler_of
-from damian.delays.samplers import ContextSampler, MessageContext
-from damian.transforms import Channel
 
 N = 3
 WORLDS = [3, 5, 8]

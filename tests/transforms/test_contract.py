@@ -32,10 +32,8 @@ from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, Trans
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
-from damian.delays.laws import Burst, Law, Uniform
-from damian.delays.samplers import ContextSampler, Sampler
+from damian import Burst, ContextSampler, Law, Sampler, UavEnv, Uniform
 from damian.envs.nodes import Belief, ServerNode
-from damian.envs.uav_env import UavEnv
 from damian.server.config import ObservationConfig
 from damian.transforms import (
     ActionDelay,

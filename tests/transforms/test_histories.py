@@ -23,13 +23,7 @@ from delay_twin import (
 from helpers import play
 from tensordict import TensorDictBase
 
-from damian.transforms import (
-    ActionHistory,
-    CumulativeReward,
-    ObservationDelay,
-    RewardDelay,
-    SampleAndHold,
-)
+from damian import ActionHistory, CumulativeReward, ObservationDelay, RewardDelay, SampleAndHold
 
 
 @pytest.fixture(params=LAWS)

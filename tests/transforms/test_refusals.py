@@ -6,15 +6,8 @@ from environments import LATE, OBSERVATION, Drift, uavs
 from tensordict import TensorDict
 from torchrl.envs import Compose, GymEnv, StepCounter, Transform, TransformedEnv
 
+from damian import ActionDelay, ActionHistory, Channel, ObservationDelay, RewardDelay, SampleAndHold
 from damian.common.errors import InputError
-from damian.transforms import (
-    ActionDelay,
-    ActionHistory,
-    Channel,
-    ObservationDelay,
-    RewardDelay,
-    SampleAndHold,
-)
 
 MISSING = {
     "observatoin": lambda: ObservationDelay(3, ["observation", "observatoin"]),

@@ -22,13 +22,13 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from damian.delays.laws import Uniform
-from damian.transforms import (
+from damian import (
     ActionHistory,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
+    Uniform,
     set_seed,
 )
 

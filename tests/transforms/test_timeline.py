@@ -8,11 +8,15 @@ from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
-from damian import keys
-from damian.delays.samplers import ContextSampler
-from damian.envs.uav_env import UavEnv
+from damian import (
+    Channel,
+    ObservationDelay,
+    ObservationTimeline,
+    UavEnv,
+    keys,
+    set_seed,
+)
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.transforms import Channel, ObservationDelay, ObservationTimeline, set_seed
 
 K = 3
 WORLDS = 2
@@ -127,27 +131,6 @@ def test_stored_timelines_are_corrected_by_what_has_arrived_since(group, own):
                 found = stored[world]["next", *key][:, receiver].reshape(expected.shape)
                 assert found.equal(expected)
     assert not stored["next", *key].equal(data["next", *key])
-
-
-def test_the_worked_timeline_of_the_docstring():
-    delays = torch.tensor([3, 1, -1, 1])  # of the messages of t = 1, 2, 3 and 4
-
-    def delay(context):
-        return delays[context.time.long() - 1].float()
-
-    late = ObservationDelay(
-        ContextSampler(delay, longest=3), "observation", "received", delay_key="delay"
-    )
-    env = TransformedEnv(
-        GymEnv("Pendulum-v1"), Compose(late, ObservationTimeline(4, delay_key="delay"))
-    )
-    steps = env.rollout(4)
-    sent = [steps["observation"][0], *steps["next", "observation"]]
-    for t, held in ((3, [None, 2, None, 0]), (4, [None, None, 2, 1])):
-        found = steps["next", "timeline"][t - 1]
-        for slot, message in zip(found, held, strict=True):
-            assert slot[-1] == float(message is not None)
-            assert slot[:-1].equal(torch.zeros(3) if message is None else sent[message])
 
 
 def test_places_relative_to_the_observer_are_moved_into_its_present_frame():

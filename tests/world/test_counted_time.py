@@ -8,7 +8,7 @@ from helpers import clock, fresh, one_uav
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.world.motion import MotionConfig
+from damian.world.config import MotionConfig
 
 
 @given(

@@ -4,10 +4,9 @@ import pytest
 import torch
 from helpers import KEEPS_GOING, SQUARE, act, fresh, random_actions, sent_messages, square, usecase
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
+from damian import ScenarioConfig, UavEnv
 from damian.world.battery import BatteryConfig, flight_drain
-from damian.world.regions.sources import RegionConfig
+from damian.world.config import RegionConfig
 from damian.world.state import State
 
 

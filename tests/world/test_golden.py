@@ -21,9 +21,9 @@ from golden_records import (
 )
 from helpers import DATA, GOLDEN, act, nearest, sent_messages, usecase
 
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv
+from damian.world.config import MotionConfig
 from damian.world.landing import action_table
-from damian.world.motion import MotionConfig
 
 
 def reason_for_other_point(case: int, transition: Transition, uav: int) -> str | None:

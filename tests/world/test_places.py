@@ -9,11 +9,9 @@ import pytest
 import torch
 
 from damian.common.errors import InputError
-from damian.world.battery import BatteryConfig
-from damian.world.config import WorldConfig
+from damian.world.config import BatteryConfig, SourceConfig, WorldConfig
 from damian.world.regions.geodesy import to_latlon
 from damian.world.regions.sources import RegionConfig, regions_of
-from damian.world.signal_source import SourceConfig
 from damian.world.simulation import Simulation
 
 SQUARE = RegionConfig(

@@ -6,13 +6,10 @@ import math
 import pytest
 import torch
 
+from damian import ClockConfig, DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.baselines.script import script_policy
 from damian.common import counter_rng
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import MotionConfig, RegionConfig, RequestConfig, SourceConfig
 
@@ -204,27 +201,3 @@ def test_what_needs_requests_is_refused_without_them():
         InputError, match=r"requests.rate: 0 is 0, so that no request appears|requests.rate"
     ):
         scenario(requests=RequestConfig())
-
-
-def test_a_uav_observes_the_nearest_open_requests_by_the_newest_that_anybody_knows():
-    env = UavEnv(scenario(), 1, seed=0)
-    sent = env.state.sent
-    half = env.simulation.airspace.scale.item() / 2
-    at = torch.tensor([[0.0, 0.0], [10.0, 0.0], [-60.0, 0.0]])
-    old = [50.0, 0, 1]
-    near = [20.0, 0, 4]
-    far = [-90.0, 0, 8]
-    done = [5.0, 0, 6]
-    requests = torch.tensor(
-        [[old, far, [0, 0, -1.0]], [near, [0, 0, -1.0], done], [near, far, done]]
-    )
-    served = torch.tensor(
-        [[1.0, -1, -1], [-1, -1, 6], [-1, -1, -1]]
-    )  # the one before `near`, and `done`
-    messages = sent._replace(target=at[None], requests=requests[None], served=served[None])
-    seen = env.server.features(messages, torch.tensor([12]), ["requests"])["requests"][0]
-    for (east, _), rows, order in zip(
-        at.tolist(), seen, [(near, far), (near, far), (far, near)], strict=True
-    ):
-        expected = [[(x - east) / half, 0.0, (12 - when) / 40, 1.0] for x, _, when in order]
-        torch.testing.assert_close(rows, torch.tensor([*expected, [0.0] * 4, [0.0] * 4]))

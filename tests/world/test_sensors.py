@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
+from damian import ScenarioConfig, UavEnv
 from damian.server.config import ObservationConfig
 from damian.world.messages import Messages, Widths
 

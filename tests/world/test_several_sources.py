@@ -4,11 +4,9 @@ out."""
 import pytest
 import torch
 
+from damian import ScenarioConfig, UavEnv, make_env
 from damian.baselines.script import script_policy
 from damian.common.errors import InputError
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import RegionConfig, SourceConfig
 from damian.world.state import Truth
@@ -65,25 +63,6 @@ def test_each_source_is_detected_as_if_it_were_the_only_one():
     assert features["source_bearing"].equal(torch.where(known.any(0), bearing, 1.0))
     newest = torch.stack([one["source_time"] for one in ones]).amin(0)
     assert features["source_time"].equal(newest)
-
-
-def test_success_needs_somebody_at_each_source_at_the_same_time():
-    env = UavEnv(
-        scenario(SourceConfig(count=3, each=EACH), episode=EpisodeConfig(60, all_sources=True)),
-        8,
-        1,
-    )
-    env.reset()
-    airspace = env.simulation.airspace
-    state = env.state
-    places = torch.tensor(PLACES, dtype=torch.float64) - airspace.offset[0].double()
-    points = airspace.nearest(places.numpy(), 0)
-    hold = int(env.simulation.candidates.hold.int().argmax())
-    for there, success in ((points, True), (points[[0, 0, 1]], False)):
-        goal = there.expand(8, 3)
-        env.state = state._replace(goal=goal, origin=goal)
-        _, outputs = env.step_fn(env.worlds, torch.full((8, 3), hold))
-        assert outputs["success"].all() == success
 
 
 def test_alike_sources_walk_and_fall_silent_independently():

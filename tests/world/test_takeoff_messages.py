@@ -9,11 +9,9 @@ import pytest
 import torch
 from helpers import KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.world.motion import MotionConfig
+from damian import ScenarioConfig, UavEnv
+from damian.server.config import ObservationConfig, RewardConfig
+from damian.world.config import MotionConfig
 
 
 @dataclass

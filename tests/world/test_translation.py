@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from damian.world.battery import BatteryConfig
-from damian.world.config import WorldConfig
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
+from damian.world.config import BatteryConfig, RegionConfig, SourceConfig, WorldConfig
 from damian.world.simulation import Simulation
 
 SQUARE = [[0.0, 0.0], [210.0, 0.0], [210.0, 210.0], [0.0, 210.0]]

@@ -18,14 +18,10 @@ from helpers import (
 )
 from twin import GLOBAL, LOCAL
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
-from damian.server.config import BUILT_IN, ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian import ScenarioConfig, UavEnv
+from damian.server.config import BUILT_IN, EpisodeConfig, ObservationConfig, RewardConfig
+from damian.world.config import RegionConfig, SourceConfig
 from damian.world.landing import ActionConfig, action_table
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
 
 TWIN_FEATURES = [name for name in GLOBAL if name != "coverage"]
 OBSERVED = [*TWIN_FEATURES, *LOCAL]
