@@ -22,7 +22,7 @@ def learner_of(example, env, **changed):
     return config.make(env, learning(MlpConfig(hidden=[8]), worlds=4, **changed), buffer)
 
 
-@pytest.mark.parametrize("mixer", ["qmix", "vdn"])
+@pytest.mark.parametrize("mixer", ["qmix", pytest.param("vdn", marks=pytest.mark.slow)])
 def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run, mixer):
     words = [
         *TINY,

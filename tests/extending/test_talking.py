@@ -87,15 +87,13 @@ ROWS = "learner=extensions:RowsConfig"
 OWN = "observation.own=true"
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("words", "refused"),
     [
-        ([ROWS, OWN], True),
         ([ROWS, OWN, "learner.hidden=true"], True),
         ([ROWS, "links=matrix"], True),
-        ([ROWS, "links=updown", "links.delay=1"], True),
         ([ROWS], False),
-        ([ROWS, OWN, "delay.obs=0"], False),
         ([ROWS, OWN, "learner.talks=true"], False),
         ([OWN], False),
         ([OWN, "actions.kind=continuous"], False),

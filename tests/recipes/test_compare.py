@@ -1,7 +1,6 @@
 """The comparison recipe, run by its command line: its runs, and its refusals of wrong input."""
 
 import csv
-import json
 import re
 import shlex
 import shutil
@@ -17,7 +16,6 @@ from damian.recipes.compare import includes, plan
 from damian.recipes.shared.runs import POLICY
 from damian.recipes.train import train
 from damian.runs.checkpoint import digest
-from damian.runs.run_folder import locked
 from damian.runs.run_record import read_record
 
 ROOT = Path(__file__).parents[2]
@@ -171,55 +169,6 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
     )
     assert {row["seed"] for row in measured(folder)} == {"3", "4"}
     assert "1 seeds (4 to 4)" in (folder / "table.md").read_text()
-
-
-@pytest.mark.slow
-def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
-    words = [*ONE, "seeds=1", "methods=[undelayed,naive]", listed(*SMALL, "frames=64")]
-    folder = compare(*words)
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    for name in ("results.csv", "curves.csv"):
-        (kept / name).write_bytes((folder / name).read_bytes())
-    stored = ["report_only=true", f"hydra.run.dir={kept}"]
-    compare(*words, *stored)
-    for name in ("table.csv", "figure.png", "curves.png"):
-        assert (kept / name).read_bytes() == (folder / name).read_bytes()
-    compare(*words[:3], "methods=[undelayed]", *stored)
-    assert {line["method"] for line in table(kept / "table.csv")} == {
-        "undelayed",
-        "random",
-        "script",
-    }
-    late = ["experiment.first_seed=9", *stored]
-    problem = "experiment: no run of it is finished in"
-    check_refused(lambda: compare(*words, *late), problem, capsys)
-
-
-@pytest.mark.slow
-def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compare, capsys):
-    words = [*ONE, "seeds=1", "methods=[undelayed,deployed]", TWO[4]]
-    folder = compare(*words) / "usecase2"
-    source, flown = (folder / name / "seed_8" for name in ("none/undelayed", "paper/deployed"))
-    compare(*words)
-    before = stamps(folder)
-    (source / "result.csv").touch()  # as in a copy of the folder
-    compare(*words)
-    assert stamps(folder) == before | {
-        str(source / "result.csv"): stamps(folder)[str(source / "result.csv")]
-    }
-    record = json.loads((flown / "run.json").read_text())
-    (flown / "run.json").write_text(
-        json.dumps(record | {"policy_sha256": "of an earlier checkpoint"})
-    )
-    compare(*words)
-    rewritten = {path for path, stamp in stamps(folder).items() if stamp != before.get(path)}
-    assert str(flown / "result.csv") in rewritten
-    assert all(path.startswith((str(flown), str(source / "result.csv"))) for path in rewritten)
-    capsys.readouterr()
-    with locked(folder.parent), pytest.raises(SystemExit):
-        compare(*words)
-    assert "is in use by another run" in capsys.readouterr().err
 
 
 @pytest.mark.slow

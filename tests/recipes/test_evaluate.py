@@ -68,9 +68,10 @@ def test_without_overrides_the_evaluation_after_the_training_is_repeated(fly, tr
 
 
 def test_new_overrides_replace_those_of_the_run_and_the_others_apply(fly):
-    folder = fly("delay.obs=4", "seed=5", "agents=10")
+    folder = fly("delay.obs=4", "seed=5", "agents=10", "source=dynamic")
     config = OmegaConf.load(folder / "config.yaml")
     assert (config.delay.obs, config.seed, config.agents) == (4, 5, 10)
+    assert config.source.motion == "dynamic"  # an option replaces what its group sets
     assert (config.episode.max_steps, config.eval_episodes, config.model.hidden) == (10, 8, [16])
     flown = (damian.results(path).set_index("policy") for path in (folder, fly(folder="trained")))
     longer, shorter = (rows.at["random", "age"] for rows in flown)
@@ -86,16 +87,6 @@ def test_a_run_that_was_resumed_is_flown_and_begun_with_as_any_other(fly, traine
         fly("frames=32", of="longer", folder="begun", program="train") / "config.yaml"
     )
     assert (begun.resume, begun.frames, begun.seed) == (None, 32, 3)
-
-
-def test_an_option_replaces_what_its_group_sets_and_all_else_stays(fly):
-    config = OmegaConf.load(fly("delay=paper", "source=dynamic", "aware=none") / "config.yaml")
-    assert (config.delay.obs.law, config.delay.loss, config.source.motion) == (
-        "uniform",
-        0.0,
-        "dynamic",
-    )
-    assert (config.episode.max_steps, config.region.lattice_step, config.seed) == (10, 60, 3)
 
 
 def test_a_loaded_policy_flies_as_it_was_evaluated(trained):
