@@ -193,12 +193,11 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, kin
     check_equals_torchrls_way(scenario, delayed(scenario))
 
 
-@both_motions
 @pytest.mark.parametrize(
     "route", [pytest.param(r, marks=[pytest.mark.slow] * (r != "everything")) for r in ROUTES]
 )
-def test_a_compiled_step_equals_torchrls_too(motion, route):
-    scenario = everything(motion, **ROUTES[route])
+def test_a_compiled_step_equals_torchrls_too(route):
+    scenario = everything("polynomial", **ROUTES[route])
     check_equals_torchrls_way(scenario, delayed(scenario).compile(backend="eager"))
 
 

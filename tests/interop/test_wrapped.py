@@ -102,6 +102,7 @@ def test_pettingzoos_environment_does_what_torchrls_does():
     assert env.step({}) == ({}, {}, {}, {}, {})
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
 def test_every_world_of_the_vector_environment_equals_a_single_one(actions):
     options = {"overrides": [f"actions={actions}", "delay=paper", "episode.max_steps=5"]}

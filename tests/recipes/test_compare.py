@@ -20,7 +20,7 @@ from damian.runs.run_record import read_record
 
 ROOT = Path(__file__).parents[2]
 SMALL = ["frames=16", "worlds=2", "learner.steps=4", "learner.epochs=1"]
-SMALL += ["eval_episodes=3", "model.hidden=[4]"]
+SMALL += ["eval_episodes=3", "model.hidden=[4]", "episode.max_steps=8"]
 
 
 def listed(*words: str) -> str:
@@ -133,7 +133,7 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "others.yaml").write_text(LEARNING_FROM_OTHERS)
     shutil.copy(ROOT / "examples" / "extending" / "distillation.py", tmp_path)
-    small = listed(*(word for word in SMALL if "learner" not in word), "episode.max_steps=8")
+    small = listed(*(word for word in SMALL if "learner" not in word), "region.lattice_step=90")
     words = [
         "--config-dir",
         "conf",
@@ -240,7 +240,7 @@ def test_a_comparison_flies_policies_in_held_out_tasks(compare, tmp_path):
     (tmp_path / "mine/experiment").mkdir(parents=True)
     (tmp_path / "mine/experiment/script.yaml").write_text(HELD_OUT)
     words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
-    compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
+    compare(*words, listed(*SMALL, "observation.belief_cell=100"))
     results = tmp_path / "runs/script"
     assert (
         "## follow@two, delay late\n\nPolicies of another task."

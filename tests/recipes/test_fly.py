@@ -34,16 +34,16 @@ def printed_line(capsys) -> str:
 
 
 def test_a_run_folder_holds_configuration_episode_film_and_figure(fly, capsys):
-    folder = fly(*BADLY, "agents=2", "episode.max_steps=4", "formats=[gif,png,html,geojson]")
+    folder = fly(*BADLY, "agents=2", "episode.max_steps=2", "formats=[gif,png,html,geojson]")
     files = {"config.yaml", "run.json", "episode_0.json", "episode_0.geojson"}
     files |= {"episode_0.gif", "episode_0.png", "episode_0.html"}
     assert {path.name for path in folder.iterdir()} == files
-    assert "4 steps" in printed_line(capsys)
+    assert "2 steps" in printed_line(capsys)
     picture = imread(folder / "episode_0.png")
     assert picture.shape[1] == 1440
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 10
     with Image.open(folder / "episode_0.gif") as film:
-        assert film.n_frames == 5
+        assert film.n_frames == 3
         assert film.size == (720, 660)
 
 
