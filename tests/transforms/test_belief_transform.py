@@ -1,6 +1,7 @@
 """The transform ``Belief`` in an environment, and back-updated beliefs, against the slow twin."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -69,6 +70,7 @@ def expected(
     return torch.tensor(found)
 
 
+@cache
 def grids_of(env: DelayedEnv) -> list[SourceGrid]:
     """The tables of each source alone."""
     simulation = env.uav_env.simulation
