@@ -156,9 +156,8 @@ REGIONS = {
 }
 
 
-def random_actions(env: UavEnv, generator: torch.Generator) -> Tensor:
-    """Uniform random actions, [B, N] discrete or [B, N, 2] continuous, from the test's own
-    generator."""
+def random_actions(env: UavEnv, generator: torch.Generator | None = None) -> Tensor:
+    """Uniform random actions, [B, N] discrete or [B, N, 2] continuous."""
     shape = (*env.batch_size, env.n_agents)
     if env.scenario.actions.kind == "continuous":
         return torch.rand(*shape, 2, generator=generator)

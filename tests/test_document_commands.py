@@ -28,8 +28,9 @@ TINY = [
     "eval_episodes=2",
     "model.hidden=[8]",
     "logger=csv",
+    "region.lattice_step=60",
+    "episode.max_steps=12",
 ]
-TINY += ["region.lattice_step=60", "episode.max_steps=12"]
 OF_RUNS = f"overrides={json.dumps([word for word in TINY if word != 'logger=csv'])}".replace(
     '"', "'"
 )

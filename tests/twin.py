@@ -17,8 +17,6 @@ GLOBAL = [
     "source_time",
     "agent_distances",
     "coverage",
-]
-GLOBAL += [
     "mean_distance",
     "mean_distance_not_spotting",
     "mean_distance_spotting",

@@ -35,17 +35,9 @@ def periods(clock: SystemClock, *spotted: torch.Tensor) -> list[int]:
     return result
 
 
-@pytest.mark.parametrize(
-    ("clock", "message"),
-    [
-        ({"simulation": "1s", "agents": "1.5s"}, "clock.agents: 1.5s is not a multiple"),
-        ({"agents": "2s", "server": "3s"}, "clock.server: 3s is not a multiple of clock.agents=2s"),
-    ],
-)
-def test_impossible_periods_are_refused(clock, message):
-    with pytest.raises(InputError, match="clock") as error:
-        ClockConfig(**clock)
-    assert message in str(error.value)
+def test_an_impossible_period_is_refused():
+    with pytest.raises(InputError, match=r"clock.server: 3s is not a multiple of clock.agents=2s"):
+        ClockConfig(agents="2s", server="3s")
 
 
 def test_a_triggered_clock_stays_within_its_bounds():

@@ -25,8 +25,7 @@ def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioCo
 def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
     """The first output, and those after each of the same random actions."""
     env = make_env(scenario, 4, seed=1, extras=["message"])
-    generator = torch.Generator().manual_seed(0)
-    outputs = play(env, [random_actions(env.uav_env, generator) for _ in range(n_steps)])
+    outputs = play(env, [random_actions(env.uav_env) for _ in range(n_steps)])
     return [outputs[0], *outputs[1::2]]
 
 

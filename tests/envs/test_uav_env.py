@@ -33,9 +33,8 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
     skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
     td = skipping.reset()
     other = steady.reset()
-    generator = torch.Generator().manual_seed(0)
     for _ in range(6):
-        action = random_actions(steady.base_env, generator)
+        action = random_actions(steady.base_env)
         after = steady.step(other.clone().set(ACTION, action))["next"]
         for world in (0, 1):  # first the one, then the other
             mask = torch.arange(2) == world
@@ -68,10 +67,7 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
 @both_motions
 def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_terms(motion, kind):
     env = UavEnv(everything(motion, kind), num_worlds=16)
-    generator = torch.Generator().manual_seed(0)
-    td = env.rollout(
-        40, lambda td: td.set(ACTION, random_actions(env, generator)), break_when_any_done=False
-    )
+    td = env.rollout(40, lambda td: td.set(ACTION, random_actions(env)), break_when_any_done=False)
     for name in ("observation", "global_observation"):
         observation = td["next", "agents", name]
         ways = 4 * (3 * env.server.observation.timeline + 3)  # of the timeline, which come last
@@ -90,8 +86,7 @@ def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_t
 
 def test_set_seed_repeats_a_rollout_and_worlds_and_episodes_differ():
     env = UavEnv(everything(), num_worlds=8)
-    generator = torch.Generator().manual_seed(0)
-    actions = [random_actions(env, generator) for _ in range(12)]
+    actions = [random_actions(env) for _ in range(12)]
 
     def rollout(seed):
         env.set_seed(seed)

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
-from torchrl.envs import Compose, GymEnv, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
 from damian import (
@@ -119,55 +119,6 @@ def test_a_space_without_zero_asks_for_a_default_only_where_an_action_is_late():
 def test_gymnasiums_checker_finds_nothing(name, wide):
     late = DelayWrapper(gymnasium.make(name).unwrapped, Uniform(0, 3), 2, 1, **wide)
     check_env(late, skip_render_check=True)
-
-
-@pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
-@pytest.mark.parametrize(
-    ("observation", "action", "reward"),
-    [(0, 0, 0), (LOSSY, 0, 3), (1, by_time, by_time), (by_time, 2, 40)],
-)
-def test_history_timeline_and_rewards_are_those_of_the_transforms(
-    name, observation, action, reward
-):
-    delays = Compose(
-        ActionDelay(action),
-        ObservationDelay(observation, "observation", "held", delay_key="delay"),
-        RewardDelay(reward),
-        ActionHistory(3),
-        ObservationTimeline(7, "observation", delay_key="delay"),
-    )
-    reference = TransformedEnv(GymEnv(name, max_episode_steps=25), delays)
-    reference.set_seed(5)
-    inner = gymnasium.make(name, max_episode_steps=25)
-    inner.reset(seed=5)
-    env = DelayWrapper(inner, observation, action, reward, history=3, timeline=7)
-    rng = np.random.default_rng(0)
-    ends = 0
-    for _ in range(2):
-        now = reference.reset()
-        done = False
-        told, info = env.reset()
-        while not done:
-            assert env.observation_space.contains(told)
-            for key in ("age", "timeline", "action_history"):
-                assert np.array_equal(told[key], now[key].numpy()), key
-            assert np.array_equal(told["observation"], now["held"].numpy())
-            assert info["age"] == told["age"].item()
-            chosen = (
-                rng.uniform(-2, 2, 1).astype(np.float32)
-                if name == "Pendulum-v1"
-                else rng.integers(2)
-            )
-            now["action"] = torch.as_tensor(
-                chosen if name == "Pendulum-v1" else np.eye(2, dtype=int)[chosen]
-            )
-            now = reference.step(now)["next"]
-            told, received, terminated, truncated, info = env.step(chosen)
-            assert received == pytest.approx(now["reward"].item(), rel=1e-5)
-            done = terminated or truncated
-            assert done == now["done"].item()
-        ends += 1
-    assert ends == 2
 
 
 def test_every_reward_is_received_once_and_the_info_tells_when_it_was_earned():

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase, StepCounter
 
-from damian import BackupdateStorage, DelayConfig, make_env
+from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.recompute import server_recompute
 from damian.keys import HIDDEN, HIDDEN_BEFORE
@@ -24,7 +24,6 @@ from damian.server.config import EpisodeConfig
 GRU = MlpConfig(hidden=[16, 8], rnn="gru")
 ROUNDING = 3e-5
 """Largest difference between numbers that are computed step by step and in one batch."""
-OBSERVATION, ACTION = (("agents", name) for name in ("observation", "action"))
 
 both_kinds_and_motions = pytest.mark.parametrize(
     ("kind", "motion"),
@@ -96,7 +95,7 @@ def test_a_batch_from_the_replay_buffer_keeps_its_first_hidden_state(settle):
         corrected = learner.backupdated_batch(batch)
         flown = flight[:, begin : begin + corrected.shape[1]]
         assert corrected[HIDDEN_BEFORE].equal(flown[HIDDEN_BEFORE])
-        assert corrected[OBSERVATION].equal(flown[OBSERVATION])
+        assert corrected[keys.OBSERVATION].equal(flown[keys.OBSERVATION])
         assert (ratios(learner, corrected) - 1).abs().max() < ROUNDING
         begin += corrected.shape[1]
     assert begin == 30 - settle

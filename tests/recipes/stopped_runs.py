@@ -20,8 +20,17 @@ from damian.recipes.train import main
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.metrics_log import MetricsLog
 
-TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "checkpoint_every=3"]
-TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]
+TINY = [
+    "worlds=4",
+    "learner.steps=8",
+    "eval_episodes=2",
+    "model.hidden=[8]",
+    "checkpoint_every=3",
+    "region.lattice_step=60",
+    "episode.max_steps=12",
+    "frames=256",
+    "logger=csv",
+]
 SAC = ["learner=sac", "learner.updates=1", "learner.batch_size=16", "learner.warm_up=40"]
 SAC += ["learner.buffer_steps=160"]
 FINISHED = {

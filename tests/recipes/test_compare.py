@@ -19,8 +19,15 @@ from damian.runs.checkpoint import digest
 from damian.runs.run_record import read_record
 
 ROOT = Path(__file__).parents[2]
-SMALL = ["frames=16", "worlds=2", "learner.steps=4", "learner.epochs=1"]
-SMALL += ["eval_episodes=3", "model.hidden=[4]", "episode.max_steps=8"]
+SMALL = [
+    "frames=16",
+    "worlds=2",
+    "learner.steps=4",
+    "learner.epochs=1",
+    "eval_episodes=3",
+    "model.hidden=[4]",
+    "episode.max_steps=8",
+]
 
 
 def listed(*words: str) -> str:
@@ -225,33 +232,6 @@ def test_a_mistake_is_one_line_and_leaves_no_folder(
     words = words if text else [*TWO[:3], *words]
     check_refused(lambda: compare("--config-dir=own", *words), message, capsys)
     assert [*tmp_path.glob("runs/*")] == []
-
-
-HELD_OUT = """\
-tasks: {follow: [scenario=delaybench/tracking]}
-delays: {late: [delay.obs=2]}
-methods: {best: {delayed: false}, naive: {naive: true}}
-held_out: {two: {overrides: [agents=2], tasks: [follow]}}
-"""
-
-
-@pytest.mark.slow
-def test_a_comparison_flies_policies_in_held_out_tasks(compare, tmp_path):
-    (tmp_path / "mine/experiment").mkdir(parents=True)
-    (tmp_path / "mine/experiment/script.yaml").write_text(HELD_OUT)
-    words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
-    compare(*words, listed(*SMALL, "observation.belief_cell=100"))
-    results = tmp_path / "runs/script"
-    assert (
-        "## follow@two, delay late\n\nPolicies of another task."
-        in (results / "table.md").read_text()
-    )
-    for method in ("none/best", "late/naive"):
-        flown = results / "follow@two" / method / "seed_0"
-        config = (flown / "config.yaml").read_text()
-        assert re.search(f"checkpoint: .*/follow/{method}/seed_0", config)
-        assert "agents: 2" in config
-        assert not (flown / "metrics.csv").exists()
 
 
 def test_runs_go_seed_by_seed_and_a_held_out_delay_replaces_the_one_of_the_training():

@@ -25,8 +25,11 @@ TRAINED = [
     "model.hidden=[16]",
     "eval_episodes=8",
     "logger=csv",
+    "episode.max_steps=10",
+    "region.lattice_step=60",
+    "seed=3",
+    "delay.obs=1",
 ]
-TRAINED += ["episode.max_steps=10", "region.lattice_step=60", "seed=3", "delay.obs=1"]
 SHIPPED = sorted(Path(damian.__file__).parent.glob("data/*/"))
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from episodes import flight
-from helpers import check_refused
 from matplotlib.image import imread
 from PIL import Image
 
@@ -90,25 +89,6 @@ def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(fly, c
     assert lost
     assert not lost & believed
     assert f"lost {len(lost) / episode.sent.sum():.1%}" in printed_line(capsys)
-
-
-@pytest.mark.sample(2)
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["policy=deterministic"], "policy: deterministic needs checkpoint"),
-        (["agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
-        (
-            ["formats=[geojson]", "region=usecase"],
-            "geojson: its region has no latitude and longitude",
-        ),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
-    fly, capsys, tmp_path, overrides, message
-):
-    check_refused(lambda: fly(*overrides), message, capsys)
-    assert [*tmp_path.glob("*/*")] == []
 
 
 def test_a_page_has_the_episodes_in_the_order_of_their_files(run, capsys):

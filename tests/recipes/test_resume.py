@@ -13,16 +13,22 @@ from typing import Any
 import pytest
 from stopped_runs import SAC, TINY, check_equal, counted_updates, ended, files, forked, killed_after
 
-WHOLE = ["delay=paper", "delay.obs.high=9s", "aware=backupdate+history", "delay.act=1"]
-WHOLE += ["motion=polynomial", "model.rnn=gru"]
+WHOLE = [
+    "delay=paper",
+    "delay.obs.high=9s",
+    "aware=backupdate+history",
+    "delay.act=1",
+    "motion=polynomial",
+    "model.rnn=gru",
+]
 TRIGGERED = [
     "learner.steps=4",
     "clock.trigger=2s",
     "clock.longest=10s",
     "source.level_db=106",
     "delay.obs=2",
+    "learner.normalize_value=true",
 ]
-TRIGGERED += ["learner.normalize_value=true"]
 SLOW_CLOCKS = [
     "delay=paper",
     "delay.obs.high=9s",

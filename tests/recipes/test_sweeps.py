@@ -27,8 +27,11 @@ TINY = [
     "eval_episodes=2",
     "model.hidden=[4]",
     "logger=csv",
+    "region.lattice_step=90",
+    "episode.max_steps=8",
+    "learner.minibatches=1",
+    "agents=1",
 ]
-TINY += ["region.lattice_step=90", "episode.max_steps=8", "learner.minibatches=1", "agents=1"]
 
 
 @pytest.fixture

@@ -23,8 +23,10 @@ TINY = [
     "eval_episodes=2",
     "model.hidden=[4]",
     "logger=csv",
+    "region.lattice_step=90",
+    "episode.max_steps=8",
+    "learner.minibatches=1",
 ]
-TINY += ["region.lattice_step=90", "episode.max_steps=8", "learner.minibatches=1"]
 MODULE = """
 from pathlib import Path
 Path(r'{}').touch()

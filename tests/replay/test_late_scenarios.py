@@ -98,7 +98,6 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "late messages and rewards": {"delay": DelayConfig(obs=LATE, rew=LATE)},
     "late and summed rewards": {"delay": DelayConfig(rew=LATE, **SUMMED)},
-    "late rewards, slow server": {"delay": DelayConfig(rew=3), "clock": ClockConfig(server="2s")},
     "order of arrival": {
         "delay": DelayConfig(obs=LATE, rew=3, order="arrival", **SUMMED),
         "clock": ClockConfig(server="4s"),
@@ -106,10 +105,6 @@ CASES: dict[str, dict[str, Any]] = {
     "slow agents, history": {
         "delay": DelayConfig(obs=LATE, rew=LATE, history=2, **SUMMED),
         "clock": ClockConfig(server="2s", agents="4s"),
-    },
-    "late messages, timeline": {
-        "delay": DelayConfig(obs=LATE),
-        "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7),
     },
     "late messages of two stops, timeline": {
         "delay": DelayConfig(obs=LATE),

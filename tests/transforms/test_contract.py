@@ -168,8 +168,6 @@ PAIRS = {
     for name, kind in GROUPS.items()
 }
 """Every kind of environment with every transform, and with a channel where that works."""
-DRAWING = {name: pair for name, pair in PAIRS.items() if "Delay" in name or "Channel" in name}
-drawing = pytest.mark.parametrize(("kind", "make"), DRAWING.values(), ids=DRAWING)
 
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -445,26 +443,6 @@ def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(k
 
 
 # Seeds.
-
-
-@drawing
-def test_set_seed_reaches_the_transforms_of_an_environment(kind, make):
-    env = TransformedEnv(kind.make(), make(kind, Uniform(0, 20)))
-    outputs = []
-    streams = []
-    for number, seed in enumerate((3, 4, 3)):
-        torch.manual_seed(number)  # the state of torch's generator does not matter
-        set_seed(env, seed)
-        outputs.append([env.reset()])
-        streams.append(env.transform.memory["streams"].clone())
-        torch.manual_seed(0)
-        for _ in range(3):
-            after, td = env.step_and_maybe_reset(env.rand_action(outputs[-1][-1].clone()))
-            outputs[-1] += [after["next"], td]
-    assert streams[0].equal(streams[2])
-    assert not set(streams[0].tolist()) & set(streams[1].tolist())
-    if kind is not KINDS["VMAS"]:  # VMAS itself goes on with its earlier random state
-        assert all_same(outputs[0], outputs[2])
 
 
 @pytest.mark.parametrize("wrap", [False, True], ids=["one environment", "nested environments"])

@@ -68,12 +68,11 @@ def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
     )  # % a second
     gain = 100 * battery.charging_power_kw / (3600 * battery.capacity_kwh)
     hardest = 10 * math.sqrt(3) / 3
-    generator = torch.Generator().manual_seed(0)
     flown = 0
     levels = env.state.battery.tolist()
     before = env.state.position[..., :2].tolist()
     for _ in range(12):
-        act(env, random_actions(env, generator))
+        act(env, random_actions(env))
         after = env.state.position[..., :2].tolist()
         for b, n in [(b, n) for b in range(4) for n in range(3)]:
             way = math.dist(before[b][n], after[b][n])

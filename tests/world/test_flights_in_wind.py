@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import clock
+from helpers import clock, play
 
 from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.common import counter_rng
@@ -184,17 +184,8 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
     scenarios = [replace(STILL, delay=DelayConfig(law), randomise={"delay.loss": losses})]
     scenarios += [replace(STILL, delay=DelayConfig(law, loss=loss)) for loss in losses]
     envs = [make_env(each, 12, 0, extras=["message"]) for each in scenarios]
-    actions = [
-        torch.randint(24, (12, 3), generator=torch.Generator().manual_seed(i)) for i in range(60)
-    ]
-    flown = []
-    for env in envs:
-        td = env.reset()
-        steps = []
-        for action in actions:
-            before, td = env.step_and_maybe_reset(td.set(("agents", "action"), action))
-            steps.append(before["next"])
-        flown.append(torch.stack(steps, 1))
+    actions = [*torch.randint(24, (60, 12, 3))]
+    flown = [torch.stack(play(env, actions)[1::2], 1) for env in envs]
     drawn = flown[0]["agents", "loss"][..., 0, 0]
     assert len(drawn.unique()) == 3
     for loss, one in zip(losses, flown[1:], strict=True):

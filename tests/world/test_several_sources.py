@@ -30,7 +30,7 @@ def scenario(source: SourceConfig, **changed) -> ScenarioConfig:
     return ScenarioConfig(agents=3, **settings | changed)
 
 
-def test_each_source_is_detected_as_if_it_were_the_only_one():
+def test_features_tell_of_the_nearest_source_and_of_the_newest_detection():
     together = UavEnv(scenario(SourceConfig(count=3, each=EACH)), 8, seed=1)
     alone = [UavEnv(scenario(SourceConfig(**each)), 8, seed=1) for each in EACH]
     for env in (together, *alone):
@@ -41,17 +41,11 @@ def test_each_source_is_detected_as_if_it_were_the_only_one():
         at = torch.cat([place, torch.zeros_like(place[..., :1])], -1)
         moved = env.state._replace(goal=start, origin=start, position=at)
         env.state = env.simulation._first_messages(moved)
-    generator = torch.Generator().manual_seed(0)
     for _ in range(25):
-        action = torch.randint(40, (8, 3), generator=generator)
+        action = torch.randint(40, (8, 3))
         for env in (together, *alone):
             env.worlds, _ = env.step_fn(env.worlds, action)
-        sent = together.state.sent
-        assert sent.spotted.equal(torch.stack([env.state.sent.spotted for env in alone]).any(0))
-        for number, env in enumerate(alone):
-            one = env.state.sent
-            assert sent.detected_time[..., number].equal(one.detected_time[..., 0])
-            assert sent.detected_position[..., number, :].equal(one.detected_position[..., 0, :])
+    sent = together.state.sent
     assert (sent.detected_time > 0).any(dim=0).all()
     features = together.server.features(sent, together.state.steps)
     ones = [env.server.features(env.state.sent, env.state.steps) for env in alone]

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-import torch
 from helpers import KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
 
 from damian import ScenarioConfig, UavEnv
@@ -104,11 +103,10 @@ def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
     )
     env = fresh(scenario, num_worlds=6)
     worlds = twins(env)
-    generator = torch.Generator().manual_seed(0)
     begun = spotting = 0
     for step in range(1, 41):
         ready = env.simulation.vehicles.ready(env.state).tolist()
-        output = act(env, random_actions(env, generator))
+        output = act(env, random_actions(env))
         goals = env.simulation.points[env.state.goal].tolist()
         sent = sent_messages(output)
         told = output["agents", "message_sent"].tolist()

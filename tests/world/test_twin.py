@@ -106,7 +106,6 @@ def check_observation(world: twin.World, observation: torch.Tensor):
 def test_rollouts_equal_those_of_the_twin(n_agents, kind, since):
     env = UavEnv(twin_scenario(n_agents, kind, since), num_worlds=12, seed=n_agents)
     table = action_table(env.scenario.actions)
-    generator = torch.Generator().manual_seed(n_agents)
     compared = ended = spotted = 0
     for _ in range(3):
         output = env.reset()
@@ -114,7 +113,7 @@ def test_rollouts_equal_those_of_the_twin(n_agents, kind, since):
         for b, world in enumerate(worlds):
             check_observation(world, output["agents", "global_observation"][b])
         for _ in range(8):
-            action = random_actions(env, generator)
+            action = random_actions(env)
             moves = (
                 table[action] if kind == "discrete" else action * torch.tensor([118.4, math.tau])
             )
@@ -146,10 +145,9 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         episode=KEEPS_GOING,
     )
     env = fresh(scenario, num_worlds=3)
-    generator = torch.Generator().manual_seed(0)
     trails = env.state.position[..., :2].unsqueeze(2).expand(-1, -1, window, -1)
     for _ in range(5):
-        output = act(env, random_actions(env, generator))
+        output = act(env, random_actions(env))
         newest = env.state.position[..., :2].unsqueeze(2)
         trails = torch.cat([newest, trails[:, :, :-1]], 2)
         for b, region in enumerate(env.state.region.tolist()):
