@@ -4,9 +4,6 @@ step."""
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
-
-from damian.server.belief import SourceGrid
 
 Steps = Sequence[tuple[list[int], list[int]]]
 """For each step the rows of ``SourceGrid.log_reports`` that UAVs send, and the delays of these
@@ -14,13 +11,13 @@ messages."""
 
 
 def belief(
-    grid: SourceGrid,
-    place: int,
-    first: list[int],
-    steps: Steps,
-    now: int,
-    viewer: int | None = None,
-) -> list[float]:
+    grid,
+    place,
+    first,
+    steps,
+    now,
+    viewer=None,
+):
     """Probability of each cell after the last of the steps, knowing what has arrived by step
     ``now``.
 
@@ -45,7 +42,7 @@ def belief(
     return probable
 
 
-def moves_of(grid: SourceGrid, place: int) -> list[list[float]]:
+def moves_of(grid, place):
     """Probabilities of the moves of a source from cell to cell, [C][C]; it stays in its region."""
     if grid.moves is None:
         return torch.eye(len(grid.centres)).tolist()
@@ -53,19 +50,19 @@ def moves_of(grid: SourceGrid, place: int) -> list[list[float]]:
     return (inside / inside.sum(-1, keepdim=True)).nan_to_num().tolist()
 
 
-def _moved(moves: list[list[float]], probable: list[float]) -> list[float]:
+def _moved(moves, probable):
     return [
         sum(chance * to for chance, to in zip(probable, column, strict=True))
         for column in zip(*moves, strict=True)
     ]
 
 
-def emission_of(grid: SourceGrid, place: int) -> float:
+def emission_of(grid, place):
     """Probability that a source emits in a step."""
     return 1.0 if grid.emits is None else float(grid.emits[place])
 
 
-def _weighed(grid: SourceGrid, place: int, probable: list[float], rows: list[int]) -> list[float]:
+def _weighed(grid, place, probable, rows):
     emits = emission_of(grid, place)
     alarm = float(grid.false_alarm[place])
     reports = [grid.log_reports[row].exp().tolist() for row in rows]
@@ -81,7 +78,7 @@ def _weighed(grid: SourceGrid, place: int, probable: list[float], rows: list[int
     return [each / sum(weighed) for each in weighed]
 
 
-def chance_at(grid: SourceGrid, place: int, probable: Tensor, point: int) -> float:
+def chance_at(grid, place, probable, point):
     """Probability of detecting the source in the next step from a landing point, by its flat id."""
     emits = emission_of(grid, place)
     detects = grid.log_reports[1 : grid.no_report // 2 : 2].exp()[point].tolist()

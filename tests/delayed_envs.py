@@ -1,17 +1,11 @@
 """Scenarios with every kind of delay and clock, and how tests step them."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import pytest
 import torch
 from delay_twin import Crowd
 from helpers import random_actions
-from tensordict import TensorDictBase
-from torch import Tensor
-from torchrl.envs import EnvBase
 
-from damian import ClockConfig, DelayConfig, ScenarioConfig, make_env
+from damian import ClockConfig, DelayConfig, make_env
 from damian.envs.uav_env import EXTRAS
 from damian.server.config import ObservationConfig
 
@@ -38,16 +32,16 @@ DELAYS = {
 every_delay = pytest.mark.parametrize("delays", DELAYS)
 
 
-def delayed(scenario: ScenarioConfig, n_worlds: int = 4, **options: Any) -> EnvBase:
+def delayed(scenario, n_worlds=4, **options):
     return make_env(scenario, n_worlds, extras=EXTRAS, **options)
 
 
-def choices(env: EnvBase, n_steps: int) -> list[Tensor]:
+def choices(env, n_steps):
     """Random actions, the same at each call."""
     generator = torch.Generator().manual_seed(3)
     return [random_actions(env, generator) for _ in range(n_steps)]
 
 
-def after_steps(outputs: Sequence[TensorDictBase], key: Any) -> Tensor:
+def after_steps(outputs, key):
     """An entry of the outputs of ``play`` after each step, [T, B, ...]."""
     return torch.stack([td[key] for td in outputs[1::2]])

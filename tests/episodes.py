@@ -8,7 +8,7 @@ from damian.show.episode import Episode
 SQUARE = shapely.box(-200.0, -200.0, 200.0, 200.0)
 
 
-def flight(n_steps: int = 3, **changes) -> Episode:
+def flight(n_steps=3, **changes):
     """An episode of two UAVs that stand still, of which the server knows the places; the source is
     silent."""
     t = n_steps + 1
@@ -40,7 +40,7 @@ UNKNOWN_SOURCE = {"source": None, "emits": None}
 """Changes of a flight of three steps whose task has no source, and whose source nobody knows."""
 
 
-def crowd(n_steps: int = 3, **changes) -> Episode:
+def crowd(n_steps=3, **changes):
     """An episode of 20 UAVs, ten at each of two places."""
     few = flight(n_steps)
     names = "position target battery believed track age reward spotted sent delay"

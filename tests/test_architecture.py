@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -30,7 +29,7 @@ FOR_ALL = (
 """What the programs share."""
 
 
-def module_of(path: Path) -> str:
+def module_of(path):
     """Name of a module, as it is installed: the recipes are a package of damian."""
     parts = path.relative_to(ROOT.parent).with_suffix("").parts
     parts = ("damian", *parts) if parts[0] == "recipes" else parts
@@ -43,7 +42,7 @@ MODULES = {
 FILES = [*MODULES.values()]
 
 
-def imported(module: str, strings: bool = False) -> Iterator[str]:
+def imported(module, strings=False):
     """Every module, or name within one, that a module imports anywhere; also those that ``strings``
     name."""
     package = module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
@@ -60,7 +59,7 @@ def imported(module: str, strings: bool = False) -> Iterator[str]:
             yield from re.findall(r"^(damian(?:\.\w+)+)(?::\w+)?$", node.value)
 
 
-def is_in(name: str, modules: Iterable[str]) -> bool:
+def is_in(name, modules):
     """Whether a module, or a name within one, is one of these modules or in one of them."""
     return any(f"{name}.".startswith(f"{module}.") for module in modules)
 

@@ -4,8 +4,6 @@ somewhere."""
 import re
 import runpy
 import shlex
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import yaml
@@ -34,7 +32,7 @@ def test_the_readmes_python_runs(capsys):
     assert 0.9 < corrected < 1
 
 
-def commands(file: Path) -> Iterator[tuple[str, list[str]]]:
+def commands(file):
     """The commands that a file names: program and words."""
     text = file.read_text(encoding="utf-8").replace("\\\n", "")
     for line in re.findall(r"(?:^[ #]*|`)damian ([a-z]+ [^`\n|]*)", text, re.MULTILINE):

@@ -54,14 +54,14 @@ INSTEAD = {
 PARK = [[-4.134, 52.808], [-4.122, 52.808], [-4.122, 52.817], [-4.134, 52.817], [-4.134, 52.808]]
 
 
-def commands(text: str) -> list[list[str]]:
+def commands(text):
     """The words of the commands in the blocks of a document, without ``damian``."""
     blocks = re.findall(r"^```\w*\n(.*?)^```", text.replace("\\\n", ""), re.DOTALL | re.MULTILINE)
     lines = [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
     return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("damian ")]
 
 
-def shortened(words: list[str]) -> list[str]:
+def shortened(words):
     """A command with tiny numbers."""
     words = [INSTEAD.get(word, word) for word in words]
     if shutil.which("ffmpeg") is None:
@@ -81,7 +81,7 @@ COMMANDS = {file.name: commands(file.read_text()) for file in DOCUMENTS}
 COMMANDS = {name: found for name, found in COMMANDS.items() if found}
 
 
-def call(words: list[str], folder: Path) -> str:
+def call(words, folder):
     """Run a command in a folder; returns what it prints."""
     done = subprocess.run(
         [*PROGRAM, *words],
@@ -98,7 +98,7 @@ def call(words: list[str], folder: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
+def trained(tmp_path_factory):
     """A trained run and the files that the documents name."""
     folder = tmp_path_factory.mktemp("documents")
     call(["train", *TINY, "hydra.run.dir=runs/FOLDER"], folder)
@@ -124,11 +124,9 @@ def trained(tmp_path_factory) -> Path:
     return folder
 
 
-def write_journal(path: Path) -> None:
+def write_journal(path):
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines: list[dict] = [
-        {"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A", "B"]}
-    ]
+    lines = [{"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A", "B"]}]
     for n in range(60):
         row = {
             "ID": "AB"[n % 2],

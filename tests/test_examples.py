@@ -8,7 +8,6 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,12 +35,12 @@ is."""
 DOCUMENT = (ROOT / "docs" / "backupdating.md").read_text()
 
 
-def load(name: str) -> dict[str, Any]:
+def load(name):
     """The names that an example defines, whose program does not run."""
     return runpy.run_path(str(EXAMPLES / f"{name}.py"))
 
 
-def run(name: str) -> dict[str, Any]:
+def run(name):
     """The names that an example about transforms defines when its program runs."""
     return runpy.run_path(str(EXAMPLES / "transforms" / f"{name}.py"), run_name="__main__")
 

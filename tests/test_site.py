@@ -4,8 +4,6 @@ there."""
 import html
 import posixpath
 import re
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 import yaml
@@ -37,7 +35,7 @@ def test_every_link_and_anchor_of_the_site_leads_somewhere():
     assert nowhere == []
 
 
-def leaves(nav: Any) -> Iterator[str]:
+def leaves(nav):
     """The pages of a navigation."""
     if isinstance(nav, str):
         yield nav

@@ -6,12 +6,11 @@ from helpers import SQUARE, square
 
 from damian import DelayConfig, keys, make_env
 from damian.baselines.script import Searcher, script_policy
-from damian.envs.delayed_env import DelayedEnv
 from damian.server.config import ObservationConfig, RewardConfig
 from damian.world.config import ActionConfig, RegionConfig
 
 
-def believing(own: bool = False, **changed) -> DelayedEnv:
+def believing(own=False, **changed):
     """Three UAVs in the south-west of a square, which fly up to 300 m in 16 directions."""
     region = RegionConfig(
         kind="vertices",

@@ -11,7 +11,7 @@ N = 20_000
 
 
 def test_the_hash_agrees_with_a_plain_python_implementation():
-    def mixed(key: int, counter: int) -> int:
+    def mixed(key, counter):
         mask = 2**64 - 1
         x = (counter * 0x9E3779B97F4A7C15 & mask) ^ key
         x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 & mask

@@ -23,7 +23,7 @@ METHODS = {
 }
 
 
-def row(task: str, delay: str, method: str, seed: int, value: float, policy: str = TRAINED) -> dict:
+def row(task, delay, method, seed, value, policy=TRAINED):
     """A row of results in which every measure has the same value."""
     labels = {"task": task, "delay": delay, "method": method, "regime": "late data"}
     labels |= {"seed": seed, "policy": policy}
@@ -34,9 +34,7 @@ def row(task: str, delay: str, method: str, seed: int, value: float, policy: str
     )
 
 
-def rows_of(
-    task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0
-) -> list[dict]:
+def rows_of(task, delay, scores, random=0.0):
     """Rows of every method, seed and policy, from the values of the methods by seed."""
     return [
         row(task, "none" if method == "best" else delay, method, seed, x, policy)
@@ -46,9 +44,7 @@ def rows_of(
     ]
 
 
-def comparison(
-    rows: list[dict] | pd.DataFrame, methods: dict[str, Method] = METHODS, curves: list = ()
-) -> Comparison:
+def comparison(rows, methods=METHODS, curves=()):
     columns = [
         "task",
         "delay",
@@ -61,7 +57,7 @@ def comparison(
     return Comparison(pd.DataFrame(rows), pd.DataFrame(curves, columns=columns), methods)
 
 
-def compared(found: Comparison) -> dict[str, dict]:
+def compared(found):
     """Lines of the delayed methods of a table by method."""
     table = found.table
     lines = table[

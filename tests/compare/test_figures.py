@@ -23,7 +23,7 @@ DEUTERANOPIA = [
 """What is seen without green receptors, in linear RGB (Machado, Oliveira and Fernandes 2009)."""
 
 
-def oklab(colour: str, seen: np.ndarray) -> np.ndarray:
+def oklab(colour, seen):
     srgb = np.array(to_rgb(colour))
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.array(TO_LAB) @ np.cbrt(np.array(TO_CONES) @ (seen @ linear).clip(0, 1))

@@ -24,7 +24,7 @@ def test_recovery_is_nan_if_the_delay_costs_less_than_a_tenth(naive, defined):
     assert np.isnan(recovery(scores)) == (not defined)
 
 
-def exact_interval(values: list[float], weights: list[float]) -> tuple[float, float]:
+def exact_interval(values, weights):
     """The 95 % percentile interval of a discrete distribution with these values and weights."""
     total = 0.0
     low = math.nan

@@ -24,7 +24,7 @@ DELAYS = {"level": LEVEL, "uniform": UNIFORM, "bursts": HELD, "queue": QUEUE, "b
 DELAYS |= {"newest first": NEWEST_FIRST}
 
 
-def log_of(delays, behind=0.0, numbers=None, uav="u1") -> pd.DataFrame:
+def log_of(delays, behind=0.0, numbers=None, uav="u1"):
     """A log of a sender whose clock is behind by so much [s], in the order in which it came in."""
     log = pd.DataFrame({"uav": uav, "time": TIMES - behind, "received": TIMES + delays})
     log["sequence"] = np.arange(N, dtype=float) if numbers is None else numbers
@@ -32,7 +32,7 @@ def log_of(delays, behind=0.0, numbers=None, uav="u1") -> pd.DataFrame:
     return log.sample(frac=1, random_state=0)
 
 
-def wrong_ones(log: pd.DataFrame) -> list[int]:
+def wrong_ones(log):
     messages = in_order(log)
     return sorted(messages.index[~are_right(messages)])
 

@@ -14,7 +14,7 @@ from damian.delays.laws import LONGEST, Burst, Lag, Law, Uniform
 from damian.delays.scenario import ScenarioDelays
 
 
-def delays(**settings) -> ScenarioDelays:
+def delays(**settings):
     """The delays of a scenario with these settings."""
     return ScenarioDelays(DelayConfig(**settings), LinkConfig(), 1.0)
 

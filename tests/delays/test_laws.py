@@ -7,22 +7,21 @@ from importlib.resources import files
 import pytest
 import torch
 from delay_twin import drawn
-from torch import Tensor
 
-from damian import Sampler, compose_scenario
+from damian import compose_scenario
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform, in_steps, law_of
+from damian.delays.laws import Burst, Constant, Geometric, Trace, Uniform, in_steps, law_of
 
 STREAMS, STEPS = 1000, 100
 """Size of a sample: 10^5 messages."""
 
 
-def sample(sampler: Sampler, n_streams: int = STREAMS, n_steps: int = STEPS) -> Tensor:
+def sample(sampler, n_streams=STREAMS, n_steps=STEPS):
     """Draw the delays of one message per stream and step, [T, M]."""
     return drawn(sampler, counter_rng.world_seeds(5, n_streams), n_steps)
 
 
-def check_chances(sampler: Sampler, chances: dict[int, float], delays: Tensor) -> None:
+def check_chances(sampler, chances, delays):
     """Compare the frequencies of delays with exact probabilities, within five deviations of
     chi-square.
 
@@ -44,7 +43,7 @@ def check_chances(sampler: Sampler, chances: dict[int, float], delays: Tensor) -
 
 PAPER = Uniform("3s", "7s", 0.15)
 
-LAWS: dict[str, tuple[Law, float, dict[int, float]]] = {
+LAWS = {
     "none": (Constant(), 1.0, {0: 1.0}),
     "steps": (Constant(3), 1.0, {3: 1.0}),
     "a time, rounded up": (Constant("0.5m"), 20.0, {2: 1.0}),
@@ -74,12 +73,12 @@ def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
         assert sampler.constant_delay == only
 
 
-def within(found: float, exact: float, deviation: float) -> bool:
+def within(found, exact, deviation):
     """Is the sample mean within five standard deviations of the exact one?"""
     return abs(found - exact) <= 5 * deviation
 
 
-def share(flags: Tensor) -> tuple[float, int]:
+def share(flags):
     """Mean of the flags, and their number."""
     return flags.double().mean().item(), flags.numel()
 
@@ -110,7 +109,7 @@ def test_losses_of_the_channel_state_and_general_losses_combine():
     check_chances(sampler, chances, sample(sampler))
 
 
-def trace(tmp_path, *rows: str, header: str = "delay") -> Trace:
+def trace(tmp_path, *rows, header="delay"):
     file = tmp_path / "trace.csv"
     file.write_text("\n".join([header, *rows]) + "\n")
     return Trace(str(file))

@@ -18,7 +18,7 @@ DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
 """Of the messages of a UAV [s]; None: lost."""
 
 
-def table(numbered: bool = True, period: float = 1.0, uavs: int = 2, start: float = 1.7e9) -> str:
+def table(numbered=True, period=1.0, uavs=2, start=1.7e9):
     """A table of reports in the order in which they came in, one of them twice."""
     rows = []
     for uav in range(uavs):
@@ -41,7 +41,7 @@ def fitted_log(path):
 
 @pytest.fixture
 def log(tmp_path):
-    def written(text: str, name: str = "reports.csv"):
+    def written(text, name="reports.csv"):
         path = tmp_path / name
         path.write_text(text)
         return path

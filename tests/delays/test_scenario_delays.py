@@ -32,11 +32,11 @@ def test_an_environment_reads_a_trace_once(tmp_path):
     env.rollout(3)
 
 
-def write_trace(path, delay: int) -> None:
+def write_trace(path, delay):
     path.write_text("delay\n" + f"{delay}\n" * 20)
 
 
-def write_region(path, side: int) -> None:
+def write_region(path, side):
     places = [
         [x * side * 1e-5, y * side * 1e-5] for x, y in [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
     ]

@@ -5,7 +5,6 @@ import itertools
 import pytest
 import torch
 from helpers import square
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from damian import ClockConfig, DelayConfig
@@ -22,11 +21,11 @@ NOT_SPOTTED = torch.tensor([[False, False]])
 WORLDS = 4
 
 
-def triggered(period: int, trigger: str = "2s", **bounds: str) -> SystemClock:
+def triggered(period, trigger="2s", **bounds):
     return SystemClock(ClockConfig(trigger=trigger, **bounds), period)
 
 
-def periods(clock: SystemClock, *spotted: torch.Tensor) -> list[int]:
+def periods(clock, *spotted):
     """The period after each tick."""
     result = []
     for flags in spotted:
@@ -77,14 +76,14 @@ def test_the_period_shrinks_if_the_source_is_spotted_in_half_of_the_worlds_or_mo
 # Batches that the training recipe collects between two ticks.
 
 
-def config(clock: ClockConfig, level_db: float) -> TrainConfig:
+def config(clock, level_db):
     scenario = square(episode=EpisodeConfig(max_steps=7), delay=DelayConfig(obs=2))
     scenario.source.level_db = level_db
     sections = {name: getattr(scenario, name) for name in ("region", "source", "episode", "delay")}
     return TrainConfig(**sections, clock=clock, worlds=WORLDS, backupdate=True)
 
 
-def batches(config: TrainConfig, n_steps: int, period: int) -> list[tuple[int, TensorDictBase]]:
+def batches(config, n_steps, period):
     """Batches of ``n_steps`` steps or more in all, each with the system clock's period at that
     time."""
     env = learning_env(config)

@@ -1,22 +1,17 @@
 """``DelayedEnv``: what holds in a scenario with any delays, losses and clocks, eager and
 compiled."""
 
-from collections.abc import Sequence
-
 import pytest
 import torch
 from delayed_envs import DELAYS, after_steps, choices, delayed, every_delay
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, square
-from tensordict import TensorDictBase
-from torchrl.envs import EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
+from torchrl.envs import RewardSum, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian import (
-    ScenarioConfig,
     compose_scenario,
 )
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env, make_transforms
 from damian.envs.uav_env import EXTRAS, UavEnv
@@ -34,7 +29,7 @@ from damian.world.config import ActionConfig
 # Without delays.
 
 
-def check_equals_undelayed(env: EnvBase, scenario: ScenarioConfig, n_steps: int = 25) -> None:
+def check_equals_undelayed(env, scenario, n_steps=25):
     """Everything that the environment without transforms outputs is output, bit for bit."""
     undelayed = UavEnv(scenario, env.batch_size[0])
     expected = play(undelayed, choices(undelayed, n_steps))
@@ -73,13 +68,13 @@ class FalsifyMessage(Transform):
     """Changes the position in the message that one UAV sends in one step, for all later
     transforms."""
 
-    def __init__(self, world: int, agent: int, step: int) -> None:
+    def __init__(self, world, agent, step):
         super().__init__()
         self.sender = (world, agent)
         self.step_to_change = step
         self.steps = 0
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(self, tensordict, next_tensordict):
         self.steps += 1
         if self.steps == self.step_to_change:
             message = next_tensordict[MESSAGE].clone()
@@ -87,9 +82,7 @@ class FalsifyMessage(Transform):
             next_tensordict.set(MESSAGE, message)
         return next_tensordict
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict, tensordict_reset):
         return tensordict_reset
 
 
@@ -153,7 +146,7 @@ def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
 def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
     scenario = everything(motion, **DELAYS[delays] | {"episode": KEEPS_GOING})
 
-    def rollout(mask: Sequence[bool]) -> list[TensorDictBase]:
+    def rollout(mask):
         env = delayed(scenario)
         outputs = []
         td = env.reset()
@@ -213,7 +206,7 @@ def test_a_scenario_compiles_to_kernels(name):
             torch.testing.assert_close(found[key], value, msg=str(key), equal_nan=True)
 
 
-def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None:
+def check_equals_torchrls_way(scenario, env):
     base = env.base_env
     uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
     one_by_one = TransformedEnv(
@@ -231,7 +224,7 @@ def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None
     assert all_same(expected, found)
 
 
-def steps_of(env: EnvBase, actions: list[torch.Tensor]) -> list[TensorDictBase]:
+def steps_of(env, actions):
     """What each step returns, and that with which the next one begins, without what a policy has
     written."""
     following = env.reset()

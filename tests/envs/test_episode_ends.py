@@ -7,9 +7,7 @@ import math
 import pytest
 import torch
 from helpers import MOTIONS, act, both_motions, clock, fresh, one_uav, sent_messages, walking
-from tensordict import TensorDictBase
 
-from damian import UavEnv
 from damian.server.config import EpisodeConfig, RewardConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 from damian.world.config import MotionConfig
@@ -19,7 +17,7 @@ HERE, EAST = [[0.0, 0.0]], [[1.0, 0.25]]
 """Continuous actions of one UAV: hold, and 100 m east (a quarter of a turn from north)."""
 
 
-def go(env: UavEnv, *actions: list) -> TensorDictBase:
+def go(env, *actions):
     """Step through the actions; return the output of the last step."""
     for action in actions:
         after = act(env, torch.tensor([action]))

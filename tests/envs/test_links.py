@@ -13,7 +13,7 @@ LATE = {"law": "uniform", "low": 1, "high": 4}
 EXTRAS = ["message", "reward_terms"]
 
 
-def linked(motion: str = "instant", **links):
+def linked(motion="instant", **links):
     """An environment whose messages to the server are delayed too, and the outputs of its steps."""
     delay = DelayConfig(obs=LATE, loss=0.1)
     env = make_env(

@@ -4,14 +4,13 @@ import pytest
 import torch
 from helpers import both_motions, everything, play, random_actions
 from sensor_cases import GLOBAL, LOCAL, SENSORS
-from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from damian import ClockConfig, DelayConfig, ScenarioConfig, make_env
+from damian import ClockConfig, DelayConfig, make_env
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 
 
-def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioConfig:
+def sensing(motion="instant", own=False, **changed):
     """Episodes without end, and readings in the actor's and the critic's observation and in the
     reward."""
     observation = ObservationConfig(
@@ -22,7 +21,7 @@ def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioCo
     return everything(motion, episode=EpisodeConfig(max_steps=None), **(sections | changed))
 
 
-def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
+def fly(scenario, n_steps=20):
     """The first output, and those after each of the same random actions."""
     env = make_env(scenario, 4, seed=1, extras=["message"])
     outputs = play(env, [random_actions(env.uav_env) for _ in range(n_steps)])

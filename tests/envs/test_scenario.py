@@ -1,9 +1,6 @@
 """Settings of scenarios and arguments of ``make_env``: what is taken, and what is refused in one
 line."""
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 from helpers import square
 
@@ -15,7 +12,7 @@ from damian.world.config import MotionConfig
 
 OWN = ObservationConfig(own=True)
 BELIEF = ObservationConfig(belief=["belief_gain"])
-REFUSED: dict[str, Callable[[], Any]] = {
+REFUSED = {
     "observation.own: True does not go with clock.server": lambda: square(
         observation=OWN, clock=ClockConfig(server="2s")
     ),

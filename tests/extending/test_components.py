@@ -111,7 +111,7 @@ def flipped(state, world):
 """
 
 
-def seen(name: str) -> dict[str, ObservationConfig]:
+def seen(name):
     return {"observation": ObservationConfig([f"lies:{name}"], [])}
 
 

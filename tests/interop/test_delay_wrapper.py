@@ -20,7 +20,6 @@ from damian import (
     ActionHistory,
     ContextSampler,
     CumulativeReward,
-    MessageContext,
     ObservationDelay,
     ObservationTimeline,
     RewardDelay,
@@ -31,13 +30,13 @@ from damian.interop import DelayVectorWrapper, DelayWrapper
 from damian.interop.pettingzoo import DelayParallelWrapper
 
 
-def by_time(message: MessageContext) -> torch.Tensor:
+def by_time(message):
     """Delays that follow from the time alone, so that messages overtake each other without
     chance."""
     return (3 * message.time) % 5
 
 
-def lost_at_times(message: MessageContext) -> torch.Tensor:
+def lost_at_times(message):
     """The same; every fourth message is lost."""
     return torch.where(message.time % 4 == 2, -1.0, by_time(message))
 
@@ -61,10 +60,10 @@ def test_delays_follow_from_the_seed_and_later_episodes_hold_nothing_of_earlier_
 class Anything(gymnasium.Env):
     """An environment whose observations are dicts, and which remembers what it has executed."""
 
-    def __init__(self, action_space: gymnasium.Space) -> None:
+    def __init__(self, action_space):
         self.action_space = action_space
         self.observation_space = Dict({"place": Box(0, 9, (2,)), "word": Text(5)})
-        self.executed: list = []
+        self.executed = []
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -295,7 +294,7 @@ BY_TIME = {"observation": LOSSY, "action": 2, "reward": by_time}  # without chan
 def test_environments_in_a_vector_are_those_alone(wraps_each, mode):
     late = {**(DRAWN if wraps_each else BY_TIME), "history": 2, "timeline": 3}
 
-    def made(delayed: bool) -> gymnasium.Env:
+    def made(delayed):
         env = gymnasium.make("CartPole-v1", max_episode_steps=8)
         return DelayWrapper(env, **late) if delayed else env
 
@@ -360,12 +359,12 @@ def made_spread():
     return spread.parallel_env(N=3, max_cycles=12, continuous_actions=True)
 
 
-def of_sender(message: MessageContext) -> torch.Tensor:
+def of_sender(message):
     """A delay for each agent: 0, 2 and 5 steps."""
     return torch.tensor([0, 2, 5])[message.sender]
 
 
-def of_congestion(message: MessageContext) -> torch.Tensor:
+def of_congestion(message):
     return message.n_sending + message.sender + by_time(message)
 
 

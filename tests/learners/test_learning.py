@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 from helpers import both_kinds, both_motions, everything, learning
-from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
@@ -30,12 +29,12 @@ SMALL = MlpConfig(hidden=[16])
 REWARD = ("next", "agents", "reward")
 
 
-def scenario(**changes) -> ScenarioConfig:
+def scenario(**changes):
     region = RegionConfig(min_area=20_000, max_area=40_000, initial_conditions=16)
     return ScenarioConfig(**{"agents": 3, "region": region, **changes})
 
 
-def collect(motion: str, kind: str):
+def collect(motion, kind):
     """A batch with episodes of 9 steps, terminated in every other world and truncated in the
     others."""
     config = scenario(
@@ -91,7 +90,7 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
 # How back-updating changes the importance ratios of the first pass.
 
 
-def collect_delayed(kind: str) -> tuple[Mappo, TensorDictBase]:
+def collect_delayed(kind):
     """A learner with back-updating, and a batch of several episodes that its actor has flown under
     delay."""
     delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)

@@ -2,17 +2,14 @@
 good for."""
 
 import itertools
-from collections.abc import Iterator
 
 import pytest
 import torch
 from helpers import everything, learning
-from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import EnvBase, StepCounter
+from torchrl.envs import StepCounter
 
 from damian import BackupdateStorage, DelayConfig, keys, make_env
-from damian.envs.delayed_env import DelayedEnv
 from damian.envs.recompute import server_recompute
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
@@ -31,9 +28,7 @@ both_kinds_and_motions = pytest.mark.parametrize(
 )
 
 
-def delayed_env(
-    kind: str = "discrete", motion: str = "instant", worlds: int = 4, **changed
-) -> DelayedEnv:
+def delayed_env(kind="discrete", motion="instant", worlds=4, **changed):
     """An environment with late messages, and episodes of 9 steps."""
     delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5})
     scenario = everything(
@@ -44,14 +39,14 @@ def delayed_env(
     return env
 
 
-def batches(env: EnvBase, actor: torch.nn.Module, steps: int, n: int) -> Iterator[TensorDictBase]:
+def batches(env, actor, steps, n):
     """Collect n consecutive batches [B, T]."""
     collector = make_collector(env, actor, env.batch_size.numel() * steps)
     yield from (batch.clone() for batch in itertools.islice(collector, n))
     collector.shutdown()
 
 
-def ratios(learner: Mappo, batch: TensorDictBase) -> torch.Tensor:
+def ratios(learner, batch):
     """Importance ratios in the loss, [B, T, N]."""
     return policy_terms(batch.clone(), learner.actor)[0].detach().exp()
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 from helpers import everything, learning
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss
@@ -24,7 +23,7 @@ SMALL = MlpConfig(hidden=[16])
 FAST = SacConfig(updates=2, batch_size=64, warm_up=0)
 
 
-def learner_of(env, config=FAST, settle=0, steps=200) -> Sac:
+def learner_of(env, config=FAST, settle=0, steps=200):
     torch.manual_seed(0)
     buffer = ReplayBuffer(storage=TimeStorage(steps * env.batch_size[0]))
     return Sac(env, config, learning(SMALL, settle), buffer)
@@ -88,14 +87,12 @@ class RecordingSac(Sac):
 
     drawn: tuple[TensorDictBase, ...] = ()
 
-    def update(self, drawn: TensorDictBase) -> TensorDictBase:
+    def update(self, drawn):
         self.drawn = (*self.drawn, drawn.clone())
         return super().update(drawn)
 
 
-def decision(
-    flight: TensorDictBase, world: int, begin: int, agent: int, last: int
-) -> Tensor | None:
+def decision(flight, world, begin, agent, last):
     """Transition of a UAV over a decision at step ``begin``, as a row of numbers (``ROW``).
 
     None if the UAV was not ready, or if the outcome is not known by the last step.
@@ -179,7 +176,7 @@ def test_steps_after_an_end_that_was_known_only_later_are_not_learnt_from():
     assert found == {tuple(row) for row in flight[OBSERVATION][:, 7].flatten(0, 1).tolist()}
 
 
-def recording_learner(env: UavEnv | None = None, **changed) -> RecordingSac:
+def recording_learner(env=None, **changed):
     """A learner that has made one update."""
     env = env or UavEnv(everything(kind="discrete"), 4)
     config = SacConfig(**({"updates": 1, "batch_size": 64, "warm_up": 0} | changed))

@@ -152,7 +152,7 @@ def test_a_law_replaces_the_one_before_it_whole_and_its_fields_change_it(words, 
 
 
 @pytest.fixture
-def mine(tmp_path, monkeypatch) -> Path:
+def mine(tmp_path, monkeypatch):
     """The file of a scenario of one's own, ``--config-dir=own scenario=mine`` in the current
     folder."""
     monkeypatch.chdir(tmp_path)

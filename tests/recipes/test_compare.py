@@ -30,7 +30,7 @@ SMALL = [
 ]
 
 
-def listed(*words: str) -> str:
+def listed(*words):
     """The setting ``overrides`` of the comparison: overrides for every run."""
     return f"overrides={list(words)}"
 
@@ -45,17 +45,17 @@ def compare(run):
     return lambda *words: run(*words, program="compare", folder="") / "runs" / "usecases"
 
 
-def table(path: Path) -> list[dict[str, str]]:
+def table(path):
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
-def measured(folder: Path) -> list[dict[str, str]]:
+def measured(folder):
     """The results of a comparison without the times that they took."""
     return [{**row, "seconds": ""} for row in table(folder / "results.csv")]
 
 
-def stamps(folder: Path) -> dict[str, int]:
+def stamps(folder):
     """Time of the last change of every file in the folders of the runs."""
     return {
         str(path): path.stat().st_mtime_ns

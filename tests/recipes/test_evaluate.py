@@ -3,7 +3,6 @@
 
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -34,7 +33,7 @@ SHIPPED = sorted(Path(damian.__file__).parent.glob("data/*/"))
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
+def trained(tmp_path_factory):
     """The folder of a training run with three UAVs."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:
@@ -44,10 +43,10 @@ def trained(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def fly(run, trained) -> Callable[..., Path]:
+def fly(run, trained):
     """Evaluate the policy of a run in an empty folder; returns the folder with the results."""
 
-    def start(*words: str, of=trained, folder: str = "flown", program="evaluate") -> Path:
+    def start(*words, of=trained, folder="flown", program="evaluate"):
         return run(*words, *[f"checkpoint={of}"] * bool(of), folder=folder, program=program)
 
     return start

@@ -17,12 +17,11 @@ from damian.common.devices import keep_freed_memory
 from damian.recipes import train
 from damian.recipes.shared import learning
 from damian.runs.checkpoint import read_checkpoint
-from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import locked
 
 
 @pytest.fixture(scope="module")
-def begun(tmp_path_factory) -> Path:
+def begun(tmp_path_factory):
     """The folder of a run that was killed after its fourth update."""
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("begun")
@@ -34,19 +33,19 @@ def begun(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def copied(begun, tmp_path, monkeypatch) -> Path:
+def copied(begun, tmp_path, monkeypatch):
     """A copy of that run as the folder ``run`` in the current one."""
     monkeypatch.chdir(tmp_path)
     return shutil.copytree(begun, tmp_path / "run")
 
 
-def updates_of(folder: str) -> int:
+def updates_of(folder):
     """How many updates the checkpoint of a run has seen."""
     checkpoint = read_checkpoint(Path(folder, "checkpoint.pt"), "test")
     return checkpoint["training"]["progress"]["updates"]
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {name: (folder / name).read_bytes() for name in files(folder)}
 
 
@@ -61,7 +60,7 @@ def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
     before = contents(copied)
     n_bytes = len(before["checkpoint.pt"]) // 2
 
-    def fill() -> None:  # no file may grow beyond a size; Python ignores the signal
+    def fill():  # no file may grow beyond a size; Python ignores the signal
         resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
 
     assert ended(forked(["resume=run", "hydra.run.dir=unused"], fill)) == 3
@@ -146,7 +145,7 @@ def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, me
 
 
 def test_sigterm_stops_a_run_after_its_update(run, capsys):
-    def signalled(log: MetricsLog) -> None:
+    def signalled(log):
         if len(log.rows) == 2:
             os.kill(os.getpid(), signal.SIGTERM)
 

@@ -24,7 +24,7 @@ def fly(run):
     return partial(run, *SHORT, program="fly")
 
 
-def printed_line(capsys) -> str:
+def printed_line(capsys):
     """The line about the episode."""
     (line,) = [
         line for line in capsys.readouterr().out.splitlines() if line.startswith("episode_0")

@@ -53,11 +53,11 @@ DOORS = {
 }
 """Ways to write in ``named``: whose finished folder each begins with, or none, and its words."""
 
-_written: set[str] | None = None
+_written = None
 """The paths that are written, made or removed while it is a set."""
 
 
-def _listen(event: str, arguments: tuple) -> None:
+def _listen(event, arguments):
     writes = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
     if _written is not None and (writes or event in ("os.mkdir", "os.rename", "os.remove")):
         paths = [each for each in arguments[:2] if isinstance(each, str | bytes | os.PathLike)]
@@ -67,7 +67,7 @@ def _listen(event: str, arguments: tuple) -> None:
 sys.addaudithook(_listen)  # none can be removed
 
 
-def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
+def contents(folder):
     """All below a folder, with the times of the last changes, since the same may be written
     again."""
     return {
@@ -94,7 +94,7 @@ def place(tmp_path_factory):
         yield folder
 
 
-def begin(state: Path | None) -> Path:
+def begin(state):
     """The folder ``named`` as it is in a state; empty, and not there, without one."""
     named = Path("named")
     shutil.rmtree(named, ignore_errors=True)
@@ -103,7 +103,7 @@ def begin(state: Path | None) -> Path:
     return named
 
 
-def finished(door: str) -> tuple[Path, list[str]]:
+def finished(door):
     """A door's folder after a run without links, and what was written below it."""
     global _written  # noqa: PLW0603
     kept = Path("finished", door)
@@ -122,7 +122,7 @@ def finished(door: str) -> tuple[Path, list[str]]:
     return kept, told.read_text(encoding="utf-8").splitlines()
 
 
-def link(path: Path, original: Path, outside: Path, dangling: bool) -> None:
+def link(path, original, outside, dangling):
     """Put a link where a path was, or shall be, to a copy of the original outside, or to nothing
     there."""
     shutil.rmtree(outside, ignore_errors=True)

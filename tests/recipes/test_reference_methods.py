@@ -15,11 +15,10 @@ from helpers import (
     random_actions,
     square,
 )
-from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from twin import GLOBAL, LOCAL
 
-from damian import ClockConfig, DelayConfig, ScenarioConfig, make_env
+from damian import ClockConfig, DelayConfig, make_env
 from damian.envs.uav_env import EXTRAS
 from damian.keys import PRIVILEGED_OBSERVATION as PRIVILEGED
 from damian.learners.config import MappoConfig, SacConfig
@@ -38,7 +37,7 @@ LATE = {
 }
 
 
-def rollout_of(scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS) -> list[TensorDictBase]:
+def rollout_of(scenario, extras=EXTRAS):
     """Outputs of the environment for random actions, which are the same at each call."""
     env = make_env(scenario, 4, extras=extras)
     generator = torch.Generator().manual_seed(3)

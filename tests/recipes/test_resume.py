@@ -6,9 +6,7 @@ import os
 import random
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from stopped_runs import SAC, TINY, check_equal, counted_updates, ended, files, forked, killed_after
@@ -98,7 +96,7 @@ STOPS = 20
 STOPS_PER_RUN = 5
 
 
-def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int]) -> int:
+def run_through(words, folder, stop):
     """Start a run and resume it until it is finished; returns how often ``stop``, which starts it,
     did so."""
     for stops in range(STOPS_PER_RUN + 1):
@@ -115,7 +113,7 @@ def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int])
     raise AssertionError("a run that nothing stops does not end")
 
 
-def check_stopped_runs(words: list[str], whole: Path, stop: Callable[[list[str]], int]) -> None:
+def check_stopped_runs(words, whole, stop):
     """Stop runs until enough were stopped, and compare each with one that never was."""
     stops = runs = 0
     while stops < STOPS:
@@ -136,7 +134,7 @@ def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, numb
     whole = run(*words, folder="whole")
     longest = time.monotonic() - begin
 
-    def stop(words: list[str]) -> int:
+    def stop(words):
         child = forked(words)
         time.sleep(moments.uniform(0, longest))
         os.kill(child, number)
@@ -151,21 +149,21 @@ def test_a_run_killed_in_the_middle_of_writing_loses_nothing(run, learner):
     words = [*SMALL, *LEARNERS[learner]]
     moments = random.Random(learner)
 
-    def stop(words: list[str]) -> int:
+    def stop(words):
         return ended(forked(words, lambda: kill_at_write(moments.randrange(40))))
 
     whole = run(*words, folder="whole")
     check_stopped_runs(words, whole, stop)
 
 
-def kill_at_write(number: int) -> None:
+def kill_at_write(number):
     """Kill this process before the call of this number that makes a file last or gives it its
     name."""
     calls = itertools.count()
     for name in ("fsync", "replace", "unlink"):
         original = getattr(os, name)
 
-        def call(*arguments: Any, original: Callable[..., Any] = original, **options: Any) -> Any:
+        def call(*arguments, original=original, **options):
             if next(calls) == number:
                 os.kill(os.getpid(), signal.SIGKILL)
             return original(*arguments, **options)

@@ -40,7 +40,7 @@ def sweep(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [])
 
-    def run(*words: str, program: str = "train") -> int | str | None:
+    def run(*words, program="train"):
         try:
             main([program, "-m", *(TINY if program == "train" else []), *words])
         except SystemExit as stopped:
@@ -53,7 +53,7 @@ def sweep(tmp_path, monkeypatch):
 def test_a_refused_or_diverged_run_is_a_row_and_the_others_go_on(sweep, capsys, monkeypatch):
     learn = Mappo.learn
 
-    def diverge(learner: Mappo, batch) -> dict[str, float]:
+    def diverge(learner, batch):
         return learn(learner, batch) | (
             {"loss_critic": math.inf} if learner.config.lr > 0.1 else {}
         )

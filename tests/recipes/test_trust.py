@@ -107,7 +107,7 @@ def store(original):
     shutil.copytree(original, "run")
     config = (original / "config.yaml").read_text(encoding="utf-8")
 
-    def write(key: str | None = None, value: object = None) -> None:
+    def write(key=None, value=None):
         changed = yaml.safe_load(config)
         if key is not None:
             set_at(changed, key, value)
@@ -117,13 +117,13 @@ def store(original):
     Path("imported").unlink(missing_ok=True)
 
 
-def check_nothing_ran() -> None:
+def check_nothing_ran():
     assert not {"evilmod", "evil-mod"} & {*sys.modules}
     assert not Path("imported").exists()
     assert not Path("new").exists()
 
 
-def check_refuses(start, capsys, message) -> None:
+def check_refuses(start, capsys, message):
     """Assert that a program is refused in a line with this message, and that nothing was run or
     made."""
     capsys.readouterr()
@@ -192,7 +192,7 @@ def test_comparisons_and_tables_of_results_read_stored_runs_as_data(store, capsy
 
 
 def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(store):
-    def imported(start) -> bool:
+    def imported(start):
         """Is the module imported, as if it never was before?"""
         sys.modules.pop("mine", None)
         LOGGERS._components.pop("mine:X", None)

@@ -1,21 +1,17 @@
 """UAVs whose rewards are late too, or summed, or whose server has a slow clock: hindsight equals no
 delay."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from helpers import everything, random_actions, square
-from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from twin import GLOBAL, LOCAL
 
-from damian import ClockConfig, ScenarioConfig, keys, make_env
+from damian import ClockConfig, keys, make_env
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.delayed_env import DelayedEnv
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
@@ -30,13 +26,13 @@ SUMMED = {"reward_window": 3, "reward_discount": 0.7}
 ENDS = ["success", "done", "terminated", "truncated"]
 
 
-def training_env(scenario: ScenarioConfig, n_worlds: int = WORLDS) -> DelayedEnv:
+def training_env(scenario, n_worlds=WORLDS):
     env = make_env(scenario, n_worlds, extras={"message", "reward_terms"})
     env.append_transform(StepCounter())
     return env
 
 
-def fly(env: DelayedEnv, n_steps: int = STEPS) -> TensorDictBase:
+def fly(env, n_steps=STEPS):
     """Steps [T, B] with random actions, the same at each call."""
     generator = torch.Generator().manual_seed(5)
     steps = []
@@ -48,7 +44,7 @@ def fly(env: DelayedEnv, n_steps: int = STEPS) -> TensorDictBase:
     return torch.stack(steps)
 
 
-def buffer_of(env: DelayedEnv, corrected: Sequence[str]) -> ReplayBuffer:
+def buffer_of(env, corrected):
     """A buffer in which late messages and rewards correct what is named."""
     late = env.delays.obs.late
     recompute = server_recompute(env.server, corrected, reward_terms=True) if late else None
@@ -60,14 +56,12 @@ def buffer_of(env: DelayedEnv, corrected: Sequence[str]) -> ReplayBuffer:
     )
 
 
-def in_order(buffer: ReplayBuffer) -> TensorDictBase:
+def in_order(buffer):
     """The stored steps in order of time, [T, B]."""
     return buffer.storage[buffer.storage.latest()]
 
 
-def backupdated(
-    scenario: ScenarioConfig, corrected: Sequence[str], n_worlds: int = WORLDS, n_steps: int = STEPS
-) -> tuple[TensorDictBase, TensorDictBase]:
+def backupdated(scenario, corrected, n_worlds=WORLDS, n_steps=STEPS):
     """Such steps as collected, and as corrected by all that has arrived after the last one,
     [T, B]."""
     env = training_env(scenario, n_worlds)
@@ -78,14 +72,14 @@ def backupdated(
     return late, in_order(buffer)
 
 
-REQUESTS: dict[str, Any] = {
+REQUESTS = {
     "source": SourceConfig(level_db=142.0),
     "requests": RequestConfig(rate=40.0, most=3),
     "observation": ObservationConfig(["served"], ["others", "requests"], own=True),
     "reward": RewardConfig(spotted=0.0, served=1.0),
 }
 UNSURE = SourceConfig(count=2, level_db=140.0, miss=0.4, false_alarm=0.3)
-CASES: dict[str, dict[str, Any]] = {
+CASES = {
     "late messages": {"delay": DelayConfig(obs=LATE)},
     "late messages, the same features for all": {
         "delay": DelayConfig(obs=LATE, history=2),

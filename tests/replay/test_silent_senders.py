@@ -2,8 +2,6 @@
 is."""
 
 from helpers import square
-from tensordict import TensorDictBase
-from torch import Tensor
 
 from damian import DelayConfig, keys
 from damian.keys import next_key
@@ -16,7 +14,7 @@ from damian.server.config import EpisodeConfig
 from damian.world.config import MotionConfig
 
 
-def truth(env, steps: TensorDictBase) -> Tensor:
+def truth(env, steps):
     """The rewards of steps [T, B], had all messages that were sent arrived at once, [T, B, N]."""
     sent = env.server.messages(steps[next_key(keys.MESSAGE)])
     return env.server(sent, steps["next", "step_count"].squeeze(-1)).reward

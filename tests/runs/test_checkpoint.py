@@ -16,7 +16,7 @@ from damian.runs.training_state import load_networks
 
 
 @pytest.fixture
-def file(tmp_path) -> Path:
+def file(tmp_path):
     path = tmp_path / "checkpoint.pt"
     write_checkpoint(path, {"components": {}, "training": {"weights": torch.arange(99)}})
     return path
@@ -49,7 +49,7 @@ def test_what_a_checkpoint_cannot_store_is_refused_before_anything_is_written(fi
     assert file.read_bytes() == before
 
 
-def flipped(data: bytes) -> bytes:
+def flipped(data):
     """With one bit of a weight changed, which the file's checksum tells."""
     place = data.index(torch.arange(99).numpy().tobytes()[:80]) + 50
     return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
@@ -67,7 +67,7 @@ def test_a_damaged_file_is_refused_in_one_line_and_stays_as_it_is(file, damage):
 class Payload:
     """Makes a folder when it is unpickled."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
 
     def __reduce__(self):

@@ -3,17 +3,15 @@
 import math
 import time
 from statistics import fmean
-from typing import Any
 
 import pytest
 import torch
 from helpers import MOTIONS, both_motions, everything, square, walking
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, StepCounter
 
-from damian import BackupdateStorage, DelayConfig, ScenarioConfig, keys, make_env
+from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.baselines.random import random_policy
 from damian.envs.nodes import EpisodeTotals
 from damian.envs.recompute import server_recompute
@@ -21,7 +19,6 @@ from damian.runs.checkpoint import plain
 from damian.runs.metrics import EpisodeLog, HindsightReturns, evaluation
 from damian.runs.metrics_log import MetricsLog, TensorBoard
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.server.server import Server
 from damian.world.config import SourceConfig
 from damian.world.messages import Messages
 
@@ -33,7 +30,7 @@ DELAYS = {
 }
 
 
-def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
+def joint_spotting(motion, delay, **changed):
     """Two of three UAVs must spot the source at the same time; it is near many of the landing
     points."""
     sections = {
@@ -51,7 +48,7 @@ def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioC
     return square(**(sections | changed))
 
 
-def fly(scenario: ScenarioConfig, n_worlds: int = 24) -> tuple[TensorDictBase, Server]:
+def fly(scenario, n_worlds=24):
     """A flight of the random policy, [B, HORIZON], and the server."""
     torch.manual_seed(1)
     env = make_env(scenario, n_worlds, seed=2, extras=["message"])
@@ -62,7 +59,7 @@ POOLED = ("age", "late", "lost")
 """Measures that are means over all messages, not over episodes."""
 
 
-def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
+def delays_by_hand(world, steps):
     """Ages of the messages held [steps], and whether each message sent is late or lost, in an
     episode."""
     agents = world["next", "agents"]
@@ -83,7 +80,7 @@ def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
     return delays
 
 
-def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[str, Any]:
+def episode_by_hand(world, server, needed):
     """Measures of the first episode of a flight [T], counted step by step."""
     row = {
         "perceived_return": 0.0,
@@ -110,7 +107,7 @@ def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[
     return row | delays_by_hand(world, t)
 
 
-def by_hand(flight: TensorDictBase, server: Server, needed: int) -> dict[str, float]:
+def by_hand(flight, server, needed):
     """The measures of an ``Evaluation`` by name."""
     rows = [episode_by_hand(world, server, needed) for world in flight]
     found = {name: fmean(row[name] for row in rows) for name in rows[0] if name not in POOLED}
@@ -172,7 +169,7 @@ def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_o
 # Measures in training.
 
 
-def training_batch() -> TensorDictBase:
+def training_batch():
     env = make_env(
         joint_spotting(
             "instant", DelayConfig(), episode=EpisodeConfig(max_steps=7, success_share=0.6)
@@ -185,7 +182,7 @@ def training_batch() -> TensorDictBase:
     return env.rollout(40, random_policy(env), break_when_any_done=False)
 
 
-def ended_episodes(world: TensorDictBase) -> list[dict[str, float]]:
+def ended_episodes(world):
     """Return, success and steps of each ended episode of a world [T]."""
     total = 0.0
     steps = 0
@@ -239,7 +236,7 @@ def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_no
     torch.manual_seed(0)
     data = env.rollout(44, break_when_any_done=False)
 
-    def make() -> HindsightReturns:
+    def make():
         return HindsightReturns(BackupdateStorage(72, server_recompute(server, ["reward"]), 4), 2)
 
     measured = make()

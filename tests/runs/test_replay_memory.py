@@ -15,13 +15,13 @@ ROWS = 20
 LONGEST = 3
 
 
-def make_buffer() -> ReplayBuffer:
+def make_buffer():
     storage = TimeStorage(WORLDS * ROWS)
     storage.longest = LONGEST  # as a BackupdateStorage: later messages correct so many rows
     return ReplayBuffer(storage=storage)
 
 
-def batch(begin: int, n_rows: int) -> TensorDict:
+def batch(begin, n_rows):
     time = torch.arange(begin, begin + n_rows).expand(WORLDS, -1)
     agents = TensorDict({"x": torch.stack([time, time], -1)}, [WORLDS, n_rows, 2])
     return TensorDict({"time": time.clone(), "agents": agents}, [WORLDS, n_rows])

@@ -8,7 +8,7 @@ import torch
 from belief_twin import chance_at, emission_of
 from helpers import everything, square, walking
 
-from damian import ScenarioConfig, UavEnv, feature, make_env
+from damian import UavEnv, feature, make_env
 from damian.server.belief import places, predict
 from damian.server.config import ObservationConfig
 from damian.server.features.belief import BELIEF_RINGS, BELIEF_SECTORS
@@ -17,7 +17,7 @@ from damian.world.config import SourceConfig
 ALL = ["belief_gain", "belief_moments", "belief_map"]
 
 
-def believing(own: bool = False, **changed) -> ScenarioConfig:
+def believing(own=False, **changed):
     observation = ObservationConfig(
         local_features=["spotted"], global_features=[], belief=ALL, own=own
     )

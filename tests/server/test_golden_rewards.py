@@ -26,7 +26,7 @@ from damian.server.features import observe
 from damian.server.rewards import RewardConfig, reward, terms_of
 
 
-def reason_for_other_term(name: str, value: float, motions: int) -> str | None:
+def reason_for_other_term(name, value, motions):
     """Why a reward term differs from the original's; None if it does not."""
     if name == "source_drift" and value <= 0.5:
         return "eq. 6 doubles a drift up to one half"

@@ -4,7 +4,6 @@ knows."""
 import pytest
 import torch
 from helpers import SQUARE, everything
-from torch import Tensor
 from twin import GLOBAL, LOCAL
 
 from damian import UavEnv
@@ -26,7 +25,7 @@ def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
     env = UavEnv(scenario, messages_only=True)
     generator = torch.Generator().manual_seed(n_agents)
 
-    def draw(low: float, high: float, *shape: int) -> Tensor:
+    def draw(low, high, *shape):
         return low + (high - low) * torch.rand(3, n_agents, n_agents, *shape, generator=generator)
 
     point = draw(0, len(env.simulation.points), 2).long()

@@ -23,7 +23,7 @@ CASES = {
 }
 
 
-def scenario(own: bool = True, stops: int | None = None, **changed) -> ScenarioConfig:
+def scenario(own=True, stops=None, **changed):
     """UAVs that move at once and observe their own places and the timeline, in short episodes."""
     sections = {
         "agents": AGENTS,

@@ -34,7 +34,7 @@ def episode():
     )[0]
 
 
-def local(feature: dict, origin: tuple[float, float]) -> np.ndarray:
+def local(feature, origin):
     """Corners of a feature's geometry in local metres, [C, 2]."""
     degrees = shapely.get_coordinates(shape(feature["geometry"]))
     return np.column_stack(to_local(degrees[:, 1], degrees[:, 0], origin))

@@ -4,7 +4,6 @@ import pytest
 import torch
 from environments import LATE
 from helpers import square
-from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
@@ -25,9 +24,7 @@ ALL = [(False, False), (True, False), (True, True)]
 """Whether a timeline is that of a group, and whether it has one's own messages at once."""
 
 
-def late_uavs(
-    law: object = LATE, loss: float = 0.2, links: bool = False, **options
-) -> TransformedEnv:
+def late_uavs(law=LATE, loss=0.2, links=False, **options):
     """UAVs that send nothing in half of the steps; ``links``: every receiver has delays of its
     own."""
     uav_env = UavEnv(square(), num_worlds=WORLDS, extras=["message"])
@@ -46,13 +43,13 @@ def late_uavs(
 
 
 def twin(
-    data: TensorDictBase,
-    world: int,
-    receiver: int,
-    group: bool,
-    own: bool,
-    until: int | None = None,
-) -> list[torch.Tensor]:
+    data,
+    world,
+    receiver,
+    group,
+    own,
+    until=None,
+):
     """The timeline of one receiver after every step, from the messages and delays of one world.
 
     With ``until``, it is that of hindsight: from what has arrived after that step.
@@ -63,7 +60,7 @@ def twin(
     first = 0
     senders = [(receiver + i) % AGENTS for i in range(AGENTS)] if group else [receiver]
 
-    def arrived(entries: TensorDictBase, sender: int, since: int) -> bool:
+    def arrived(entries, sender, since):
         delay = entries[keys.DELAY][sender]
         return 0 <= int(delay[receiver] if len(delay) > 1 else delay) <= since
 

@@ -12,7 +12,6 @@ from golden_records import (
     EPISODES,
     PERSISTENT,
     TOLERANCE,
-    Transition,
     column,
     ready_env,
     recorded,
@@ -26,7 +25,7 @@ from damian.world.config import MotionConfig
 from damian.world.landing import action_table
 
 
-def reason_for_other_point(case: int, transition: Transition, uav: int) -> str | None:
+def reason_for_other_point(case, transition, uav):
     """Why this project leads the UAV to another point than the original; None if it does not."""
     golden = GOLDEN[case]
     points = golden["scenario"]["landing_points"]

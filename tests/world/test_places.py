@@ -20,7 +20,7 @@ SQUARE = RegionConfig(
 CORNERS = [[8.0, 45.0], [8.003, 45.0], [8.003, 45.002], [8.0, 45.002], [8.0, 45.0]]
 
 
-def build(region, **settings) -> Simulation:
+def build(region, **settings):
     places = {
         name: settings.pop(name)
         for name in ("start_positions", "start_together")

@@ -18,7 +18,6 @@ from damian.world.config import RegionConfig
 from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon
-from damian.world.regions.region import Region
 
 DATA = Path(__file__).parents[1] / "data" / "regions"
 FIR = DATA / "fir.csv"
@@ -27,7 +26,7 @@ SHIPPED = Path(damian.__file__).parent / "data" / "fir.csv"
 DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 
 
-def _places(region: Region) -> np.ndarray:
+def _places(region):
     """Corners of a region converted back to degrees, [V, 2] (latitude, longitude)."""
     assert region.origin is not None
     return np.column_stack(to_latlon(*shapely.get_coordinates(region.polygon).T, region.origin))
@@ -74,7 +73,7 @@ def _collection(*features):
     return {"type": "FeatureCollection", "features": list(features)}
 
 
-def _written(folder, name, content) -> Path:
+def _written(folder, name, content):
     file = folder / name
     file.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
     return file
@@ -137,7 +136,7 @@ PLACEMARK = """<Folder><Placemark><name>{}</name><Polygon><outerBoundaryIs><Line
 {}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></Folder>"""
 
 
-def _map(file: Path) -> Path:
+def _map(file):
     """Two areas with heights in a file of a suffix that GDAL knows."""
     areas = {
         "Łąka: a=b": [[*corner, 100.0] for corner in RING],
@@ -337,7 +336,7 @@ def test_a_plan_without_the_outline_of_a_fence_is_refused_with_the_remedy(tmp_pa
     _assert_one_line_error(file, message, lambda: read_area(file))
 
 
-def _assert_one_line_error(file: Path, message: str, read) -> None:
+def _assert_one_line_error(file, message, read):
     with pytest.raises(InputError) as error:
         read()
     line = str(error.value)

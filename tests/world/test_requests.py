@@ -17,7 +17,7 @@ RATE = 40.0
 MOST = 3
 
 
-def scenario(**changed) -> ScenarioConfig:
+def scenario(**changed):
     settings = {
         "region": RegionConfig(kind="vertices", vertices=[[0, 0], [400, 0], [400, 300], [0, 300]]),
         "source": SourceConfig(level_db=138.0),

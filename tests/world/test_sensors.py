@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 
-from damian import ScenarioConfig, UavEnv
+from damian import UavEnv
 from damian.server.config import ObservationConfig
 from damian.world.messages import Messages, Widths
 
 
-def sensing(motion: str = "instant", **changed) -> ScenarioConfig:
+def sensing(motion="instant", **changed):
     """A scenario with everything, and with sensors and features of your own."""
     observation = ObservationConfig(["spotted", *LOCAL], ["source_distance", *GLOBAL])
     return everything(motion, **({"sensors": SENSORS, "observation": observation} | changed))
@@ -55,7 +55,7 @@ def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, n_sou
     blank = Messages.blank(torch.randint(2**24, (*shape, window), generator=generator), widths)
     assert blank.readings.shape == (*shape, n_readings)
 
-    def fill(field: torch.Tensor) -> torch.Tensor:
+    def fill(field):
         numbers = torch.randint(2**24, field.shape, generator=generator)
         return numbers % 2 == 0 if field.dtype == torch.bool else numbers.to(field.dtype)
 

@@ -18,7 +18,7 @@ SQUARE = RegionConfig(kind="vertices", vertices=LAND, initial_conditions=8)
 EACH = [{"position": place, "level_db": level} for place, level in zip(PLACES, LEVELS, strict=True)]
 
 
-def scenario(source: SourceConfig, **changed) -> ScenarioConfig:
+def scenario(source, **changed):
     settings = {
         "region": SQUARE,
         "source": source,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
 
-from damian import ScenarioConfig, UavEnv
+from damian import ScenarioConfig
 from damian.server.config import ObservationConfig, RewardConfig
 from damian.world.config import MotionConfig
 
@@ -32,7 +32,7 @@ class FlyingUav:
     told: list = field(default_factory=list)
     """Those that it has told."""
 
-    def choose(self, target: tuple, motion: MotionConfig) -> None:
+    def choose(self, target, motion):
         """Begin to fly to a landing point, or to hold."""
         self.start = self.place
         self.place = target
@@ -47,7 +47,7 @@ class FlyingUav:
             hard = 10 * math.sqrt(3) / 3 / motion.max_acceleration
             self.duration = sum(max(fast * length, math.sqrt(hard * length)) for length in phases)
 
-    def listen(self, now: float, dt: float, source: tuple, radius: float) -> bool:
+    def listen(self, now, dt, source, radius):
         """Pass a step, and send a message on the ground or as the flight begins; returns if one is
         sent."""
         self.elapsed += 1
@@ -75,7 +75,7 @@ class FlyingUav:
         return True
 
 
-def twins(env: UavEnv) -> list[list[FlyingUav]]:
+def twins(env):
     """The UAVs of all worlds as they begin an episode."""
     levels = env.simulation.vehicles.levels.tolist()
     places = env.state.position[..., :2].tolist()

@@ -28,7 +28,7 @@ OBSERVED = [*TWIN_FEATURES, *LOCAL]
 """Features in the order of the critic's observation."""
 
 
-def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
+def twin_scenario(n_agents, kind, since):
     """Every reward term and feature except the coverage; uneven distances, so that no two points
     tie."""
     task = dict.fromkeys(BUILT_IN, 0.5) | {
@@ -61,7 +61,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
     )
 
 
-def twins(env: UavEnv) -> list[twin.World]:
+def twins(env):
     """The twin's worlds, in the initial conditions of the environment's worlds."""
     airspace = env.simulation.airspace
     state = env.state
@@ -86,7 +86,7 @@ def twins(env: UavEnv) -> list[twin.World]:
     return worlds
 
 
-def check_observation(world: twin.World, observation: torch.Tensor):
+def check_observation(world, observation):
     """Assert that the critic's observation [N, G] of one world equals the twin's."""
     features = world.observe()
     columns = [np.array(features[name]).reshape(len(world.uavs), -1) for name in OBSERVED]
