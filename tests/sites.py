@@ -26,7 +26,7 @@ def generator():
 def pages():
     """The text of each page of the site, made ones included, with its links as the site has
     them."""
-    texts = {path.name: path.read_text(encoding="utf-8") for path in DOCS.glob("*.md")}
+    texts = {path.name: path.read_text("utf-8") for path in DOCS.glob("*.md")}
     texts |= {name: text for name, text in generator()["made"]().items() if isinstance(text, str)}
     return {name: generator()["led"](text, name) for name, text in texts.items()}
 

@@ -13,7 +13,7 @@ import damian
 
 ROOT = Path(damian.__file__).parent
 RECIPES = ROOT.parent / "recipes"
-TREE = (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("\ndamian/\n")[2]
+TREE = (ROOT.parent / "CONTRIBUTING.md").read_text("utf-8").partition("\ndamian/\n")[2]
 ROOMS = re.findall(r"^  (\w+)(?:/|\.py) ", TREE.partition("\nconf/")[0], re.MULTILINE)
 """Folders and modules of ``damian``, as CONTRIBUTING.md lists them: each imports only from those
 above it."""
@@ -46,7 +46,7 @@ def imported(module, strings=False):
     """Every module, or name within one, that a module imports anywhere; also those that ``strings``
     name."""
     package = module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(MODULES[module].read_text("utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -128,7 +128,7 @@ def test_text_is_read_and_written_as_utf_8_everywhere():
         for folder in ("damian", "recipes", "examples")
         for each in (ROOT.parent / folder).rglob("*.py")
     ):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in (
                 "read_text",
                 "write_text",
@@ -137,7 +137,7 @@ def test_text_is_read_and_written_as_utf_8_everywhere():
 
 
 def test_every_public_name_exists_and_is_loaded_on_demand():
-    text = Path(damian.__file__).read_text(encoding="utf-8")
+    text = Path(damian.__file__).read_text("utf-8")
     assert {*re.findall(r"import (\w+) as \1\b", text)} == {*damian._MODULE_OF}
     assert all(getattr(damian, name).__name__ == name for name in damian._MODULE_OF)
     with pytest.raises(AttributeError, match="no attribute nothing"):

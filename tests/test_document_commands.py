@@ -137,7 +137,7 @@ def write_journal(path):
         }
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
     path.parent.mkdir(exist_ok=True)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines), "utf-8")
 
 
 @pytest.mark.slow

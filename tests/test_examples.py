@@ -50,7 +50,7 @@ def test_a_program_is_imported(path):
     if not path.relative_to(ROOT).as_posix().startswith(tuple(ELSEWHERE)):
         runpy.run_path(str(path))
         return
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "damian":
             exec(ast.unparse(node), {})
 

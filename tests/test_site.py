@@ -67,7 +67,7 @@ def test_every_setting_program_and_example_has_a_place():
         *(ROOT / "examples" / "fleet").rglob("*")
     }:
         text = pages()[f"examples/{example.relative_to(ROOT / 'examples').as_posix()}.md"]
-        assert example.read_text(encoding="utf-8") in text
+        assert example.read_text("utf-8") in text
 
 
 def test_every_public_name_leads_to_what_documents_it():

@@ -125,7 +125,7 @@ def test_a_trace_is_played_in_order_from_a_random_start_and_wraps_around(tmp_pat
 
 
 def test_the_measured_trace_of_the_package_is_played_back():
-    rows = (files("damian") / "data" / "queue_trace.csv").read_text(encoding="utf-8").split()[1:]
+    rows = (files("damian") / "data" / "queue_trace.csv").read_text("utf-8").split()[1:]
     arrive = [float(row.removesuffix("s")) for row in rows if row != "lost"]
     measured = compose_scenario("delay=measured").make_delays().obs
     assert 1000 <= len(rows) <= 3000

@@ -15,9 +15,7 @@ from damian.common import compiling, devices
 from damian.common.tensors import tree_map
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.transforms.base import Memory, StatefulTransform
-from damian.transforms.entries import Entries
-from damian.world.state import PackedState
+from damian.transforms.base import StatefulTransform
 
 LATE = DelayConfig(
     obs={"law": "geometric", "mean": 2}, rew={"law": "uniform", "low": 0, "high": 30}
@@ -122,9 +120,6 @@ class Recording(TorchDispatchMode):
             for old, new in zip(tensors([found]), tensors([func(*args, **kwargs)]), strict=True):
                 if old.data_ptr() != new.data_ptr():
                     old.copy_(new)
-
-
-Inputs = tuple[DelayedEnv, PackedState, list[Memory], Entries, Tensor]
 
 
 def inputs(scenario):

@@ -206,7 +206,7 @@ def test_every_option_is_a_file_that_begins_with_its_launch_line_and_composes():
     known = groups()
     for group, options in known.items():
         for option in options:
-            lines = (CONF / group / f"{option}.yaml").read_text(encoding="utf-8").splitlines()
+            lines = (CONF / group / f"{option}.yaml").read_text("utf-8").splitlines()
             (first, *_) = [line for line in lines if not line.startswith("# @package")]
             assert first.startswith("# damian "), (group, option)
     del known["experiment"]

@@ -46,7 +46,7 @@ def compare(run):
 
 
 def table(path):
-    with path.open(encoding="utf-8", newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 

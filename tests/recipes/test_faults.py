@@ -64,7 +64,7 @@ def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
         resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
 
     assert ended(forked(["resume=run", "hydra.run.dir=unused"], fill)) == 3
-    output = Path("output.txt").read_text(encoding="utf-8")
+    output = Path("output.txt").read_text("utf-8")
     (error,) = [line for line in output.splitlines() if "error" in line.lower()]
     assert error.startswith("error: run/checkpoint.pt: it cannot be written: File too large")
     assert "Traceback" not in output

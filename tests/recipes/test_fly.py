@@ -95,7 +95,7 @@ def test_a_page_has_the_episodes_in_the_order_of_their_files(run, capsys):
     for name in ("undelayed.json", "late.json"):
         flight(about={"overrides": [f"delay={name}"]}).save(Path(name))
     folder = run("replay=[undelayed.json,late.json]", program="fly", folder="page")
-    text = (folder / "replay.html").read_text(encoding="utf-8")
+    text = (folder / "replay.html").read_text("utf-8")
     assert capsys.readouterr().out.startswith("page: page/replay.html (0.")
     assert text.index('"title":"delay=undelayed.json"') < text.index('"title":"delay=late.json"')
     assert len(text) < len(page([flight()])) + 10_000

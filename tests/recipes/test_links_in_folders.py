@@ -88,9 +88,9 @@ def place(tmp_path_factory):
         patch.chdir(folder)
         patch.setattr(sys, "argv", [])
         Path("conf/experiment").mkdir(parents=True)
-        Path("conf/experiment/x.yaml").write_text(EXPERIMENT, encoding="utf-8")
-        Path("table.csv").write_text(TABLE, encoding="utf-8")
-        Path("log.csv").write_text(LOG, encoding="utf-8")
+        Path("conf/experiment/x.yaml").write_text(EXPERIMENT, "utf-8")
+        Path("table.csv").write_text(TABLE, "utf-8")
+        Path("log.csv").write_text(LOG, "utf-8")
         yield folder
 
 
@@ -118,8 +118,8 @@ def finished(door):
         below = [path for path in map(Path, sorted(_written)) if named in path.parents]
         _written = None
         shutil.copytree(named, kept)
-        told.write_text("\n".join(str(path.relative_to(named)) for path in below), encoding="utf-8")
-    return kept, told.read_text(encoding="utf-8").splitlines()
+        told.write_text("\n".join(str(path.relative_to(named)) for path in below), "utf-8")
+    return kept, told.read_text("utf-8").splitlines()
 
 
 def link(path, original, outside, dangling):

@@ -13,7 +13,7 @@ from damian.recipes.command import main
 
 def test_results_are_utf_8_and_shown_also_where_the_locale_lacks_a_letter(tmp_path, monkeypatch):
     text = "policy,episodes,return\nŁąka,4,1.5\n"
-    (tmp_path / "result.csv").write_text(text, encoding="utf-8")
+    (tmp_path / "result.csv").write_text(text, "utf-8")
     printed = BytesIO()
     monkeypatch.setattr(sys, "stdout", TextIOWrapper(printed, encoding="ascii"))
     main(["results", str(tmp_path)])

@@ -107,7 +107,7 @@ def run_through(words, folder, stop):
             else [*words, f"hydra.run.dir={folder}"]
         )
         code = stop(again) if stops < STOPS_PER_RUN else ended(forked(again))
-        assert code in STOPPED, Path("output.txt").read_text(encoding="utf-8")[-2000:]
+        assert code in STOPPED, Path("output.txt").read_text("utf-8")[-2000:]
         if code == 0:
             return stops
     raise AssertionError("a run that nothing stops does not end")

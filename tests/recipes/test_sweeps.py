@@ -71,7 +71,7 @@ def test_a_refused_or_diverged_run_is_a_row_and_the_others_go_on(sweep, capsys, 
     assert "the learner has diverged" in failed["delay.obs-1_learner.lr-0.99"]["error"]
     refused = failed["delay.obs--1_learner.lr-0.001"]
     assert refused["error"].startswith("delay.obs: -1 is not a delay")
-    table = Path("all/table.md").read_text(encoding="utf-8")
+    table = Path("all/table.md").read_text("utf-8")
     assert table in printed.out
     assert all(f"| {name} | {each['error'][:40]}" in table for name, each in failed.items())
     assert f"failed: all/delay.obs--1_learner.lr-0.001: {refused['error']}" in printed.err

@@ -95,7 +95,7 @@ def original(tmp_path_factory):
         patch.setattr(sys, "argv", [])
         main(["train", *TINY, "hydra.run.dir=original"])
         for name in ("evilmod", "evil-mod", "mine"):
-            Path(f"{name}.py").write_text(MODULE.format(folder / "imported"), encoding="utf-8")
+            Path(f"{name}.py").write_text(MODULE.format(folder / "imported"), "utf-8")
         yield Path("original")
 
 
@@ -105,13 +105,13 @@ def store(original):
     test."""
     shutil.rmtree("run", ignore_errors=True)
     shutil.copytree(original, "run")
-    config = (original / "config.yaml").read_text(encoding="utf-8")
+    config = (original / "config.yaml").read_text("utf-8")
 
     def write(key=None, value=None):
         changed = yaml.safe_load(config)
         if key is not None:
             set_at(changed, key, value)
-        Path("run/config.yaml").write_text(yaml.safe_dump(changed), encoding="utf-8")
+        Path("run/config.yaml").write_text(yaml.safe_dump(changed), "utf-8")
 
     yield write
     Path("imported").unlink(missing_ok=True)
@@ -150,8 +150,8 @@ def test_no_program_imports_what_a_stored_run_names(store, name, capsys):
 
 def test_stored_words_are_only_shown_and_stored_settings_not_resolved(store, monkeypatch):
     monkeypatch.setenv("SECRET", "secret")
-    record = json.loads(Path("run/run.json").read_text(encoding="utf-8"))
-    Path("run/run.json").write_text(json.dumps({**record, "overrides": WORDS}), encoding="utf-8")
+    record = json.loads(Path("run/run.json").read_text("utf-8"))
+    Path("run/run.json").write_text(json.dumps({**record, "overrides": WORDS}), "utf-8")
     _, env = damian.load("run")
     assert env.uav_env.scenario.agents == 3
     check_nothing_ran()
@@ -166,7 +166,7 @@ def test_stored_words_are_only_shown_and_stored_settings_not_resolved(store, mon
 def test_links_in_a_run_folder_are_not_followed(store, name, linked, capsys):
     shutil.rmtree("outside", ignore_errors=True)
     Path("outside").mkdir()
-    Path("outside/000007.pt").write_text("mine", encoding="utf-8")
+    Path("outside/000007.pt").write_text("mine", "utf-8")
     link = Path("run", linked)
     if link.exists():
         link.rename(Path("outside", link.name))
@@ -175,7 +175,7 @@ def test_links_in_a_run_folder_are_not_followed(store, name, linked, capsys):
     before = sorted(Path("outside").iterdir())
     check_refuses(PROGRAMS[name], capsys, f"{link} is a link, and links")
     assert sorted(Path("outside").iterdir()) == before
-    assert Path("outside/000007.pt").read_text(encoding="utf-8") == "mine"
+    assert Path("outside/000007.pt").read_text("utf-8") == "mine"
 
 
 def test_comparisons_and_tables_of_results_read_stored_runs_as_data(store, capsys):
@@ -183,7 +183,7 @@ def test_comparisons_and_tables_of_results_read_stored_runs_as_data(store, capsy
     methods = "tasks: {{t: [agents=3]}}\nmethods: {{a: {{delayed: false, overrides: [{}]}}}}\n"
     Path("conf/experiment").mkdir(parents=True, exist_ok=True)
     Path("conf/experiment/x.yaml").write_text(
-        methods.format(", ".join(f"'{word}'" for word in TINY)), encoding="utf-8"
+        methods.format(", ".join(f"'{word}'" for word in TINY)), "utf-8"
     )
     shutil.copytree("run", "old/t/none/a/seed_0", dirs_exist_ok=True)
     words = ["compare", "--config-dir=conf", "experiment=x", "seeds=1", "hydra.run.dir=old"]
@@ -215,7 +215,7 @@ def test_a_value_with_a_colon_is_no_name(store):
     corners = [[8, 45], [8.01, 45], [8.01, 45.008], [8, 45.008], [8, 45]]
     park = {"type": "Feature", "properties": {"name": "park"}}
     park["geometry"] = {"type": "Polygon", "coordinates": [corners]}
-    Path("park.geojson").write_text(json.dumps(park), encoding="utf-8")
+    Path("park.geojson").write_text(json.dumps(park), "utf-8")
     store("region", {"kind": "geojson", "path": "park.geojson", "where": "name:park"})
     _, env = damian.load("run")
     assert env.uav_env.scenario.region.where == "name:park"

@@ -14,7 +14,6 @@ from torchrl.data import Bounded, Composite, ReplayBuffer, Unbounded
 from torchrl.envs import (
     Compose,
     EnvBase,
-    GymEnv,
     MultiStepTransform,
     StepCounter,
     Transform,
@@ -28,7 +27,6 @@ from damian import (
     RewardDelay,
     SampleAndHold,
     Uniform,
-    set_seed,
 )
 from damian.common.errors import InputError
 from damian.keys import next_key
@@ -332,37 +330,6 @@ def check_step(after, at, twin, t, row):
         twin.case,
         t,
     )
-
-
-def late_cartpole(*transforms):
-    late = RewardDelay(Uniform(0, 4), delay_key="reward_delay", earned_key="earned", seed=0)
-    env = TransformedEnv(GymEnv("CartPole-v1"), Compose(StepCounter(), late, *transforms))
-    set_seed(env, 0)
-    return env
-
-
-@pytest.mark.parametrize("window", [1, 3])
-def test_late_rewards_alone_are_credited_in_any_environment(window):
-    env = late_cartpole(CumulativeReward(window, GAMMA))
-    steps = env.rollout(70, break_when_any_done=False)
-    corrections = corrections_of(env.transform, ["reward"])
-    storage = BackupdateStorage(200, None, 4, corrections=corrections)
-    buffer = ReplayBuffer(storage=storage)
-    for part in steps.split(10):
-        buffer.extend(part.unsqueeze(0))
-    after = storage[storage.latest()].squeeze(1)
-    count, done = (steps[name].flatten().tolist() for name in ("step_count", ("next", "done")))
-    delay = steps["next", "reward_delay"].flatten().tolist()
-    for t in range(70):
-        latest = range(t - min(count[t], window - 1), t + 1)
-        paid = [g for g in latest if g + delay[g] <= 69 or any(done[g:])]
-        expected = sum(GAMMA ** (t - g) for g in paid)
-        assert after["next", "reward"][t].item() == pytest.approx(expected)
-    assert not steps["next", "reward"].equal(after["next", "reward"])
-    paid_late = [g for g in range(70) if delay[g] > 0 and (g + delay[g] <= 69 or any(done[g:]))]
-    assert after["backupdated"].flatten().nonzero().flatten().tolist() == paid_late
-    assert after["next", "done"].equal(steps["next", "done"])
-    assert after["valid"].all()
 
 
 @both_layouts

@@ -145,6 +145,7 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     for key in [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]:
         assert found[key].equal(true[key]), key
     assert not late[next_key(keys.REWARD)].equal(true[next_key(keys.REWARD)])
+    assert found[keys.BACKUPDATED].any()
     if actor:
         n_features = true[keys.OBSERVATION].shape[-1] - 2 * scenario.delay.history
         for key in (keys.OBSERVATION, next_key(keys.OBSERVATION)):

@@ -1,7 +1,6 @@
 """Messages between agents do what an obvious program does, which follows one link at a time."""
 
 import math
-from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -9,7 +8,6 @@ import pytest
 import torch
 from delay_twin import Counting, drawn
 from environments import vmas
-from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
@@ -22,9 +20,6 @@ WORLDS = [3, 5, 8]
 STEPS = 25
 CLOCKS = 2 * STEPS + 2
 ALL = set(permutations(range(N), 2))
-
-Link = tuple[int, int]
-"""Receiver and sender."""
 
 
 class World:
@@ -79,10 +74,6 @@ class World:
             return zeros, since, False
         sent, content = self.holds[receiver, sender]
         return content, self.clock - sent, True
-
-
-Wants = Callable[[TensorDictBase, TensorDictBase | None, int], Collection[Link]]
-"""The links on which a world wants to send, from the outputs, from the inputs (None at a reset)."""
 
 
 def check_against_twin(

@@ -75,7 +75,7 @@ def _collection(*features):
 
 def _written(folder, name, content):
     file = folder / name
-    file.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    file.write_text(content if isinstance(content, str) else json.dumps(content), "utf-8")
     return file
 
 
@@ -199,10 +199,10 @@ def test_only_areas_of_a_map_count_and_what_else_is_in_it_is_told_once(tmp_path,
     file = _map(tmp_path / "map.kml")
     drawn = read_area(file, every=True).polygon
     rings = " ".join(f"{x},{y}" for x, y in RING)
-    text = file.read_text(encoding="utf-8").replace("</Document>", PICTURES.format(rings))
+    text = file.read_text("utf-8").replace("</Document>", PICTURES.format(rings))
     text = text.replace("<Polygon>", "<MultiGeometry><Polygon>", 1)
     text = text.replace("</Polygon>", "</Polygon></MultiGeometry>", 1)
-    file.write_text(text, encoding="utf-8")
+    file.write_text(text, "utf-8")
     assert not capsys.readouterr().err
     for _ in range(2):
         assert read_area(file, every=True).polygon.equals(drawn)
