@@ -120,31 +120,6 @@ def test_a_method_is_compared_over_the_seeds_that_it_and_what_it_is_compared_wit
     assert [lines[method]["compared_seeds"] for method in ("blind", "flown", "aware")] == [2] * 3
 
 
-def test_a_table_has_every_method_and_policy_with_intervals_and_its_regime():
-    table = comparison(rows_of("t", "late", THREE)).table
-    assert [*table[["delay", "method", "policy"]].itertuples(index=False, name=None)] == [
-        ("none", "best", TRAINED),
-        ("none", "best", LIKELIEST),
-        ("none", RANDOM, RANDOM),
-        *[
-            ("late", method, policy)
-            for method in ("blind", "flown", "aware")
-            for policy in (TRAINED, LIKELIEST)
-        ],
-        ("late", RANDOM, RANDOM),
-    ]
-    cells = table.loc[7]
-    assert [cells[name] for name in ("method", "regime", "policy")] == [
-        "aware",
-        "late data",
-        TRAINED,
-    ]
-    assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
-    assert cells["return_low"] < cells["return"] < cells["return_high"]
-    assert cells["improvement"] == cells["improvement_high"] == 1
-    assert np.isnan([table.loc[3, "recovery"], table.loc[8, "J_norm"]]).all()
-
-
 def test_a_recovery_is_from_the_naive_method_of_the_same_track_if_the_delay_costs_something():
     scores = SCORES | {"flown": [9.0, 9.5]}  # as good as undelayed
     lines = compared(comparison(rows_of("t", "late", scores)))

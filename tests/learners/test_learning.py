@@ -23,7 +23,6 @@ from damian.models.critic import make_critic
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.server.config import EpisodeConfig, RewardConfig
 from damian.world.config import ActionConfig, MotionConfig, RegionConfig
-from damian.world.messages import Messages
 
 SMALL = MlpConfig(hidden=[16])
 REWARD = ("next", "agents", "reward")
@@ -119,24 +118,6 @@ def test_with_backupdating_the_first_importance_ratios_are_one_as_actor_observat
     with torch.no_grad():
         log_prob = learner.actor.get_dist(corrected.clone()).log_prob(batch["agents", "action"])
     assert (log_prob - behaviour).abs().max() < 1e-4  # computed step by step, and in one batch
-
-
-def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():
-    learner, flight = collect_delayed("discrete")
-    undelayed = everything(episode=EpisodeConfig(max_steps=9))
-    learner.setup = learning(SMALL, 5)
-    server = make_env(undelayed, 4, seed=1).server
-    learnt = torch.cat([learner.backupdated_batch(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
-    assert learnt.shape[1] == len(flight[0]) - 5  # the first batch is shorter
-    settled = flight[:, :25]
-    assert learnt["agents", "action"].equal(settled["agents", "action"])
-    sent = settled["next", "agents", "message"]
-    steps = settled["next", "step_count"].squeeze(-1)
-    truth = server(Messages.unpack(sent), steps)
-    assert learnt["next", "agents", "global_observation"].equal(truth.global_observation)
-    assert not learnt["next", "agents", "global_observation"].equal(
-        settled["next", "agents", "global_observation"]
-    )
 
 
 def test_a_nan_counts_only_if_weights_are_wrong():

@@ -5,7 +5,6 @@ import itertools
 import os
 import random
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -120,27 +119,6 @@ def check_stopped_runs(words, whole, stop):
         stops += run_through(words, f"run_{runs}", stop)
         check_equal(whole, whole.with_name(f"run_{runs}"))
         runs += 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("learner", LEARNERS)
-@pytest.mark.parametrize(
-    "number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name
-)
-def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, number):
-    words = [*SMALL, *LEARNERS[learner]]
-    moments = random.Random(f"{learner} {number}")
-    begin = time.monotonic()
-    whole = run(*words, folder="whole")
-    longest = time.monotonic() - begin
-
-    def stop(words):
-        child = forked(words)
-        time.sleep(moments.uniform(0, longest))
-        os.kill(child, number)
-        return ended(child)
-
-    check_stopped_runs(words, whole, stop)
 
 
 @pytest.mark.slow

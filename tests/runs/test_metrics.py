@@ -268,19 +268,6 @@ def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_no
     assert (found.isnan().logical_not().sum(1) == 5).all()
 
 
-def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
-    log = MetricsLog(tmp_path)
-    log.add(10, {"loss": 2.0, "old": 3.0})
-    log.add(15, {"loss": 9.0, "old": 9.0})
-    log.sync()
-    log = MetricsLog(tmp_path, frames=10)
-    log.add(20, {"new": 4.0, "loss": 5.0})
-    log.add(30, {"loss": 6.0})
-    log.close()
-    lines = ["frames,loss,old,new", "10.0,2.0,3.0,nan", "20.0,5.0,nan,4.0", "30.0,6.0,nan,nan"]
-    assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
-
-
 def test_tensorboard_shows_numbers_up_to_where_a_run_resumed(tmp_path):
     for resumed, frames in ((0, [10, 20]), (10, [20, 30])):
         time.sleep(1)  # files are in the order of the seconds in their names
