@@ -33,7 +33,13 @@ class Crowd(Law):
     loses: bool = True
 
     def sampler(self, dt=1.0, loss=0.0, key="delay"):
-        return ContextSampler(self.delays, LONGEST, loss, loses=self.loses, reads=[self.entry])
+        return ContextSampler(
+            self.delays,
+            LONGEST,
+            loss,
+            loses=self.loses,
+            reads=[self.entry],
+        )
 
     def delays(self, context):
         """Every part is a whole number, apart from a quarter that is to be rounded up."""
@@ -195,7 +201,11 @@ class Counting(EnvBase):
         observation = torch.stack(
             [names, agents, total, episode, self.x, self.executed, self.action_valid], -1
         ).double()
-        values = {"observation": observation, "message_sent": self._flag(0), "ready": self._flag(1)}
+        values = {
+            "observation": observation,
+            "message_sent": self._flag(0),
+            "ready": self._flag(1),
+        }
         return TensorDict({"agents": TensorDict(values, shape)}, self.batch_size)
 
     def _reset(self, tensordict=None, **_):
@@ -238,7 +248,13 @@ LAWS = {
     "uniform": lambda _: Uniform(1, 4),
     "paper": lambda _: PAPER,
     "geometric": lambda _: Geometric(2, 6),
-    "burst": lambda _: Burst(0.2, 0.3, good=Uniform(0, 1), bad=5, bad_loss=0.0),
+    "burst": lambda _: Burst(
+        0.2,
+        0.3,
+        good=Uniform(0, 1),
+        bad=5,
+        bad_loss=0.0,
+    ),
     "trace": lambda folder: trace(folder, 4, 0, 7, 1, 0, 2, 9, 0, 0, 3),
 }
 """Delay laws that lose no message."""

@@ -10,15 +10,38 @@ from damian.envs.uav_env import EXTRAS
 from damian.server.config import ObservationConfig
 
 PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
-BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}
+BURST = {
+    "law": "burst",
+    "enter": 0.2,
+    "leave": 0.3,
+    "bad": 4,
+    "bad_loss": 0.3,
+}
 DELAYS = {
     "paper": {"delay": DelayConfig(obs=PAPER)},
     "burst": {
-        "delay": DelayConfig(obs=BURST, act={"law": "geometric", "mean": 1}, order="arrival")
+        "delay": DelayConfig(
+            obs=BURST,
+            act={"law": "geometric", "mean": 1},
+            order="arrival",
+        )
     },
-    "everything": {"delay": DelayConfig(obs=3, act=2, rew=1, history=4, loss=0.1, reward_window=3)},
+    "everything": {
+        "delay": DelayConfig(
+            obs=3,
+            act=2,
+            rew=1,
+            history=4,
+            loss=0.1,
+            reward_window=3,
+        )
+    },
     "slow clocks": {
-        "delay": DelayConfig(obs=PAPER, act={"law": "uniform", "high": 2}, history=2),
+        "delay": DelayConfig(
+            obs=PAPER,
+            act={"law": "uniform", "high": 2},
+            history=2,
+        ),
         "clock": ClockConfig(agents="2s", server="4s"),
     },
     "belief": {
@@ -26,7 +49,12 @@ DELAYS = {
         "observation": ObservationConfig(own=True, belief=["belief_moments", "belief_map"]),
     },
     "context": {
-        "delay": DelayConfig(obs=Crowd(), act=Crowd(column=1), rew=Crowd(loses=False), loss=0.1)
+        "delay": DelayConfig(
+            obs=Crowd(),
+            act=Crowd(column=1),
+            rew=Crowd(loses=False),
+            loss=0.1,
+        )
     },
 }
 every_delay = pytest.mark.parametrize("delays", DELAYS)

@@ -42,7 +42,12 @@ class Teams(EnvBase):
         )
         flag = Categorical(2, shape=(*agents, 1), dtype=torch.bool)
         self.done_spec = Composite(
-            agents=Composite(done=flag, terminated=flag.clone(), shape=agents), shape=(2,)
+            agents=Composite(
+                done=flag,
+                terminated=flag.clone(),
+                shape=agents,
+            ),
+            shape=(2,),
         )
         self.reward_spec = Composite(
             agents=Composite(reward=Unbounded((*agents, 1)), shape=agents),
@@ -56,7 +61,11 @@ class Teams(EnvBase):
         flag = done.view(2, 1, 1).expand(2, 2, 1)
         agents |= {"done": flag.clone(), "terminated": flag.clone()}
         return TensorDict(
-            {"agents": TensorDict(agents, [2, 2]), "state": self.time.view(2, 1).clone()}, [2]
+            {
+                "agents": TensorDict(agents, [2, 2]),
+                "state": self.time.view(2, 1).clone(),
+            },
+            [2],
         )
 
     def _reset(self, tensordict=None, **_):
@@ -106,7 +115,13 @@ KINDS = {
     "PettingZoo, state": Kind(petting_zoo, "state", ("agent", "action"), ("agent", "reward")),
     "flags in the group": Kind(Teams),
     "flags in the group, root entries": Kind(Teams, "state", ("agents", "action"), "team_reward"),
-    "UAVs": Kind(lambda: UavEnv(square(), num_worlds=2, extras=["message"])),
+    "UAVs": Kind(
+        lambda: UavEnv(
+            square(),
+            num_worlds=2,
+            extras=["message"],
+        )
+    ),
 }
 
 
@@ -150,7 +165,12 @@ class Drift(EnvBase):
         done = (self.time >= self._longest).unsqueeze(-1)
         flags = {"done": done, "terminated": done}
         return TensorDict(
-            {"observation": place, "reward": place.sum(-1, keepdim=True), **flags}, [3]
+            {
+                "observation": place,
+                "reward": place.sum(-1, keepdim=True),
+                **flags,
+            },
+            [3],
         )
 
     def _set_seed(self, seed):

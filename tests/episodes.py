@@ -23,7 +23,12 @@ def flight(n_steps=3, **changes):
         "source": np.tile([0.0, -120.0], (t, 1, 1)),
         "believed": np.tile(position[:, :2], (t, 1, 1)),
         **dict.fromkeys(("track", "age", "reward"), uavs),
-        **{"spotted": flags, "sent": flags, "delay": uavs.astype(int), "emits": flags[:, :1]},
+        **{
+            "spotted": flags,
+            "sent": flags,
+            "delay": uavs.astype(int),
+            "emits": flags[:, :1],
+        },
     }
     fixed = {
         "about": {},
@@ -35,7 +40,10 @@ def flight(n_steps=3, **changes):
     return Episode(**{**fixed, **columns, **changes})
 
 
-NO_SOURCE = {"source": np.zeros((4, 0, 2)), "emits": np.zeros((4, 0), bool)}
+NO_SOURCE = {
+    "source": np.zeros((4, 0, 2)),
+    "emits": np.zeros((4, 0), bool),
+}
 UNKNOWN_SOURCE = {"source": None, "emits": None}
 """Changes of a flight of three steps whose task has no source, and whose source nobody knows."""
 

@@ -190,7 +190,16 @@ def same(one, other, atol=0.0):
 
     def equal(a, b):
         is_near = atol > 0 and a.is_floating_point() and a.shape == b.shape
-        return torch.allclose(a, b, rtol=0, atol=atol) if is_near else a.equal(b)
+        return (
+            torch.allclose(
+                a,
+                b,
+                rtol=0,
+                atol=atol,
+            )
+            if is_near
+            else a.equal(b)
+        )
 
     keys = {*one.keys(True, True)}
     return keys == {*other.keys(True, True)} and all(equal(one[key], other[key]) for key in keys)

@@ -157,5 +157,10 @@ def test_the_transforms_load_without_the_world_of_the_uavs():
     code = (
         f"import sys, damian.transforms; print([name for name in {heavy} if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout.strip() == "[]"

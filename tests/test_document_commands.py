@@ -126,7 +126,14 @@ def trained(tmp_path_factory):
 
 def write_journal(path):
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines = [{"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A", "B"]}]
+    lines = [
+        {
+            "journal": "damian-advice",
+            "version": 3,
+            "fleet": "north",
+            "uavs": ["A", "B"],
+        }
+    ]
     for n in range(60):
         row = {
             "ID": "AB"[n % 2],

@@ -145,7 +145,11 @@ def test_workers_draw_the_same_delays_again_each_its_own():
 
 
 def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew():
-    storage, _ = load("sac_backupdating")["train"](delay=6, frames=150, warm_up=120)
+    storage, _ = load("sac_backupdating")["train"](
+        delay=6,
+        frames=150,
+        warm_up=120,
+    )
     learnt = storage.steps[storage.latest()[:-6]]
     assert len(learnt) == 150 - 6
     assert learnt["next", "state"].equal(learnt["next", "observation"])
@@ -202,5 +206,10 @@ def test_a_search_with_optuna_keeps_its_trials_and_goes_on(tmp_path):
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for n in ("1", "2"):
         command = [sys.executable, str(EXAMPLES / "tune.py"), n, *words]
-        subprocess.run(command, cwd=tmp_path, env=os.environ | {"PATH": path}, check=True)
+        subprocess.run(
+            command,
+            cwd=tmp_path,
+            env=os.environ | {"PATH": path},
+            check=True,
+        )
     assert len([*tmp_path.glob("runs/tune/*/result.csv")]) == 2

@@ -47,7 +47,12 @@ def weight(path):
 
 
 def main():
-    listed = subprocess.run(["git", "ls-files", "*.py"], check=True, capture_output=True, text=True)
+    listed = subprocess.run(
+        ["git", "ls-files", "*.py"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     for group, folders in GROUPS.items():
         tokens = Counter()
         lines = Counter()

@@ -66,7 +66,12 @@ def compared(found):
     return {line["method"]: line for line in lines.to_dict("records")}
 
 
-THREE = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3], "flown": [5.0, 3, 4], "aware": [6.0, 9, 7]}
+THREE = {
+    "best": [9.0, 11, 10],
+    "blind": [1.0, 5, 3],
+    "flown": [5.0, 3, 4],
+    "aware": [6.0, 9, 7],
+}
 
 
 def test_a_table_from_before_a_metric_existed_has_an_empty_column(tmp_path):
@@ -87,7 +92,12 @@ def test_a_table_from_before_a_metric_existed_has_an_empty_column(tmp_path):
         means(rows, [], "lab:unknown")
 
 
-SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
+SCORES = {
+    "best": [9.0, 11.0],
+    "blind": [1.0, 5.0],
+    "flown": [5.0, 3.0],
+    "aware": [6.0, 9.0],
+}
 
 
 def test_recovery_counts_from_the_stronger_naive_method_by_means_over_seeds():

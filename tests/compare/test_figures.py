@@ -45,7 +45,11 @@ MEASURES = ["return", "success_rate", "steps", "perceived_return", "age"]
 def test_a_sweep_has_a_panel_for_each_value_with_the_other_panels_in_grey(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
-    returns = {("none", 4): 2.0, ("none", 0): 9.0, ("timeline", 4): 7.0}
+    returns = {
+        ("none", 4): 2.0,
+        ("none", 0): 9.0,
+        ("timeline", 4): 7.0,
+    }
     rows = pd.DataFrame(
         [
             (*place, policy, seed, 9, mean + seed - 10 * (policy == "script"), 0.0, 1.0, 0.0, 0.0)
@@ -65,7 +69,10 @@ def test_a_sweep_has_a_panel_for_each_value_with_the_other_panels_in_grey(tmp_pa
     found = {
         line.get_label(): line.get_xydata().tolist() for line in first.lines if line is not trained
     }
-    assert found == {"other panels": [[4, 7]], "script": [[0, -1], [4, -8]]}
+    assert found == {
+        "other panels": [[4, 7]],
+        "script": [[0, -1], [4, -8]],
+    }
     assert trained.get_xydata().tolist() == [[0, 9], [4, 2]]
     assert [label.get_text() for label in drawn[1].axes[0].get_xticklabels()] == [
         "none",

@@ -12,7 +12,14 @@ from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, OWN, fit_laws
 from damian.delays.laws import sampler_of
 
 UNIFORM = {"law": "uniform", "low": 3, "high": 7}
-BURST = {"law": "burst", "enter": 0.05, "leave": 0.2, "good": 1, "bad": UNIFORM, "bad_loss": 0.3}
+BURST = {
+    "law": "burst",
+    "enter": 0.05,
+    "leave": 0.2,
+    "good": 1,
+    "bad": UNIFORM,
+    "bad_loss": 0.3,
+}
 LAWS = [
     3,
     UNIFORM,

@@ -49,14 +49,38 @@ LAWS = {
     "a time, rounded up": (Constant("0.5m"), 20.0, {2: 1.0}),
     "uniform steps": (Uniform(2, 5), 1.0, dict.fromkeys((2, 3, 4, 5), 0.25)),
     "the paper's": (PAPER, 1.0, {0: 0.85} | dict.fromkeys((4, 5, 6, 7), 0.0375)),
-    "the paper's at a coarser step": (PAPER, 2.0, {0: 0.85, 2: 0.0375, 3: 0.075, 4: 0.0375}),
-    "uniform within a step": (Uniform("0.5s", "2s"), 1.0, {1: 1 / 3, 2: 2 / 3}),
+    "the paper's at a coarser step": (
+        PAPER,
+        2.0,
+        {
+            0: 0.85,
+            2: 0.0375,
+            3: 0.075,
+            4: 0.0375,
+        },
+    ),
+    "uniform within a step": (
+        Uniform("0.5s", "2s"),
+        1.0,
+        {
+            1: 1 / 3,
+            2: 2 / 3,
+        },
+    ),
     "geometric": (
         Geometric(2, 6),
         1.0,
         {k: 2**k / 3 ** (k + 1) for k in range(6)} | {6: (2 / 3) ** 6},
     ),
-    "a burst that never ends": (Burst(leave=0.0, bad=2, bad_loss=0.25), 1.0, {2: 0.75}),
+    "a burst that never ends": (
+        Burst(
+            leave=0.0,
+            bad=2,
+            bad_loss=0.25,
+        ),
+        1.0,
+        {2: 0.75},
+    ),
 }
 
 
@@ -83,7 +107,13 @@ def share(flags):
     return flags.double().mean().item(), flags.numel()
 
 
-BURST = Burst(enter=0.05, leave=0.2, good=0, bad=5, bad_loss=0.0)
+BURST = Burst(
+    enter=0.05,
+    leave=0.2,
+    good=0,
+    bad=5,
+    bad_loss=0.0,
+)
 
 
 def test_a_channel_changes_state_with_its_probabilities_so_that_a_burst_lasts_1_over_leave_steps():
@@ -99,7 +129,14 @@ def test_a_channel_changes_state_with_its_probabilities_so_that_a_burst_lasts_1_
 
 
 def test_losses_of_the_channel_state_and_general_losses_combine():
-    law = Burst(enter=0.5, leave=0.5, good=1, bad=PAPER, good_loss=0.1, bad_loss=0.5)
+    law = Burst(
+        enter=0.5,
+        leave=0.5,
+        good=1,
+        bad=PAPER,
+        good_loss=0.1,
+        bad_loss=0.5,
+    )
     sampler = law.sampler(loss=0.2)
     kept = 0.5 * 0.8
     chances = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys(
@@ -150,7 +187,14 @@ def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
     [
         ("3", Constant(3)),
         (Uniform(1, 2), Uniform(1, 2)),
-        ({"law": "geometric", "mean": 1.5, "longest": "9"}, Geometric(1.5, 9)),
+        (
+            {
+                "law": "geometric",
+                "mean": 1.5,
+                "longest": "9",
+            },
+            Geometric(1.5, 9),
+        ),
         (
             {"law": "burst", "bad": {"law": "uniform", "high": 3}},
             Burst(bad={"law": "uniform", "high": 3}),

@@ -76,12 +76,30 @@ def test_a_law_reads_the_trace(log, tmp_path, capsys):
 
 
 def test_a_journal_is_a_log(log):
-    head = {"journal": "damian-advice", "version": 3, "fleet": "x", "uavs": ["A"], "about": {}}
+    head = {
+        "journal": "damian-advice",
+        "version": 3,
+        "fleet": "x",
+        "uavs": ["A"],
+        "about": {},
+    }
     reports = [
-        {"received": i + 0.25, "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}]}
+        {
+            "received": i + 0.25,
+            "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}],
+        }
         for i in range(4)
     ]
-    lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]
+    lines = [
+        head,
+        *reports,
+        {
+            "asked": 5.0,
+            "step": 5,
+            "told": {},
+            "advice": [],
+        },
+    ]
     path = log("".join(f"{json.dumps(line)}\n" for line in lines) + '{"cut', "x.jsonl")
     assert trace_rows(fitted_log(path)) == ["0.250000s"] * 4
 

@@ -21,10 +21,21 @@ from damian.world.config import RegionConfig, SourceConfig
 
 def test_an_environment_reads_a_trace_once(tmp_path):
     delay = DelayConfig(
-        obs=trace(tmp_path, 1, 2, 0), act={"law": "uniform", "high": 2}, rew=1, history=2
+        obs=trace(tmp_path, 1, 2, 0),
+        act={
+            "law": "uniform",
+            "high": 2,
+        },
+        rew=1,
+        history=2,
     )
     scenario = square(delay=delay, links=LinkConfig("matrix", delay=1))
-    config = TrainConfig(**vars(scenario), learner=MappoConfig(steps=5), worlds=2, backupdate=True)
+    config = TrainConfig(
+        **vars(scenario),
+        learner=MappoConfig(steps=5),
+        worlds=2,
+        backupdate=True,
+    )
     check_learning(config)
     env = learning_env(config)
     next(tmp_path.iterdir()).unlink()  # so that to read it again fails
@@ -93,7 +104,11 @@ def test_an_environment_keeps_the_settings_with_which_it_was_made(make, change):
 
 
 def test_a_learner_keeps_the_settings_with_which_it_was_made():
-    config = TrainConfig(**vars(square()), learner=MappoConfig(steps=5), worlds=2)
+    config = TrainConfig(
+        **vars(square()),
+        learner=MappoConfig(steps=5),
+        worlds=2,
+    )
     env = learning_env(config)
     learner = make_learner(config, env, None)
     config.learner.epochs = 40

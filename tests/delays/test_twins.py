@@ -42,7 +42,13 @@ LAWS = {
     "time": Lag(Uniform(1, 5), "8s"),
     "episode": Lag(Uniform(1, 5), "episode"),
     "hold": Lag(Uniform(1, 5), 2, hold_probability=0.5),
-    "all": Lag(Uniform(1, 5), 3, hold_probability=0.4, shared=True, stagger=True),
+    "all": Lag(
+        Uniform(1, 5),
+        3,
+        hold_probability=0.4,
+        shared=True,
+        stagger=True,
+    ),
     "context": Crowd("seen", column=4),
     "state of one's own": Route(4, change=0.6),
 }
@@ -62,7 +68,10 @@ class LagSender:
         self.stream = torch.tensor(stream)
         self.lag = lag
         self.loss = loss
-        self.period = {"episode": math.inf, "8s": 4}.get(str(lag.update_period), lag.update_period)
+        self.period = {
+            "episode": math.inf,
+            "8s": 4,
+        }.get(str(lag.update_period), lag.update_period)
         self.begin()
 
     def begin(self):
@@ -147,7 +156,11 @@ def senders(transform, law, loss=0.0, first=1):
     """A sender for each row, with the random stream of the transform."""
     streams = transform.memory["streams"]
     sampler = transform.sampler
-    own = {Lag: LagSender, Route: RouteSender, Crowd: CrowdSender}.get(type(law))
+    own = {
+        Lag: LagSender,
+        Route: RouteSender,
+        Crowd: CrowdSender,
+    }.get(type(law))
     if own is None:
         return [TableSender(d, sampler.lost) for d in drawn(sampler, streams, STEPS).T.tolist()]
     assert len(streams.unique()) >= len(WORLDS), "worlds draw apart"
@@ -230,7 +243,15 @@ def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key
 
 @pytest.mark.sample(2)
 def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
-    law = Crowd("seen", column=4, loses=False) if isinstance(law, Crowd) else law
+    law = (
+        Crowd(
+            "seen",
+            column=4,
+            loses=False,
+        )
+        if isinstance(law, Crowd)
+        else law
+    )
     earned = after(play(Counting(WORLDS, N_AGENTS), choices()), *REWARD)
     transform = RewardDelay(
         law, REWARD, delay_key="reward_delay", earned_key="earned", **options(law)

@@ -42,7 +42,13 @@ def check_equals_undelayed(env, scenario, n_steps=25):
 
 def test_without_any_delay_there_are_no_transforms():
     nothing = DelayConfig(
-        obs="0s", act={"law": "uniform", "high": "7s", "low": "3s", "probability": 0.0}
+        obs="0s",
+        act={
+            "law": "uniform",
+            "high": "7s",
+            "low": "3s",
+            "probability": 0.0,
+        },
     )
     env = make_env(everything(delay=nothing), 4, extras=EXTRAS)
     assert not [*env.transform.transforms]
@@ -88,7 +94,17 @@ class FalsifyMessage(Transform):
 
 @pytest.mark.sample(4)
 @pytest.mark.parametrize("order", ["generation", "arrival"])
-@pytest.mark.parametrize("obs", [4, {"law": "geometric", "mean": 3}], ids=["constant", "random"])
+@pytest.mark.parametrize(
+    "obs",
+    [
+        4,
+        {
+            "law": "geometric",
+            "mean": 3,
+        },
+    ],
+    ids=["constant", "random"],
+)
 def test_a_message_has_no_effect_before_it_arrives(obs, order):
     scenario = everything(episode=KEEPS_GOING, delay=DelayConfig(obs=obs, order=order))
     original = play(env := delayed(scenario), choices(env, 20))
@@ -203,7 +219,12 @@ def test_a_scenario_compiles_to_kernels(name):
     actions = choices(eager, 8)
     for expected, found in zip(steps_of(eager, actions), steps_of(compiled, actions), strict=True):
         for key, value in expected.items(True, True):
-            torch.testing.assert_close(found[key], value, msg=str(key), equal_nan=True)
+            torch.testing.assert_close(
+                found[key],
+                value,
+                msg=str(key),
+                equal_nan=True,
+            )
 
 
 def check_equals_torchrls_way(scenario, env):

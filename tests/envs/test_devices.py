@@ -18,9 +18,17 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.transforms.base import StatefulTransform
 
 LATE = DelayConfig(
-    obs={"law": "geometric", "mean": 2}, rew={"law": "uniform", "low": 0, "high": 30}
+    obs={
+        "law": "geometric",
+        "mean": 2,
+    },
+    rew={"law": "uniform", "low": 0, "high": 30},
 )
-LAG = {"law": "lag", "lag": {"law": "uniform", "low": 0, "high": 3}, "update_period": 2}
+LAG = {
+    "law": "lag",
+    "lag": {"law": "uniform", "low": 0, "high": 3},
+    "update_period": 2,
+}
 LINKS = {
     "own": {
         "delay": DelayConfig(obs=2),
@@ -28,7 +36,12 @@ LINKS = {
     },
     "updown": {"links": LinkConfig("updown", delay=2, loss=0.1)},
     "matrix": {
-        "links": LinkConfig("matrix", delay=[[0, 1, LAG]] * 3, loss=0.1, range=100.0),
+        "links": LinkConfig(
+            "matrix",
+            delay=[[0, 1, LAG]] * 3,
+            loss=0.1,
+            range=100.0,
+        ),
         "delay": LATE,
     },
 }
@@ -38,7 +51,13 @@ SCENARIOS = {
         f"{name} in flight": square(motion=MOTIONS["polynomial"], **KINDS[name])
         for name in ("coverage", "energy")
     },
-    **{name: everything(**sections) for name, sections in {**DELAYS, **LINKS}.items()},
+    **{
+        name: everything(**sections)
+        for name, sections in {
+            **DELAYS,
+            **LINKS,
+        }.items()
+    },
     "continuous": everything("polynomial", "continuous", delay=LATE),
 }
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)

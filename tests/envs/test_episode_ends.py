@@ -45,7 +45,14 @@ def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding
     )
     episode = EpisodeConfig(max_steps=None, discharged_share=1.0)
     task = RewardConfig(penalty=2.0)
-    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion], episode=episode, reward=task))
+    env = fresh(
+        one_uav(
+            battery=battery,
+            motion=MOTIONS[motion],
+            episode=episode,
+            reward=task,
+        )
+    )
     env.state = env.state._replace(battery=torch.tensor([[level]]))
     output = go(env, HERE)
     assert sent_messages(output).empty.item() == empty
@@ -55,7 +62,13 @@ def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding
 
 
 def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_configured():
-    once = {"n_hotspots": 1, "min_stops": 1, "max_stops": 1, "min_wait": 0.9, "max_wait": 0.9}
+    once = {
+        "n_hotspots": 1,
+        "min_stops": 1,
+        "max_stops": 1,
+        "min_wait": 0.9,
+        "max_wait": 0.9,
+    }
     source = walking(level_db=170.0, after_walk="stop", local_distance=1e-3, **once)
     for terminates in (True, False):
         episode = EpisodeConfig(max_steps=None, end_with_source=terminates)

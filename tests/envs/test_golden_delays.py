@@ -208,7 +208,17 @@ ESTIMATED = ("source_distance", "source_bearing", "source_drift", "mean_distance
     ("case", "compared", "reasons"),
     [
         (1, 974, {NOTHING_COVERED: 181, NO_BEARING: 112, LATE_RESET: 14}),
-        (2, 4593, {ONCE: 672, NOTHING_COVERED: 603, LATE_RESET: 270, DIVIDED: 136, NO_BEARING: 26}),
+        (
+            2,
+            4593,
+            {
+                ONCE: 672,
+                NOTHING_COVERED: 603,
+                LATE_RESET: 270,
+                DIVIDED: 136,
+                NO_BEARING: 26,
+            },
+        ),
     ],
 )
 def test_the_server_computes_the_recorded_features(case, compared, reasons):

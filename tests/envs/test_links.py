@@ -17,7 +17,14 @@ def linked(motion="instant", **links):
     """An environment whose messages to the server are delayed too, and the outputs of its steps."""
     delay = DelayConfig(obs=LATE, loss=0.1)
     env = make_env(
-        everything(motion, delay=delay, links=LinkConfig(**links)), 4, seed=2, extras=EXTRAS
+        everything(
+            motion,
+            delay=delay,
+            links=LinkConfig(**links),
+        ),
+        4,
+        seed=2,
+        extras=EXTRAS,
     )
     return env, play(env, choices(env, 20))
 
@@ -25,7 +32,11 @@ def linked(motion="instant", **links):
 LINKS = {
     "updown": {"kind": "updown", "delay": LATE, "loss": 0.1},
     "matrix": {"kind": "matrix", "delay": LATE, "loss": 0.1},
-    "range": {"kind": "matrix", "delay": {"law": "distance", "speed": 40.0}, "range": 120.0},
+    "range": {
+        "kind": "matrix",
+        "delay": {"law": "distance", "speed": 40.0},
+        "range": 120.0,
+    },
     "a law for each pair": {
         "kind": "matrix",
         "delay": [[0, 1, 2], [3, 0, LATE], [1, 1, 0]],
@@ -40,7 +51,11 @@ every_link = pytest.mark.parametrize("links", LINKS.values(), ids=LINKS)
 @both_motions
 @pytest.mark.parametrize("extras", [(), EXTRAS])
 def test_the_specs_are_right(links, motion, extras):
-    scenario = everything(motion, delay=DelayConfig(obs=1, history=2), links=LinkConfig(**links))
+    scenario = everything(
+        motion,
+        delay=DelayConfig(obs=1, history=2),
+        links=LinkConfig(**links),
+    )
     env = make_env(scenario, 2, extras=extras)
     check_env_specs(env, break_when_any_done="both")
     assert keys.LINKED not in env.reset().keys(True, True)
@@ -72,7 +87,12 @@ def test_on_board_each_uav_computes_what_the_server_would_from_the_messages_that
 ):
     delay = DelayConfig(obs=LATE)
     links = LinkConfig("matrix", delay=LATE, loss=0.2)
-    env = make_env(everything(motion, delay=delay, links=links), 4, seed=2, extras=EXTRAS)
+    env = make_env(
+        everything(motion, delay=delay, links=links),
+        4,
+        seed=2,
+        extras=EXTRAS,
+    )
     env.transform[-1].dropped_keys = []
     n_old = 0
     steps = torch.zeros(4, dtype=torch.long)

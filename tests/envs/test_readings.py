@@ -43,7 +43,10 @@ def test_a_reward_term_reads_features_of_any_width_and_range(motion):
     "changed",
     [
         {},
-        {"delay": DelayConfig(obs=2, history=3), "clock": ClockConfig(agents="2s", server="2s")},
+        {
+            "delay": DelayConfig(obs=2, history=3),
+            "clock": ClockConfig(agents="2s", server="2s"),
+        },
         {"delay": DelayConfig(obs=2, history=1), "own": True},
     ],
 )

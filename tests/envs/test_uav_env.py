@@ -27,7 +27,14 @@ from damian.world.config import ActionConfig
 @both_motions
 def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
     delay = DelayConfig(
-        obs={"law": "burst"}, act={"law": "uniform", "low": 0, "high": 2}, rew=1, history=2
+        obs={"law": "burst"},
+        act={
+            "law": "uniform",
+            "low": 0,
+            "high": 2,
+        },
+        rew=1,
+        history=2,
     )
     scenario = everything(motion, delay=delay)
     skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
@@ -58,7 +65,11 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
         agents=2,
         region=REGIONS[region],
         motion=MOTIONS[motion],
-        actions=ActionConfig(kind=kind, distances=[0.0, 60.0], headings=[0.0, 90.0, 180.0, 270.0]),
+        actions=ActionConfig(
+            kind=kind,
+            distances=[0.0, 60.0],
+            headings=[0.0, 90.0, 180.0, 270.0],
+        ),
     )
     check_env_specs(UavEnv(config, num_worlds=2), seed=0, break_when_any_done="both")
 
@@ -77,7 +88,12 @@ def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_t
     assert set(terms.keys()) == {*BUILT_IN} - {"served"}
     rest = td["next", "agents", "reward"].squeeze(-1) - sum(terms.values())
     final = 1.0 * td["next", "success"] - 0.25 * (td["next", "done"] & ~td["next", "success"])
-    torch.testing.assert_close(rest, final.expand_as(rest), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        rest,
+        final.expand_as(rest),
+        atol=1e-5,
+        rtol=0,
+    )
     assert td["next", "done"].any()
 
 

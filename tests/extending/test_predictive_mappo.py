@@ -90,7 +90,12 @@ def test_the_attention_is_that_of_a_loop_over_heads_and_known_messages(example):
         for j in range(3):
             for q in range(3):
                 expected = twin(encoder, observation[i, j], history[i, j], codes[i, j, q])
-                torch.testing.assert_close(encoded[i, j, q], expected, atol=1e-5, rtol=1e-4)
+                torch.testing.assert_close(
+                    encoded[i, j, q],
+                    expected,
+                    atol=1e-5,
+                    rtol=1e-4,
+                )
 
 
 def test_targets_use_nothing_that_has_not_arrived_by_now(example):

@@ -23,7 +23,14 @@ WIDTH = 2 * WINDOW + 5
 
 def make(agents):
     observation = ObservationConfig(["spotted"], ["talking:heard"], window=WINDOW)
-    links = LinkConfig(kind="matrix", delay={"law": "uniform", "low": 1, "high": 4})
+    links = LinkConfig(
+        kind="matrix",
+        delay={
+            "law": "uniform",
+            "low": 1,
+            "high": 4,
+        },
+    )
     return make_env(
         ScenarioConfig(agents=agents, observation=observation, links=links),
         2,

@@ -62,7 +62,12 @@ class Anything(gymnasium.Env):
 
     def __init__(self, action_space):
         self.action_space = action_space
-        self.observation_space = Dict({"place": Box(0, 9, (2,)), "word": Text(5)})
+        self.observation_space = Dict(
+            {
+                "place": Box(0, 9, (2,)),
+                "word": Text(5),
+            }
+        )
         self.executed = []
 
     def reset(self, *, seed=None, options=None):
@@ -73,7 +78,16 @@ class Anything(gymnasium.Env):
     def step(self, action):
         self.executed.append(action)
         t = len(self.executed)
-        return {"place": np.full(2, t, np.float32), "word": f"t{t}"}, 0.0, False, False, {}
+        return (
+            {
+                "place": np.full(2, t, np.float32),
+                "word": f"t{t}",
+            },
+            0.0,
+            False,
+            False,
+            {},
+        )
 
 
 @pytest.mark.parametrize(
@@ -83,7 +97,13 @@ class Anything(gymnasium.Env):
         (Discrete(4), 0),
         (MultiDiscrete([3, 4]), [0, 0]),
         (MultiBinary(3), [0, 0, 0]),
-        (Dict(gas=Box(0.0, 1), gear=Tuple([Discrete(3), Discrete(2)])), {"gas": 0, "gear": (0, 0)}),
+        (
+            Dict(gas=Box(0.0, 1), gear=Tuple([Discrete(3), Discrete(2)])),
+            {
+                "gas": 0,
+                "gear": (0, 0),
+            },
+        ),
     ],
     ids=str,
 )
@@ -104,7 +124,16 @@ def test_a_space_without_zero_asks_for_a_default_only_where_an_action_is_late():
     for late in (1, Uniform(0, 2)):
         with pytest.raises(InputError, match="default: is missing"):
             DelayWrapper(inner, action=late)
-    for options, executed in (({"observation": 2}, 3), ({"action": 1, "default": 5}, 5)):
+    for options, executed in (
+        ({"observation": 2}, 3),
+        (
+            {
+                "action": 1,
+                "default": 5,
+            },
+            5,
+        ),
+    ):
         env = DelayWrapper(inner, **options)
         env.reset()
         env.step(3)
@@ -113,7 +142,18 @@ def test_a_space_without_zero_asks_for_a_default_only_where_an_action_is_late():
 
 @pytest.mark.filterwarnings("ignore:.*WARN")  # of the wrapped environments themselves
 @pytest.mark.parametrize(
-    ("name", "wide"), [("Pendulum-v1", {"history": 3, "timeline": 4}), ("CartPole-v1", {})], ids=str
+    ("name", "wide"),
+    [
+        (
+            "Pendulum-v1",
+            {
+                "history": 3,
+                "timeline": 4,
+            },
+        ),
+        ("CartPole-v1", {}),
+    ],
+    ids=str,
 )
 def test_gymnasiums_checker_finds_nothing(name, wide):
     late = DelayWrapper(gymnasium.make(name).unwrapped, Uniform(0, 3), 2, 1, **wide)
@@ -284,7 +324,12 @@ def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
     assert [np.max(age) for age in ages] == [1, 2, 2, 2, 2, 2]
 
 
-DRAWN = {"observation": Uniform(1, 4), "action": 1, "reward": Uniform(0, 3), "loss": 0.2}
+DRAWN = {
+    "observation": Uniform(1, 4),
+    "action": 1,
+    "reward": Uniform(0, 3),
+    "loss": 0.2,
+}
 BY_TIME = {"observation": LOSSY, "action": 2, "reward": by_time}  # without chance
 
 
@@ -474,7 +519,15 @@ class Relay(ParallelEnv):
 
 def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
     env = DelayParallelWrapper(
-        Relay(), {"a": 1, "b": 4, "c": 2}, {"a": 2}, {"b": 3, "a": 1}, timeline=4
+        Relay(),
+        {
+            "a": 1,
+            "b": 4,
+            "c": 2,
+        },
+        {"a": 2},
+        {"b": 3, "a": 1},
+        timeline=4,
     )
     for _ in range(2):  # nothing of an episode reaches the next one
         told, infos = env.reset()
@@ -522,7 +575,14 @@ def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
     groups = {"agents": inner.possible_agents}
     relay = PettingZooWrapper(inner, use_mask=True, done_on_any=False, group_map=groups)
     reference = TransformedEnv(relay, delays)
-    env = DelayParallelWrapper(Relay(again, tells, "ab"), LOSSY, 1, by_time, history=3, timeline=5)
+    env = DelayParallelWrapper(
+        Relay(again, tells, "ab"),
+        LOSSY,
+        1,
+        by_time,
+        history=3,
+        timeline=5,
+    )
     now = reference.reset()
     earned = dict.fromkeys("ab", 0.0)
     env.reset()
@@ -573,6 +633,14 @@ def test_agents_draw_different_delays_which_follow_from_the_seed():
 
 def test_pettingzoos_checker_finds_nothing(capsys):
     parallel_api_test(
-        DelayParallelWrapper(made_spread(), Uniform(0, 3), 1, 2, history=2, timeline=3), 30
+        DelayParallelWrapper(
+            made_spread(),
+            Uniform(0, 3),
+            1,
+            2,
+            history=2,
+            timeline=3,
+        ),
+        30,
     )
     assert "Passed Parallel API test" in capsys.readouterr().out

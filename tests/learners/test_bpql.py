@@ -22,7 +22,14 @@ LONGEST = 5
 def learnt(kind="discrete", steps=40):
     """A learner after several batches, all steps that it was given [B, T], and the last transitions
     drawn."""
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": LONGEST}, history=3)
+    delay = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 0,
+            "high": LONGEST,
+        },
+        history=3,
+    )
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, 1, extras=["message", "privileged"])
     env.append_transform(StepCounter())

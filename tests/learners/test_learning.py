@@ -92,7 +92,14 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
 def collect_delayed(kind):
     """A learner with back-updating, and a batch of several episodes that its actor has flown under
     delay."""
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
+    delay = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 0,
+            "high": 5,
+        },
+        history=2,
+    )
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["message"])
     env.append_transform(StepCounter())

@@ -179,7 +179,16 @@ def test_steps_after_an_end_that_was_known_only_later_are_not_learnt_from():
 def recording_learner(env=None, **changed):
     """A learner that has made one update."""
     env = env or UavEnv(everything(kind="discrete"), 4)
-    config = SacConfig(**({"updates": 1, "batch_size": 64, "warm_up": 0} | changed))
+    config = SacConfig(
+        **(
+            {
+                "updates": 1,
+                "batch_size": 64,
+                "warm_up": 0,
+            }
+            | changed
+        )
+    )
     learner = RecordingSac(env, config, learning(SMALL), ReplayBuffer(storage=TimeStorage(100)))
     learner.learn(fly(env, learner.actor, 8))
     return learner

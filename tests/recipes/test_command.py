@@ -35,7 +35,12 @@ def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
         f"import sys\ntry:\n    {code}\nfinally:\n    assert not {{'torch', 'pandas'}} & "
         f"{{*sys.modules}}"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert "AssertionError" not in done.stderr
     assert done.returncode == (2 if "agnts=3" in code else 0)
 

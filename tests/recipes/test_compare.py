@@ -165,7 +165,11 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
     assert measured(folder) == rows
 
     stored = pd.read_csv(folder / "results.csv")
-    stored[stored["method"] != "student"].to_csv(folder / "results.csv", index=False, na_rep="nan")
+    stored[stored["method"] != "student"].to_csv(
+        folder / "results.csv",
+        index=False,
+        na_rep="nan",
+    )
     compare(*words, "keep=true")
     assert {path.parent.name for path in place.rglob("seed_3")} == {"undelayed", "student"}
     found = measured(folder)
@@ -235,10 +239,16 @@ def test_a_mistake_is_one_line_and_leaves_no_folder(
 
 
 def test_runs_go_seed_by_seed_and_a_held_out_delay_replaces_the_one_of_the_training():
-    methods = {"best": Method(delayed=False), "naive": Method(naive=True, tasks=["a"])}
+    methods = {
+        "best": Method(delayed=False),
+        "naive": Method(naive=True, tasks=["a"]),
+    }
     methods["flown"] = Method(policy_of="best", tasks=["b"])
     tasks = {task: ["scenario=delaybench/tracking"] for task in ("a", "b")}
-    held_out = {"six": HeldOut(["delay.obs=6"], ["a"]), "burst": HeldOut(["delay=burst"], ["a"])}
+    held_out = {
+        "six": HeldOut(["delay.obs=6"], ["a"]),
+        "burst": HeldOut(["delay=burst"], ["a"]),
+    }
     experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, methods, held_out, first_seed=3)
     config = CompareConfig(experiment, seeds=2)
     runs = plan(config, Path("runs"))

@@ -47,7 +47,12 @@ def fly(run, trained):
     """Evaluate the policy of a run in an empty folder; returns the folder with the results."""
 
     def start(*words, of=trained, folder="flown", program="evaluate"):
-        return run(*words, *[f"checkpoint={of}"] * bool(of), folder=folder, program=program)
+        return run(
+            *words,
+            *[f"checkpoint={of}"] * bool(of),
+            folder=folder,
+            program=program,
+        )
 
     return start
 
@@ -100,7 +105,13 @@ def test_a_loaded_policy_flies_as_it_was_evaluated(trained):
 
 
 def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
-    policy, env = damian.load(trained / "best.pt", "agents=5", "delay.obs=3", worlds=4, seed=1)
+    policy, env = damian.load(
+        trained / "best.pt",
+        "agents=5",
+        "delay.obs=3",
+        worlds=4,
+        seed=1,
+    )
     one, other = (env.rollout(5, policy)[keys.ACTION] for _ in range(2))
     assert one.shape == (4, 5, 5)
     assert not one.equal(other)  # actions are drawn

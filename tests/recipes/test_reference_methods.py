@@ -30,7 +30,13 @@ from damian.world.config import ActionConfig, SourceConfig
 from damian.world.state import Truth
 
 UNIFORM = {"law": "uniform", "low": 1, "high": 3, "probability": 0.3}
-BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.0}
+BURST = {
+    "law": "burst",
+    "enter": 0.2,
+    "leave": 0.3,
+    "bad": 4,
+    "bad_loss": 0.0,
+}
 LATE = {
     "delay": DelayConfig(obs=BURST, loss=0.3, history=2, rew=1),
     "clock": ClockConfig(server="2s"),
@@ -71,7 +77,12 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
         uavs = Truth.unpack(td["state"]).position[..., :2]
         from_centre = torch.tensor(position) - 100.0  # the middle of the square
         to_source = (from_centre - uavs) / (200 * math.sqrt(2))
-        torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            td[PRIVILEGED][..., -2:],
+            to_source,
+            atol=1e-6,
+            rtol=0,
+        )
 
 
 @both_kinds

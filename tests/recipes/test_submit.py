@@ -43,7 +43,10 @@ def folder(tmp_path, monkeypatch):
         (run / "run.json").write_text(json.dumps(record))
         evaluated = {"policy": "trained", "return": 20.0 + seed, "episodes": 200.0}
         write_csv(run / "result.csv", pd.DataFrame([evaluated]))
-        networks = {"actor": {"w": torch.zeros(3, 4)}, "optimizer": {"w": torch.zeros(9)}}
+        networks = {
+            "actor": {"w": torch.zeros(3, 4)},
+            "optimizer": {"w": torch.zeros(9)},
+        }
         write_checkpoint(run / "checkpoint.pt", {"components": networks})
         label = {
             "task": "crowded",

@@ -110,7 +110,15 @@ def test_of_many_runs_one_that_fails_is_kept_and_the_others_go_on(tmp_path):
     config = cli.settings("agents=1")
     names = ["first", "wrong", "last"]
     runs = [Run(work, config, tmp_path / name) for name in names]
-    runs.append(Run(work, config, tmp_path / "later", needs=tmp_path / "wrong", stage=1))
+    runs.append(
+        Run(
+            work,
+            config,
+            tmp_path / "later",
+            needs=tmp_path / "wrong",
+            stage=1,
+        )
+    )
     assert [run.folder.name for run in perform_all(runs, 1)] == ["wrong", "later"]
     told = [
         json.loads((tmp_path / name / "failed.json").read_text())["error"]
@@ -163,9 +171,19 @@ def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, caps
 
 def test_a_difference_takes_only_seeds_that_both_have():
     runs = pd.DataFrame(
-        {"seed": [0, 1, 2, 5], "return": [3.0, 5.0, 4.0, 99.0], "steps": [1, 2, 3, 0]}
+        {
+            "seed": [0, 1, 2, 5],
+            "return": [3.0, 5.0, 4.0, 99.0],
+            "steps": [1, 2, 3, 0],
+        }
     )
-    others = pd.DataFrame({"seed": [2, 1, 0], "return": [3.5, 4.0, 1.0], "steps": [4.0, 5.0, 6.0]})
+    others = pd.DataFrame(
+        {
+            "seed": [2, 1, 0],
+            "return": [3.5, 4.0, 1.0],
+            "steps": [4.0, 5.0, 6.0],
+        }
+    )
     found = difference(runs, others, "return")
     assert found["difference"] == pytest.approx((2 + 1 + 0.5) / 3)
     assert found["difference_low"] < found["difference"] < found["difference_high"]

@@ -56,7 +56,11 @@ SETTINGS = {
     "learner.name": lambda name: name,
     "delay.rew": lambda name: {"law": name},
     "delay.act": lambda name: {"law": "lag", "lag": {"law": name}},
-    "links": lambda name: {"kind": "updown", "delay": {"law": name}, "loss": 0.0},
+    "links": lambda name: {
+        "kind": "updown",
+        "delay": {"law": name},
+        "loss": 0.0,
+    },
     "logger.custom": lambda name: [name],
     "metrics": lambda name: [name],
     "reward.custom": lambda name: [{"term": name}],

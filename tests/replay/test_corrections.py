@@ -91,7 +91,10 @@ class Remote(EnvBase):
         n_rows = torch.Size(self.shape_of_rows).numel()
         number = (100.0 * self.n_sent + torch.arange(n_rows)).view(self.shape_of_rows)
         message = torch.stack([number, torch.rand(self.shape_of_rows)], -1)
-        entries = {key(self.group, "message"): message, "world": torch.arange(WORLDS).float()}
+        entries = {
+            key(self.group, "message"): message,
+            "world": torch.arange(WORLDS).float(),
+        }
         entries |= outcome(self.group, message, self.elapsed)
         agents = {"agents": TensorDict({}, self.shape_of_rows)} if self.group else {}
         outputs = TensorDict(agents, [WORLDS])
@@ -141,7 +144,12 @@ class Case(NamedTuple):
 def make_env(group, case=Case()):  # noqa: B008 (never changed)
     """The environment with late messages and what a case says."""
     message, received, reward = (key(group, name) for name in ("message", "received", "reward"))
-    told = {"loss": case.loss, "order": case.order, "delay_key": "delay", "seed": 3}
+    told = {
+        "loss": case.loss,
+        "order": case.order,
+        "delay_key": "delay",
+        "seed": 3,
+    }
     transforms = [ObservationDelay(Uniform(0, LONGEST), [message], [received], **told)]
     transforms += [StepCounter(), Receiver(group)]
     if case.latest is not None:
@@ -381,7 +389,11 @@ def extend_twice(first, second):
 
 def extend_joined(steps):
     n_step = MultiStepTransform(n_steps=3, gamma=0.9)
-    ReplayBuffer(storage=make_storage(()), transform=n_step, batch_size=4).extend(steps)
+    ReplayBuffer(
+        storage=make_storage(()),
+        transform=n_step,
+        batch_size=4,
+    ).extend(steps)
 
 
 REFUSED = {

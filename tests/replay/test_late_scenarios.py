@@ -133,7 +133,15 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     case = CASES[name]
     motion = "polynomial" if name in FLYING else "instant"
     scenario = everything(motion, episode=EpisodeConfig(max_steps=9), **case)
-    on_time = replace(scenario, delay=replace(scenario.delay, obs=0, rew=0, order="generation"))
+    on_time = replace(
+        scenario,
+        delay=replace(
+            scenario.delay,
+            obs=0,
+            rew=0,
+            order="generation",
+        ),
+    )
     late_messages = scenario.make_delays().obs.late
     actor = scenario.links.kind == "server" and late_messages
     corrected = ["reward", "critic", *["actor"] * actor]

@@ -21,7 +21,14 @@ def truth(env, steps):
 
 
 def test_the_programs_learn_the_same_rewards_from_flights_in_any_order_of_arrival():
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, order="arrival")
+    delay = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 0,
+            "high": 4,
+        },
+        order="arrival",
+    )
     motion = MotionConfig(kind="polynomial", max_speed=10.0, max_acceleration=2.0)
     scenario = square(delay=delay, motion=motion, episode=EpisodeConfig(max_steps=60))
     config = TrainConfig(

@@ -49,8 +49,14 @@ def test_decisions_are_those_that_a_loop_finds(seed):
 def random_steps(seed):
     """Random steps, as a ring buffer holds them whose oldest step lies at index 4."""
     torch.manual_seed(seed)
-    agents = {"action": torch.rand(T, B, N, 2), "observation": torch.rand(T, B, N, 4)}
-    after = {"observation": torch.rand(T, B, N, 4), "reward": torch.rand(T, B, N, 1)}
+    agents = {
+        "action": torch.rand(T, B, N, 2),
+        "observation": torch.rand(T, B, N, 4),
+    }
+    after = {
+        "observation": torch.rand(T, B, N, 4),
+        "reward": torch.rand(T, B, N, 1),
+    }
     ends = {key: torch.rand(T, B, 1) < 0.3 for key in ("done", "terminated")}
     return TensorDict({"agents": agents, "next": {"agents": after, **ends}}, [T, B])
 

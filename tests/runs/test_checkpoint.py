@@ -26,9 +26,18 @@ def test_everything_that_states_consist_of_is_read_as_it_was(tmp_path):
     whole = torch.arange(1000.0)
     step = TensorDict({"done": torch.zeros(2, 1, dtype=torch.bool)}, [2])
     step["agents"] = TensorDict({"x": whole[:6].view(2, 3)}, [2, 3])
-    numbers = {"a": [1, 2.5, None, "text", True], "b": (np.float64(3.5), np.int64(4)), 7: b"bytes"}
+    numbers = {
+        "a": [1, 2.5, None, "text", True],
+        "b": (np.float64(3.5), np.int64(4)),
+        7: b"bytes",
+    }
     module = nn.BatchNorm1d(3)
-    content = {"step": step, **numbers, "module": module.state_dict(), "size": torch.Size([2])}
+    content = {
+        "step": step,
+        **numbers,
+        "module": module.state_dict(),
+        "size": torch.Size([2]),
+    }
     write_checkpoint(tmp_path / "x.pt", content)
     assert (
         tmp_path / "x.pt"

@@ -23,7 +23,14 @@ from damian.world.config import SourceConfig
 from damian.world.messages import Messages
 
 HORIZON = 24
-BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}
+BURSTS = {
+    "law": "burst",
+    "enter": 0.3,
+    "leave": 0.3,
+    "good": 0,
+    "bad": 5,
+    "bad_loss": 0.2,
+}
 DELAYS = {
     "bursts and losses": DelayConfig(obs=BURSTS, loss=0.1),
     "rewards and actions too": DelayConfig(obs=2, act=1, rew=2),
@@ -129,7 +136,11 @@ def test_an_evaluation_equals_counting_step_by_step(motion, delay):
 @both_motions
 def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion):
     ends = EpisodeConfig(max_steps=9, success_share=0.3, discharged_share=0.6, end_with_source=True)
-    stops = everything(motion, episode=ends, source=walking(emission="per_step", after_walk="stop"))
+    stops = everything(
+        motion,
+        episode=ends,
+        source=walking(emission="per_step", after_walk="stop"),
+    )
     for scenario in (joint_spotting(motion, DelayConfig()), stops):
         flight, server = fly(scenario)
         row = evaluation(flight, server)
@@ -229,7 +240,14 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_nothing_is_lost(loss):
-    late = DelayConfig(obs={"law": "uniform", "low": 1, "high": 4}, loss=loss)
+    late = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 1,
+            "high": 4,
+        },
+        loss=loss,
+    )
     env = make_env(square(delay=late, episode=EpisodeConfig(max_steps=7)), 3, extras=["message"])
     server = env.server
     env.append_transform(EpisodeTotals())

@@ -93,7 +93,12 @@ def test_moments_are_mean_spread_and_entropy(flown):
         x, y = messages.position[world, uav].tolist()
         expected = [(east - x) / scale, (north - y) / scale, math.sqrt(variance) / scale, entropy]
         found = features["belief_moments"][world, uav].view(2, 4)[source]
-        torch.testing.assert_close(found, torch.tensor(expected).clamp(-1, 1), rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(
+            found,
+            torch.tensor(expected).clamp(-1, 1),
+            rtol=1e-3,
+            atol=1e-4,
+        )
 
 
 def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
@@ -111,7 +116,12 @@ def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
             )
             expected[ring * BELIEF_SECTORS + sector] += p
         found = features["belief_map"][world, uav].view(2, -1)[source]
-        torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            found,
+            torch.tensor(expected),
+            rtol=1e-4,
+            atol=1e-5,
+        )
         assert found.sum().item() == pytest.approx(1, abs=1e-4)
 
 

@@ -18,7 +18,16 @@ UNIFORM = {"law": "uniform", "low": 0, "high": 6}
 CASES = {
     "no delay": {},
     "delays beyond the slots, losses": {"delay": DelayConfig(obs=UNIFORM, loss=0.2)},
-    "held back": {"delay": DelayConfig(obs={"law": "uniform", "low": 0, "high": 2}, hold="max")},
+    "held back": {
+        "delay": DelayConfig(
+            obs={
+                "law": "uniform",
+                "low": 0,
+                "high": 2,
+            },
+            hold="max",
+        )
+    },
     "links": {"links": LinkConfig("matrix", delay=UNIFORM, loss=0.2)},
 }
 

@@ -22,7 +22,14 @@ def flown():
     source = SourceConfig(motion="dynamic", emission="per_step", emission_probability=0.5)
     scenario = ScenarioConfig(
         source=source,
-        delay=DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, loss=0.2),
+        delay=DelayConfig(
+            obs={
+                "law": "uniform",
+                "low": 0,
+                "high": 4,
+            },
+            loss=0.2,
+        ),
         observation=ObservationConfig(belief=["belief_moments"]),
         episode=EpisodeConfig(max_steps=25),
     )

@@ -279,7 +279,11 @@ def test_a_drag_shows_a_part_of_the_time_which_follows_the_present(opened):
 
 def test_rows_of_many_uavs_scroll_and_show_shares_of_a_long_time(opened):
     with opened(
-        crowd(300, cells=np.array([[-9.0, 0], [9, 0]]), belief=np.full((301, 1, 2), 0.5))
+        crowd(
+            300,
+            cells=np.array([[-9.0, 0], [9, 0]]),
+            belief=np.full((301, 1, 2), 0.5),
+        )
     ) as page:
         assert (page.shown("belief"), page.one(".scale").is_displayed()) == ("belief 1.0 bit", True)
         notes = [page.one(".note").text, page.press("t") or page.one(".note").text]

@@ -74,7 +74,13 @@ def test_every_step_is_that_of_mpe2(game):
         }
         for key, values in found.items():
             twin = np.stack([world[key] for world in expected])
-            np.testing.assert_allclose(values.numpy(), twin, atol=1e-5, rtol=1e-5, err_msg=key)
+            np.testing.assert_allclose(
+                values.numpy(),
+                twin,
+                atol=1e-5,
+                rtol=1e-5,
+                err_msg=key,
+            )
         touching += sum(
             int((torch.pdist(places) < 2 * env.size[0]).sum()) for places in env.position
         )

@@ -69,7 +69,15 @@ def grids_of(env):
     """The tables of each source alone."""
     simulation = env.uav_env.simulation
     of_each = [(each, footprint_radius(each)) for each in simulation.sources]
-    return [build_source_grid(simulation.airspace, *each, dt=1.0, cell=50.0) for each in of_each]
+    return [
+        build_source_grid(
+            simulation.airspace,
+            *each,
+            dt=1.0,
+            cell=50.0,
+        )
+        for each in of_each
+    ]
 
 
 def rows_of(grid, messages, source):

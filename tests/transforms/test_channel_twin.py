@@ -160,7 +160,20 @@ def twin_of(law, loss=0.0, **rules):
     return make
 
 
-@pytest.mark.parametrize("law", [0, 2, Uniform(1, 4), Burst(0.3, 0.4, good=Uniform(0, 2), bad=5)])
+@pytest.mark.parametrize(
+    "law",
+    [
+        0,
+        2,
+        Uniform(1, 4),
+        Burst(
+            0.3,
+            0.4,
+            good=Uniform(0, 2),
+            bad=5,
+        ),
+    ],
+)
 @pytest.mark.parametrize("known", [False, True])
 def test_messages_arrive_as_their_law_says(law, known):
     env = counting(Channel(law, loss=0.2, known_at_reset=known))
@@ -168,7 +181,12 @@ def test_messages_arrive_as_their_law_says(law, known):
 
 
 def test_a_flag_chooses_who_sends():
-    channel = Channel(Uniform(0, 3), sent_key="message_sent", loss=0.1, known_at_reset=True)
+    channel = Channel(
+        Uniform(0, 3),
+        sent_key="message_sent",
+        loss=0.1,
+        known_at_reset=True,
+    )
 
     def wants(outputs, _, b):
         sent = outputs["agents", "message_sent"][b]

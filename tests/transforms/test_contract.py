@@ -219,7 +219,12 @@ def some(cases, fast):
     seconds."""
     slow = pytest.mark.slow
     values = [
-        pytest.param(case, id=n, marks=() if n in fast else slow) for n, case in cases.items()
+        pytest.param(
+            case,
+            id=n,
+            marks=() if n in fast else slow,
+        )
+        for n, case in cases.items()
     ]
     return pytest.mark.parametrize("case", values)
 
@@ -528,7 +533,13 @@ class ByContent(Law):
 )
 def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
     kind = KINDS["CartPole"]
-    law = Burst(0.4, 0.4, good=Uniform(0, 2), bad=3, bad_loss=0.0)
+    law = Burst(
+        0.4,
+        0.4,
+        good=Uniform(0, 2),
+        bad=3,
+        bad_loss=0.0,
+    )
     skipping, steady = (TransformedEnv(two_worlds(), make(kind, law)) for _ in range(2))
     for env in (skipping, steady):
         set_seed(env, 1)

@@ -44,7 +44,13 @@ KINDS = {
     "VMAS": (vmas, AGENTS),
 }
 CHAINS = {
-    "observation": lambda o, a, r: ObservationDelay(LATE, [o], loss=0.1, delay_key="d", seed=1),
+    "observation": lambda o, a, r: ObservationDelay(
+        LATE,
+        [o],
+        loss=0.1,
+        delay_key="d",
+        seed=1,
+    ),
     "all": lambda o, a, r: Compose(
         ObservationDelay(LATE, [o], order="arrival", seed=1),
         Compose(RewardDelay(LATE, r, seed=2), CumulativeReward(2, 0.9, r)),

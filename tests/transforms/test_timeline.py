@@ -93,7 +93,11 @@ def twin(
 def test_the_timeline_holds_what_has_arrived_of_the_latest_steps(group, own, links):
     if links and not group:
         return
-    data = late_uavs(links=links, group=group, own=own).rollout(20, break_when_any_done=False)
+    data = late_uavs(
+        links=links,
+        group=group,
+        own=own,
+    ).rollout(20, break_when_any_done=False)
     assert data["next", "done"].sum() > WORLDS
     assert (data["next", "agents", "delay"] < 0).any()
     for world in range(WORLDS):

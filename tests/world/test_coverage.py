@@ -84,7 +84,12 @@ def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
         newest = [[old_new[-1]] for old_new in case["stored_positions_old_new"]]
         expected = np.array(case["clean_current_disc_minus_polygon_and_others_m2"])
         got = share_at(polygon, newest, radius) * math.pi * radius**2
-        np.testing.assert_allclose(got, expected, rtol=0, atol=0.01 * golden["disc_area"])
+        np.testing.assert_allclose(
+            got,
+            expected,
+            rtol=0,
+            atol=0.01 * golden["disc_area"],
+        )
 
 
 def test_a_sequence_of_steps_equals_each_step_by_itself():

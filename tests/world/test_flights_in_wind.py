@@ -101,7 +101,11 @@ def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
 
 
 def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
-    drawn = {"wind.speed": [0, 6], "motion.max_acceleration": [1, 2, 3], "source.miss": [0.0, 0.5]}
+    drawn = {
+        "wind.speed": [0, 6],
+        "motion.max_acceleration": [1, 2, 3],
+        "source.miss": [0.0, 0.5],
+    }
     flying = MotionConfig(kind="polynomial")
     gusty = WindConfig(gusts=2.0)
     scenario = replace(WORLD, motion=flying, wind=gusty, randomise=drawn)
@@ -180,8 +184,21 @@ def test_what_has_tables_for_each_level_refuses_a_range_of_them():
 
 def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
     losses = [0.0, 0.3, 0.9]
-    law = {"law": "lag", "lag": {"law": "uniform", "low": 1, "high": 4}}
-    scenarios = [replace(STILL, delay=DelayConfig(law), randomise={"delay.loss": losses})]
+    law = {
+        "law": "lag",
+        "lag": {
+            "law": "uniform",
+            "low": 1,
+            "high": 4,
+        },
+    }
+    scenarios = [
+        replace(
+            STILL,
+            delay=DelayConfig(law),
+            randomise={"delay.loss": losses},
+        )
+    ]
     scenarios += [replace(STILL, delay=DelayConfig(law, loss=loss)) for loss in losses]
     envs = [make_env(each, 12, 0, extras=["message"]) for each in scenarios]
     actions = [*torch.randint(24, (60, 12, 3))]
@@ -195,9 +212,20 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
 
 
 def test_reports_of_two_sources_are_those_of_a_plain_loop():
-    each = [{"level_db": 150.0, "miss": 0.4, "false_alarm": 0.1}, {"level_db": 145.0, "miss": 0.2}]
+    each = [
+        {
+            "level_db": 150.0,
+            "miss": 0.4,
+            "false_alarm": 0.1,
+        },
+        {"level_db": 145.0, "miss": 0.2},
+    ]
     moving = replace(WORLD.motion, max_speed=60.0, max_acceleration=40.0)
-    scenario = replace(WORLD, motion=moving, source=SourceConfig(count=2, each=each))
+    scenario = replace(
+        WORLD,
+        motion=moving,
+        source=SourceConfig(count=2, each=each),
+    )
     scenario = replace(scenario, episode=EpisodeConfig(None, all_sources=True))
     env = UavEnv(scenario, 8, seed=0)
     tag = torch.tensor(counter_rng.number_of("report"))
@@ -243,7 +271,14 @@ def test_the_truth_pays_and_ends_as_if_there_were_no_misses_and_false_alarms(end
     source = SourceConfig(count=2, level_db=150.0)
     episode = EpisodeConfig(12, **ends)
     clear = replace(STILL, reward=reward, source=source, episode=episode)
-    reported = replace(clear, source=replace(clear.source, miss=0.5, false_alarm=0.2))
+    reported = replace(
+        clear,
+        source=replace(
+            clear.source,
+            miss=0.5,
+            false_alarm=0.2,
+        ),
+    )
     judged = replace(reported, reward=replace(clear.reward, detection="truth"))
     rewards = []
     for scenario in (clear, judged, reported):

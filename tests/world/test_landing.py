@@ -110,7 +110,11 @@ def some_points(rng, kind, n):
 @settings(max_examples=settings.default.max_examples // 4)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    kinds=st.lists(st.sampled_from(["scattered", "clusters", "lattice"]), min_size=1, max_size=3),
+    kinds=st.lists(
+        st.sampled_from(["scattered", "clusters", "lattice"]),
+        min_size=1,
+        max_size=3,
+    ),
     n=st.integers(1, 9),
 )
 def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds, n):
@@ -174,7 +178,14 @@ def test_actions_that_lead_nowhere_are_refused_unless_there_is_one_landing_point
         )
         actions = ActionConfig(kind, distances=[0.0, distance], headings=[90.0])
         return Simulation(
-            WorldConfig(agents=1, region=region, actions=actions), 1.0, stops=1, seed=0
+            WorldConfig(
+                agents=1,
+                region=region,
+                actions=actions,
+            ),
+            1.0,
+            stops=1,
+            seed=0,
         )
 
     with pytest.raises(InputError, match=r"actions.distances: .* lead from no landing point"):

@@ -93,5 +93,13 @@ def test_no_uav_leaves_the_region_or_enters_a_zone(kind):
 def test_zones_that_cannot_be_are_refused(zones, message):
     with pytest.raises(ValueError, match=message):
         UavEnv(
-            ScenarioConfig(region=RegionConfig(kind="vertices", vertices=DENTED, zones=zones)), 1, 0
+            ScenarioConfig(
+                region=RegionConfig(
+                    kind="vertices",
+                    vertices=DENTED,
+                    zones=zones,
+                )
+            ),
+            1,
+            0,
         )

@@ -61,7 +61,15 @@ def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(tmp_path):
 
 @pytest.mark.parametrize(
     "place",
-    [[math.nan, 1.0], {"lat": 1.0, "lng": 2.0}, [0.0, 100.0], {"lat": 53.1, "lon": -4.5}],
+    [
+        [math.nan, 1.0],
+        {
+            "lat": 1.0,
+            "lng": 2.0,
+        },
+        [0.0, 100.0],
+        {"lat": 53.1, "lon": -4.5},
+    ],
     ids=[
         "not finite",
         "a misspelt key",

@@ -58,7 +58,11 @@ def test_a_hole_stays_a_hole_and_heights_are_ignored():
 
 
 RING = [[8.0, 45.0], [8.01, 45.0], [8.01, 45.01], [8.0, 45.01], [8.0, 45.0]]
-POINT = {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [8, 45]}}
+POINT = {
+    "type": "Feature",
+    "properties": {},
+    "geometry": {"type": "Point", "coordinates": [8, 45]},
+}
 
 
 def _polygon(*rings):
@@ -184,7 +188,12 @@ def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(
     half = read_area(_written(tmp_path, "fence.plan", plan))
     assert half.polygon.area == pytest.approx(whole / 2, rel=1e-4)
     assert half.origin == pytest.approx((45.005, 8.0075), abs=1e-6)
-    fences["circles"] = [{"circle": {"center": [45, 8], "radius": 40}, "inclusion": False}]
+    fences["circles"] = [
+        {
+            "circle": {"center": [45, 8], "radius": 40},
+            "inclusion": False,
+        }
+    ]
     file = _written(tmp_path, "circle.plan", plan)
     _assert_one_line_error(file, "geoFence.circles: a circle is not read", lambda: read_area(file))
 

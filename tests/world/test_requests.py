@@ -78,7 +78,11 @@ def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
                     and slots[b][m][2] > was[m]
                     and math.dist(slots[b][m][:2], at) <= radius
                 ]
-                best = min(near, key=lambda m: slots[b][m][2], default=None)
+                best = min(
+                    near,
+                    key=lambda m: slots[b][m][2],
+                    default=None,
+                )
                 serves = (
                     (lands is None or bool(lands[b, n])) and best is not None and best not in taken
                 )
@@ -137,8 +141,19 @@ def test_requests_appear_at_their_rate_anywhere_in_the_region():
 @pytest.mark.parametrize("reach", [None, 150.0])
 def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
     flying = MotionConfig(kind="polynomial", max_speed=60.0, max_acceleration=40.0)
-    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, loss=0.4)
-    asked = scenario(motion=flying, delay=late, requests=RequestConfig(RATE, 6, range=reach))
+    late = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 0,
+            "high": 4,
+        },
+        loss=0.4,
+    )
+    asked = scenario(
+        motion=flying,
+        delay=late,
+        requests=RequestConfig(RATE, 6, range=reach),
+    )
     env = make_env(asked, 4, 0, extras=["message"])
     steps = env.rollout(39, break_when_any_done=False)["next", "agents"]
     server = env.uav_env.server
@@ -171,7 +186,12 @@ def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
                     rows.append([*(min(max(x, -1), 1) for x in way), (t + 1 - when) / 40, 1.0])
                 shown += len(rows)
                 rows += [[0.0] * 4] * (4 - len(rows))
-                torch.testing.assert_close(seen[b, t, n], torch.tensor(rows), rtol=0, atol=1e-5)
+                torch.testing.assert_close(
+                    seen[b, t, n],
+                    torch.tensor(rows),
+                    rtol=0,
+                    atol=1e-5,
+                )
                 paid, before[n] = paid + pays, time
                 served += int(sent.serves[b, t, n, 0] * steps["message_sent"][b, t, n])
     assert 5 < paid < served

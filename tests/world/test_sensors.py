@@ -47,7 +47,11 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
     window=st.integers(1, 5),
     n_readings=st.integers(0, 5),
     n_sources=st.integers(1, 3),
-    shape=st.lists(st.integers(1, 3), min_size=1, max_size=3),
+    shape=st.lists(
+        st.integers(1, 3),
+        min_size=1,
+        max_size=3,
+    ),
 )
 def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, n_sources, shape):
     generator = torch.Generator().manual_seed(seed)

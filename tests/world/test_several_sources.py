@@ -15,7 +15,13 @@ PLACES = [[60.0, 60.0], [340.0, 80.0], [200.0, 240.0]]
 LEVELS = [138.0, 141.0, 135.0]
 LAND = [[0, 0], [400, 0], [400, 300], [0, 300]]
 SQUARE = RegionConfig(kind="vertices", vertices=LAND, initial_conditions=8)
-EACH = [{"position": place, "level_db": level} for place, level in zip(PLACES, LEVELS, strict=True)]
+EACH = [
+    {
+        "position": place,
+        "level_db": level,
+    }
+    for place, level in zip(PLACES, LEVELS, strict=True)
+]
 
 
 def scenario(source, **changed):

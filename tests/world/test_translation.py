@@ -25,7 +25,14 @@ def simulation(vertices, offset):
     source = SourceConfig(motion="dynamic", position=moved([30.0, 20.7])[0])
     battery = BatteryConfig(enabled=True, charging_points=moved([9.0, 9.0], [70, 8.5]))
     return Simulation(
-        WorldConfig(region=region, source=source, battery=battery), 1.0, stops=2, seed=0
+        WorldConfig(
+            region=region,
+            source=source,
+            battery=battery,
+        ),
+        1.0,
+        stops=2,
+        seed=0,
     )
 
 
