@@ -229,18 +229,6 @@ def test_only_areas_of_a_map_count_and_what_else_is_in_it_is_told_once(tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("key", "sign", "value"), [("name", ":", "12:30"), ("ISO 3166:2", "=", "x=y:z")]
-)
-def test_a_property_and_its_value_may_have_any_characters(tmp_path, key, sign, value):
-    features = [
-        _feature(_polygon(RING), **{key: "other"}),
-        _feature(_polygon(RING), **{key: value}),
-    ]
-    file = _written(tmp_path, "two.geojson", _collection(*features))
-    assert read_area(file, where=f"{key}{sign}{value}").name in (value, "two features[1]")
-
-
-@pytest.mark.parametrize(
     ("choice", "message"),
     [
         (
