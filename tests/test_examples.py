@@ -138,7 +138,7 @@ def test_an_example_runs(name, entry):
 
 
 def test_workers_draw_the_same_delays_again_each_its_own():
-    draw = run("late_workers")["draw"]
+    draw = load("transforms/late_workers")["draw"]
     one, other = draw(SerialEnv)
     assert one != other
     assert draw(SerialEnv) == [one, other]
@@ -165,6 +165,11 @@ def test_ppo_behind_delays_takes_a_few_steps():
 def test_multi_agent_ppo_behind_delays_takes_a_few_steps():
     pytest.importorskip("vmas")
     assert len(load("ppo_vmas")["train"](batches=1)) == 1
+
+
+@pytest.mark.slow
+def test_worker_processes_draw_late_messages():
+    run("late_workers")
 
 
 @pytest.mark.slow
