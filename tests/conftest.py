@@ -21,7 +21,7 @@ settings.register_profile("deep", deadline=None, max_examples=3000, print_blob=T
 settings.load_profile("same")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Mark property tests, which ``make test-deep`` runs, and the cases that ``sample`` leaves to
     be slow."""
     for item in items:
@@ -37,7 +37,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("slow")
 
 
-def _function(item: pytest.Item) -> str:
+def _function(item):
     """The test of which the item is a case."""
     return item.nodeid.partition("[")[0]
 

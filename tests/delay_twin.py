@@ -6,20 +6,16 @@ episode.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
+from damian import Burst, ContextSampler, Geometric, Law, Trace, Uniform
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Geometric, Law, Trace, Uniform
-from damian.delays.samplers import ContextSampler, MessageContext, Sampler
-from damian.transforms import StatefulTransform
 
 LONGEST = 6
 LOST = 0.875
@@ -36,10 +32,16 @@ class Crowd(Law):
     """Column of the entry that the law looks at."""
     loses: bool = True
 
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return ContextSampler(self.delays, LONGEST, loss, loses=self.loses, reads=[self.entry])
+    def sampler(self, dt=1.0, loss=0.0, key="delay"):
+        return ContextSampler(
+            self.delays,
+            LONGEST,
+            loss,
+            loses=self.loses,
+            reads=[self.entry],
+        )
 
-    def delays(self, context: MessageContext) -> Tensor:
+    def delays(self, context):
         """Every part is a whole number, apart from a quarter that is to be rounded up."""
         place = (context.entries[self.entry][:, self.column] / 32).floor().abs() % 3
         parity = (context.time / context.dt) % 2
@@ -54,9 +56,7 @@ class Crowd(Law):
         return torch.where(context.uniform >= LOST, -1.0, steps)
 
 
-def twin_delay(
-    value: float, n_sending: int, sender: int, elapsed: int, uniform: float
-) -> int | None:
+def twin_delay(value, n_sending, sender, elapsed, uniform):
     """The delay of ``Crowd`` for one message; None if it is lost."""
     if uniform >= LOST:
         return None
@@ -67,7 +67,7 @@ def twin_delay(
     )
 
 
-def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
+def drawn(sampler, streams, n_steps):
     """Delays of the messages that senders with these random streams [M] send in steps 1 to T,
     [T, M]."""
     memory = sampler.initial_state(streams)
@@ -90,17 +90,17 @@ class Receiver:
     """Receives one sender's messages; holds that sent last (``generation``) or arrived last
     (``arrival``)."""
 
-    def __init__(self, order: str) -> None:
+    def __init__(self, order):
         self.order = order
 
-    def begin(self, now: int, content: Any) -> None:
+    def begin(self, now, content):
         """Begin an episode: the first message is received without delay, and no other is in
         transit."""
         self.began = now
         self.holds = Message(now, now, content)
         self.in_transit = []
 
-    def step(self, now: int, content: Any, delay: int | None) -> bool:
+    def step(self, now, content, delay):
         """Send a message, unless the delay is None, and receive others; is a new message held?"""
         if delay is not None:
             self.in_transit.append(Message(now + delay, now, content))
@@ -113,7 +113,7 @@ class Receiver:
         return True
 
     @property
-    def waits(self) -> bool:
+    def waits(self):
         """Has no message of this episode arrived but the first."""
         return self.holds.sent == self.began
 
@@ -125,7 +125,7 @@ class Purse:
     in_transit: list[tuple[int, float]] = field(default_factory=list)
     """Step of arrival and value of each reward."""
 
-    def step(self, now: int, reward: float, delay: int, done: bool) -> float:
+    def step(self, now, reward, delay, done):
         """Delay a reward; return the sum of those that arrive now, or of all of them if the episode
         ends."""
         self.in_transit.append((now + delay, reward))
@@ -152,9 +152,7 @@ class Counting(EnvBase):
 
     N_ACTIONS = 7
 
-    def __init__(
-        self, worlds: Sequence[int], n_agents: int = 2, continuous: bool = False, ends: float = 0.15
-    ) -> None:
+    def __init__(self, worlds, n_agents=2, continuous=False, ends=0.15):
         super().__init__(batch_size=[len(worlds)])
         self.names = torch.tensor(worlds)
         self.n_agents = n_agents
@@ -163,7 +161,7 @@ class Counting(EnvBase):
         worlds_shape = self.batch_size
         agents = torch.Size((len(worlds), n_agents))
 
-        def group(**specs: Any) -> Composite:
+        def group(**specs):
             return Composite(agents=Composite(**specs, shape=agents), shape=worlds_shape)
 
         action = Categorical(self.N_ACTIONS, shape=agents)
@@ -179,14 +177,14 @@ class Counting(EnvBase):
         self._begin(torch.ones(worlds_shape, dtype=torch.bool))
         self.episode = torch.zeros(worlds_shape, dtype=torch.long)
 
-    def _begin(self, mask: Tensor) -> None:
+    def _begin(self, mask):
         shape = (*self.batch_size, self.n_agents)
         x = (7 * self.names.unsqueeze(-1) + torch.arange(self.n_agents)) % 101
         self.x = torch.where(mask.unsqueeze(-1), x, self.x if hasattr(self, "x") else x)
         self.executed = torch.zeros(shape)
         self.action_valid = torch.ones(shape)
 
-    def _flag(self, salt: int) -> Tensor:
+    def _flag(self, salt):
         """A flag that is true with probability 2/3, [B, N]."""
         agents = torch.arange(self.n_agents)
         bits = counter_rng.bits(
@@ -194,7 +192,7 @@ class Counting(EnvBase):
         )
         return bits % 3 > 0
 
-    def _outputs(self) -> TensorDict:
+    def _outputs(self):
         shape = (*self.batch_size, self.n_agents)
         names = self.names.unsqueeze(-1).expand(shape)
         agents = torch.arange(self.n_agents).expand(shape)
@@ -203,17 +201,21 @@ class Counting(EnvBase):
         observation = torch.stack(
             [names, agents, total, episode, self.x, self.executed, self.action_valid], -1
         ).double()
-        values = {"observation": observation, "message_sent": self._flag(0), "ready": self._flag(1)}
+        values = {
+            "observation": observation,
+            "message_sent": self._flag(0),
+            "ready": self._flag(1),
+        }
         return TensorDict({"agents": TensorDict(values, shape)}, self.batch_size)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+    def _reset(self, tensordict=None, **_):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
         self._begin(mask)
         self.episode = self.episode + mask
         return self._outputs().set("done", torch.zeros(*self.batch_size, 1, dtype=torch.bool))
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(self, tensordict):
         self.total += 1
         action = tensordict["agents", "action"]
         if action.is_floating_point():
@@ -227,7 +229,7 @@ class Counting(EnvBase):
         done = counter_rng.uniform(self.names, torch.tensor(self.total)) < self.ends
         return outputs.set("done", done.unsqueeze(-1)).set("terminated", done.unsqueeze(-1))
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed):
         """The random numbers depend only on the worlds' names and the step."""
 
 
@@ -246,29 +248,33 @@ LAWS = {
     "uniform": lambda _: Uniform(1, 4),
     "paper": lambda _: PAPER,
     "geometric": lambda _: Geometric(2, 6),
-    "burst": lambda _: Burst(0.2, 0.3, good=Uniform(0, 1), bad=5, bad_loss=0.0),
+    "burst": lambda _: Burst(
+        0.2,
+        0.3,
+        good=Uniform(0, 1),
+        bad=5,
+        bad_loss=0.0,
+    ),
     "trace": lambda folder: trace(folder, 4, 0, 7, 1, 0, 2, 9, 0, 0, 3),
 }
 """Delay laws that lose no message."""
 
 
-def trace(folder: Any, *delays: Any) -> Trace:
+def trace(folder, *delays):
     """A trace of these delays, in a file of the folder."""
     file = folder / f"{len(delays)}.csv"
     file.write_text("\n".join(map(str, ["delay", *delays])))
     return Trace(str(file))
 
 
-def delayed(
-    *transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **options: Any
-) -> TransformedEnv:
+def delayed(*transforms, worlds=WORLDS, **options):
     """A ``Counting`` environment with transforms whose draws depend on the names of the worlds."""
     for transform in transforms:
         transform.seed_worlds(torch.tensor(worlds))
     return TransformedEnv(Counting(worlds, N_AGENTS, **options), Compose(*transforms))
 
 
-def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor]:
+def choices(worlds=WORLDS, n_steps=STEPS):
     """Actions for each step, [B, N]; those of a world do not depend on the other worlds."""
     names = torch.tensor(worlds).unsqueeze(-1)
     agents = torch.arange(N_AGENTS)
@@ -278,16 +284,16 @@ def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor
     ]
 
 
-def column(outputs: Sequence[TensorDictBase], *key: str) -> list:
+def column(outputs, *key):
     """An entry of every output, as nested lists."""
     return torch.stack([td[key] for td in outputs]).tolist()
 
 
-def before(outputs: Sequence[TensorDictBase], *key: str) -> list:
+def before(outputs, *key):
     """An entry before each step, as nested lists."""
     return column(outputs[:-1:2], *key)
 
 
-def after(outputs: Sequence[TensorDictBase], *key: str) -> list:
+def after(outputs, *key):
     """An entry after each step, as nested lists."""
     return column(outputs[1::2], *key)

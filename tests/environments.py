@@ -6,12 +6,11 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from helpers import square
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv
 
-from damian.delays.laws import Uniform
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv, Uniform
 
 
 class Kind(NamedTuple):
@@ -31,7 +30,7 @@ class Teams(EnvBase):
     environments with a root state look so.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(batch_size=torch.Size([2]))
         agents = torch.Size([2, 2])
         group = {"observation": Unbounded((*agents, 3))}
@@ -43,7 +42,12 @@ class Teams(EnvBase):
         )
         flag = Categorical(2, shape=(*agents, 1), dtype=torch.bool)
         self.done_spec = Composite(
-            agents=Composite(done=flag, terminated=flag.clone(), shape=agents), shape=(2,)
+            agents=Composite(
+                done=flag,
+                terminated=flag.clone(),
+                shape=agents,
+            ),
+            shape=(2,),
         )
         self.reward_spec = Composite(
             agents=Composite(reward=Unbounded((*agents, 1)), shape=agents),
@@ -52,31 +56,35 @@ class Teams(EnvBase):
         )
         self.time = torch.zeros(2)
 
-    def _outputs(self, done: torch.Tensor) -> TensorDict:
+    def _outputs(self, done):
         agents = {"observation": self.time.view(2, 1, 1).expand(2, 2, 3).clone()}
         flag = done.view(2, 1, 1).expand(2, 2, 1)
         agents |= {"done": flag.clone(), "terminated": flag.clone()}
         return TensorDict(
-            {"agents": TensorDict(agents, [2, 2]), "state": self.time.view(2, 1).clone()}, [2]
+            {
+                "agents": TensorDict(agents, [2, 2]),
+                "state": self.time.view(2, 1).clone(),
+            },
+            [2],
         )
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+    def _reset(self, tensordict=None, **_):
         mask = None if tensordict is None else tensordict.get(("agents", "_reset"), None)
         mask = torch.ones(2, dtype=torch.bool) if mask is None else mask.flatten(1).any(-1)
         self.time = self.time.masked_fill(mask, 0)
         return self._outputs(torch.zeros(2, dtype=torch.bool))
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(self, tensordict):
         self.time = self.time + 1
         outputs = self._outputs(self.time >= torch.tensor([3, 5]))
         outputs["agents", "reward"] = torch.ones(2, 2, 1)
         return outputs.set("team_reward", torch.ones(2, 1))
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed):
         """The environment has no randomness."""
 
 
-def vmas(num_envs: int = 2, n_agents: int = 2, max_steps: int = 4, **options: Any) -> EnvBase:
+def vmas(num_envs=2, n_agents=2, max_steps=4, **options):
     """A multi-agent environment of VMAS: the first two numbers of an observation are the agent's
     position."""
     pytest.importorskip("vmas")
@@ -86,7 +94,7 @@ def vmas(num_envs: int = 2, n_agents: int = 2, max_steps: int = 4, **options: An
     return VmasEnv("navigation", seed=0, **sizes, **options)
 
 
-def petting_zoo(n_agents: int = 2) -> EnvBase:
+def petting_zoo(n_agents=2):
     """A PettingZoo environment without batch dimensions, with a state at the root and flags in the
     group."""
     spread = pytest.importorskip("mpe2.simple_spread_v3")
@@ -107,7 +115,13 @@ KINDS = {
     "PettingZoo, state": Kind(petting_zoo, "state", ("agent", "action"), ("agent", "reward")),
     "flags in the group": Kind(Teams),
     "flags in the group, root entries": Kind(Teams, "state", ("agents", "action"), "team_reward"),
-    "UAVs": Kind(lambda: UavEnv(square(), num_worlds=2, extras=["message"])),
+    "UAVs": Kind(
+        lambda: UavEnv(
+            square(),
+            num_worlds=2,
+            extras=["message"],
+        )
+    ),
 }
 
 
@@ -125,14 +139,14 @@ class Drift(EnvBase):
     earlier steps.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(batch_size=torch.Size([3]))
         self.observation_spec = Composite(observation=Unbounded((3, 2)), shape=(3,))
         self.action_spec = Bounded(-1.0, 1.0, (3, 2))
         self.reward_spec = Unbounded((3, 1))
         self._longest = torch.tensor([3, 4, 5])
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+    def _reset(self, tensordict=None):
         reset = torch.ones(3, dtype=torch.bool)
         if tensordict is not None and "_reset" in tensordict:
             reset = tensordict["_reset"].view(3)
@@ -144,17 +158,22 @@ class Drift(EnvBase):
         self.time = self.time.masked_fill(reset, 0)
         return TensorDict({"observation": self.place}, [3])
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(self, tensordict):
         place = 0.9 * self.place + tensordict["action"]
         self.place = place.detach()
         self.time = self.time + 1
         done = (self.time >= self._longest).unsqueeze(-1)
         flags = {"done": done, "terminated": done}
         return TensorDict(
-            {"observation": place, "reward": place.sum(-1, keepdim=True), **flags}, [3]
+            {
+                "observation": place,
+                "reward": place.sum(-1, keepdim=True),
+                **flags,
+            },
+            [3],
         )
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed):
         """The environment has no randomness."""
 
 
@@ -162,6 +181,6 @@ cartpole = KINDS["CartPole"].make
 uavs = KINDS["UAVs"].make
 
 
-def unserved() -> EnvBase:
+def unserved():
     """As ``uavs``, but without a server node."""
     return UavEnv(square(), num_worlds=2, extras=["message"], messages_only=True)

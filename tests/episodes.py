@@ -8,7 +8,7 @@ from damian.show.episode import Episode
 SQUARE = shapely.box(-200.0, -200.0, 200.0, 200.0)
 
 
-def flight(n_steps: int = 3, **changes) -> Episode:
+def flight(n_steps=3, **changes):
     """An episode of two UAVs that stand still, of which the server knows the places; the source is
     silent."""
     t = n_steps + 1
@@ -23,7 +23,12 @@ def flight(n_steps: int = 3, **changes) -> Episode:
         "source": np.tile([0.0, -120.0], (t, 1, 1)),
         "believed": np.tile(position[:, :2], (t, 1, 1)),
         **dict.fromkeys(("track", "age", "reward"), uavs),
-        **{"spotted": flags, "sent": flags, "delay": uavs.astype(int), "emits": flags[:, :1]},
+        **{
+            "spotted": flags,
+            "sent": flags,
+            "delay": uavs.astype(int),
+            "emits": flags[:, :1],
+        },
     }
     fixed = {
         "about": {},
@@ -35,12 +40,15 @@ def flight(n_steps: int = 3, **changes) -> Episode:
     return Episode(**{**fixed, **columns, **changes})
 
 
-NO_SOURCE = {"source": np.zeros((4, 0, 2)), "emits": np.zeros((4, 0), bool)}
+NO_SOURCE = {
+    "source": np.zeros((4, 0, 2)),
+    "emits": np.zeros((4, 0), bool),
+}
 UNKNOWN_SOURCE = {"source": None, "emits": None}
 """Changes of a flight of three steps whose task has no source, and whose source nobody knows."""
 
 
-def crowd(n_steps: int = 3, **changes) -> Episode:
+def crowd(n_steps=3, **changes):
     """An episode of 20 UAVs, ten at each of two places."""
     few = flight(n_steps)
     names = "position target battery believed track age reward spotted sent delay"

@@ -18,8 +18,9 @@ TINY = [
     "eval_episodes=3",
     "model.hidden=[8]",
     "logger=csv",
+    "region.lattice_step=60",
+    "episode.max_steps=12",
 ]
-TINY += ["region.lattice_step=60", "episode.max_steps=12"]
 
 
 @damian.reward_term(reads=["belief_moments"], scope="system")

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from helpers import GOLDEN, nearest
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv
 from damian.server.config import ObservationConfig
 from damian.server.features import ServerContext
 from damian.server.rewards import Counters
@@ -54,7 +53,7 @@ class Transition(NamedTuple):
     """The record after the step."""
 
 
-def recorded(case: int, *kinds: str) -> list[Transition]:
+def recorded(case, *kinds):
     """The recorded transitions of the given kinds of runs."""
     golden = GOLDEN[case]
     transitions = []
@@ -76,19 +75,19 @@ def recorded(case: int, *kinds: str) -> list[Transition]:
     return transitions
 
 
-def detection_step(record: dict[str, Any]) -> float | None:
+def detection_step(record):
     """Step number of the latest detection; the original stamps step k with k - 1, this project with
     k."""
     time = record["server"]["last_time"]
     return None if time is None else time + 1
 
 
-def column(records: list[Transition], field: str) -> torch.Tensor:
+def column(records, field):
     """A field of the records after M transitions, [M, N, ...]."""
     return torch.tensor([transition.after[field] for transition in records])
 
 
-def set_state(env: UavEnv, records: list[Transition], places: list) -> None:
+def set_state(env, records, places):
     """Set world m to the state before transition m, with the UAVs standing at ``places[m]``."""
     points = settings_points(env).tolist()
     goal = torch.tensor([[nearest(points, place) for place in world] for world in places])
@@ -112,19 +111,19 @@ def set_state(env: UavEnv, records: list[Transition], places: list) -> None:
     )
 
 
-def settings_points(env: UavEnv) -> torch.Tensor:
+def settings_points(env):
     """Landing points in the coordinates of the settings, which are those of the records, [L, 2]."""
     airspace = env.simulation.airspace
     return airspace.exact_points[0] + torch.tensor(airspace.regions[0].offset)
 
 
-def ready_env(scenario: ScenarioConfig, n_worlds: int) -> UavEnv:
+def ready_env(scenario, n_worlds):
     env = UavEnv(scenario, num_worlds=n_worlds)
     env.reset()
     return env
 
 
-def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, ServerContext, Counters]:
+def server_inputs(case, records):
     """The server's inputs after each transition; every UAV reports the recorded estimate as its
     detection."""
     golden = GOLDEN[case]["scenario"]
@@ -168,7 +167,7 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
     return messages, server, Counters(number, motions, torch.ones_like(messages.spotted))
 
 
-def converted(name: str, value: float, detected: bool) -> float:
+def converted(name, value, detected):
     """A feature of the original in this project's convention: bearings clockwise from north."""
     if not detected or name not in ("source_bearing", "source_drift"):
         return value
@@ -176,7 +175,7 @@ def converted(name: str, value: float, detected: bool) -> float:
     return (0.25 - value) % 1.0 if name == "source_bearing" else (1.25 - value) % 1.0
 
 
-def close(name: str, one: float, other: float) -> bool:
+def close(name, one, other):
     """Whether two values of a feature are equal within the tolerance; angles wrap around."""
     difference = abs(one - other)
     if name in ("source_bearing", "source_drift"):

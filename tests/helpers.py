@@ -4,32 +4,26 @@ step them."""
 import io
 import json
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDict
 from twin import GLOBAL, LOCAL, Uav
 
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.uav_env import UavEnv
-from damian.learners.base import LearningSetup
-from damian.models.config import ModelConfig
-from damian.server.config import BUILT_IN, ObservationConfig
+from damian import ClockConfig, LearningSetup, ScenarioConfig, UavEnv
+from damian.server.config import BUILT_IN, EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext
 from damian.server.features.place import battery_settings
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.battery import BatteryConfig
-from damian.world.landing import ActionConfig
+from damian.world.config import (
+    ActionConfig,
+    BatteryConfig,
+    MotionConfig,
+    RegionConfig,
+    SourceConfig,
+)
 from damian.world.messages import Messages
-from damian.world.motion import MotionConfig
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
 
 DATA = Path(__file__).parent / "data"
 
@@ -42,7 +36,7 @@ SQUARE = [[0.0, 0.0], [200.0, 0.0], [200.0, 200.0], [0.0, 200.0]]
 """Corners of a square region of 200 m by 200 m, [x, y] in metres."""
 
 
-def usecase(case: int, **changed: Any) -> ScenarioConfig:
+def usecase(case, **changed):
     """The paper's use case 1 or 2; ``changed`` replaces whole sections."""
     golden = GOLDEN[case]["scenario"]
     table = GOLDEN[case]["action_table"]
@@ -84,7 +78,7 @@ def usecase(case: int, **changed: Any) -> ScenarioConfig:
     return ScenarioConfig(**(sections | changed))
 
 
-def square(**changed: Any) -> ScenarioConfig:
+def square(**changed):
     """Three UAVs that start on different points of a small square, with the source in its
     middle."""
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=8)
@@ -96,7 +90,7 @@ def square(**changed: Any) -> ScenarioConfig:
     return ScenarioConfig(**(sections | changed))
 
 
-def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) -> ScenarioConfig:
+def everything(motion="instant", kind="discrete", **changed):
     """A scenario with every feature, every reward term, a walking intermittent source and
     batteries."""
     in_order = getattr(changed.get("delay"), "order", "generation") == "generation"
@@ -115,13 +109,13 @@ def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) 
     return ScenarioConfig(**(sections | changed))
 
 
-def walking(**changed: Any) -> SourceConfig:
+def walking(**changed):
     """A source that leaves its first stop soon enough for a short test."""
     sections = {"level_db": 140.0, "motion": "dynamic", "min_wait": 1.0, "max_wait": 3.0}
     return SourceConfig(**(sections | {"local_distance": 15.0} | changed))
 
 
-def tracking(emission: str) -> dict[str, Any]:
+def tracking(emission):
     """Scenario sections of a task in which UAVs track a walking source."""
     return {
         "source": walking(emission=emission),
@@ -130,7 +124,7 @@ def tracking(emission: str) -> dict[str, Any]:
     }
 
 
-KINDS: dict[str, dict[str, Any]] = {
+KINDS = {
     "spotting": {"episode": EpisodeConfig(max_steps=5, success_share=0.5)},
     "tracking, emission per stop": tracking("per_stop"),
     "tracking, emission per step": tracking("per_step"),
@@ -159,24 +153,21 @@ REGIONS = {
 }
 
 
-def random_actions(env: UavEnv, generator: torch.Generator) -> Tensor:
-    """Uniform random actions, [B, N] discrete or [B, N, 2] continuous, from the test's own
-    generator."""
+def random_actions(env, generator=None):
+    """Uniform random actions, [B, N] discrete or [B, N, 2] continuous."""
     shape = (*env.batch_size, env.n_agents)
     if env.scenario.actions.kind == "continuous":
         return torch.rand(*shape, 2, generator=generator)
     return torch.randint(env.scenario.actions.n_actions, shape, generator=generator)
 
 
-def act(env: UavEnv, action: Tensor) -> TensorDictBase:
+def act(env, action):
     """Step once without resets, and return the ``next`` entry."""
     td = TensorDict({"agents": {"action": action}}, env.batch_size)
     return env.step(td)["next"]
 
 
-def play(
-    env: UavEnv, choose: Sequence[Tensor] | Callable[[int], Tensor], n_steps: int | None = None
-) -> list[TensorDictBase]:
+def play(env, choose, n_steps=None):
     """Step through episodes, resetting worlds that are done; return the output of every step and
     reset."""
     td = env.reset()
@@ -189,32 +180,39 @@ def play(
     return shown
 
 
-def sent_messages(output: TensorDictBase) -> Messages:
+def sent_messages(output):
     """The messages in an environment's output, unpacked into their fields."""
     return Messages.unpack(output["agents", "message"])
 
 
-def same(one: TensorDictBase, other: TensorDictBase, atol: float = 0.0) -> bool:
+def same(one, other, atol=0.0):
     """Whether both have the same keys and equal values: bit for bit, or floats up to ``atol``."""
 
-    def equal(a: Tensor, b: Tensor) -> bool:
+    def equal(a, b):
         is_near = atol > 0 and a.is_floating_point() and a.shape == b.shape
-        return torch.allclose(a, b, rtol=0, atol=atol) if is_near else a.equal(b)
+        return (
+            torch.allclose(
+                a,
+                b,
+                rtol=0,
+                atol=atol,
+            )
+            if is_near
+            else a.equal(b)
+        )
 
     keys = {*one.keys(True, True)}
     return keys == {*other.keys(True, True)} and all(equal(one[key], other[key]) for key in keys)
 
 
-def all_same(
-    some: Sequence[TensorDictBase], others: Sequence[TensorDictBase], atol: float = 0.0
-) -> bool:
+def all_same(some, others, atol=0.0):
     """Whether both sequences are equal at every step: bit for bit, or floats up to ``atol``."""
     return len(some) == len(others) and all(
         same(*pair, atol) for pair in zip(some, others, strict=True)
     )
 
 
-def saved_and_loaded(state: Any) -> Any:
+def saved_and_loaded(state):
     """A state after it was saved to a file and loaded from it."""
     file = io.BytesIO()
     torch.save(state, file)
@@ -222,19 +220,17 @@ def saved_and_loaded(state: Any) -> Any:
     return torch.load(file, weights_only=True)
 
 
-def clock(period: str) -> ClockConfig:
+def clock(period):
     """A clock with a simulation step of ``period``."""
     return ClockConfig(simulation=period)
 
 
-def nearest(points: Sequence[Sequence[float]], place: Sequence[float]) -> int:
+def nearest(points, place):
     """Index of the point nearest a place; of several, the lowest index."""
     return min(range(len(points)), key=lambda i: math.dist(points[i], place))
 
 
-def random_worlds(
-    seed: int, n_agents: int, heard: float, spots: float, n_worlds: int = 4
-) -> list[tuple[float, list[Uav]]]:
+def random_worlds(seed, n_agents, heard, spots, n_worlds=4):
     """Random times and UAVs of the twin; a UAV without any detection does not spot the source
     either."""
     rng = np.random.default_rng(seed)
@@ -259,10 +255,10 @@ def random_worlds(
     return worlds
 
 
-def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, ServerContext]:
+def messages_of(worlds):
     """The messages [B, N] and the server context of the twin's worlds."""
 
-    def column(read: Callable[[Uav], Any], dtype: torch.dtype = torch.float32) -> Tensor:
+    def column(read, dtype=torch.float32):
         return torch.tensor([[read(uav) for uav in uavs] for _, uavs in worlds], dtype=dtype)
 
     place = column(lambda uav: uav.place)
@@ -299,7 +295,7 @@ both_motions = pytest.mark.parametrize("motion", ["instant", "polynomial"])
 both_kinds = pytest.mark.parametrize("kind", ["discrete", "continuous"])
 
 
-def one_uav(**changed) -> ScenarioConfig:
+def one_uav(**changed):
     """One UAV that starts near (60, 100) in a rectangle, too far to hear the source at
     (390, 100)."""
     region = RegionConfig(
@@ -318,22 +314,20 @@ def one_uav(**changed) -> ScenarioConfig:
     return ScenarioConfig(**(sections | changed))
 
 
-def fresh(scenario: ScenarioConfig, num_worlds: int = 1, **options) -> UavEnv:
+def fresh(scenario, num_worlds=1, **options):
     """A new environment after its first reset."""
     env = UavEnv(scenario, num_worlds=num_worlds, **options)
     env.reset()
     return env
 
 
-def learning(model: ModelConfig, settle: int = 0, **changed: Any) -> LearningSetup:
+def learning(model, settle=0, **changed):
     """Setup of a learner that postpones learning from a step by ``settle`` steps."""
     setup = LearningSetup(model, 1, 1, 1, longest_delay=settle, settle=settle > 0)
     return setup._replace(**changed)
 
 
-def check_refused(
-    recipe: Callable[[], Any], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def check_refused(recipe, message, capsys):
     """Assert that a recipe ends with exit code 2 and one error line on stderr that contains
     ``message``."""
     capsys.readouterr()

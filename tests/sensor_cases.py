@@ -6,9 +6,8 @@ import math
 import torch
 from torch import Tensor
 
-from damian import feature, reward_term, sensor
+from damian import UavEnv, feature, reward_term, sensor
 from damian.common import counter_rng
-from damian.envs.uav_env import UavEnv
 from damian.server.features import FeatureCache
 from damian.server.rewards import Counters
 from damian.world.simulation import Simulation

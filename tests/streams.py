@@ -1,20 +1,19 @@
 """A check that random streams are independent, which fails for shared and for shifted streams."""
 
 import torch
-from torch import Tensor
 
 from damian.common import counter_rng
 
 N_DRAWS = 4000
 
 
-def overlaps(draws: Tensor) -> int:
+def overlaps(draws):
     """Number of draws that occur more than once among all draws of all streams."""
     _, counts = draws.flatten().unique(return_counts=True)
     return int((counts > 1).sum())
 
 
-def check_independent(streams: Tensor) -> None:
+def check_independent(streams):
     """Check the draws of all streams [M] beside each other, in the same step and one step apart."""
     clock = torch.arange(N_DRAWS)
     assert overlaps(counter_rng.bits64(streams.unsqueeze(-1), clock)) == 0

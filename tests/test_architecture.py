@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ import damian
 
 ROOT = Path(damian.__file__).parent
 RECIPES = ROOT.parent / "recipes"
-TREE = (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("\ndamian/\n")[2]
+TREE = (ROOT.parent / "CONTRIBUTING.md").read_text("utf-8").partition("\ndamian/\n")[2]
 ROOMS = re.findall(r"^  (\w+)(?:/|\.py) ", TREE.partition("\nconf/")[0], re.MULTILINE)
 """Folders and modules of ``damian``, as CONTRIBUTING.md lists them: each imports only from those
 above it."""
@@ -30,7 +29,7 @@ FOR_ALL = (
 """What the programs share."""
 
 
-def module_of(path: Path) -> str:
+def module_of(path):
     """Name of a module, as it is installed: the recipes are a package of damian."""
     parts = path.relative_to(ROOT.parent).with_suffix("").parts
     parts = ("damian", *parts) if parts[0] == "recipes" else parts
@@ -43,11 +42,11 @@ MODULES = {
 FILES = [*MODULES.values()]
 
 
-def imported(module: str, strings: bool = False) -> Iterator[str]:
+def imported(module, strings=False):
     """Every module, or name within one, that a module imports anywhere; also those that ``strings``
     name."""
     package = module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(MODULES[module].read_text("utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -60,7 +59,7 @@ def imported(module: str, strings: bool = False) -> Iterator[str]:
             yield from re.findall(r"^(damian(?:\.\w+)+)(?::\w+)?$", node.value)
 
 
-def is_in(name: str, modules: Iterable[str]) -> bool:
+def is_in(name, modules):
     """Whether a module, or a name within one, is one of these modules or in one of them."""
     return any(f"{name}.".startswith(f"{module}.") for module in modules)
 
@@ -129,7 +128,7 @@ def test_text_is_read_and_written_as_utf_8_everywhere():
         for folder in ("damian", "recipes", "examples")
         for each in (ROOT.parent / folder).rglob("*.py")
     ):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in (
                 "read_text",
                 "write_text",
@@ -138,7 +137,7 @@ def test_text_is_read_and_written_as_utf_8_everywhere():
 
 
 def test_every_public_name_exists_and_is_loaded_on_demand():
-    text = Path(damian.__file__).read_text(encoding="utf-8")
+    text = Path(damian.__file__).read_text("utf-8")
     assert {*re.findall(r"import (\w+) as \1\b", text)} == {*damian._MODULE_OF}
     assert all(getattr(damian, name).__name__ == name for name in damian._MODULE_OF)
     with pytest.raises(AttributeError, match="no attribute nothing"):
@@ -158,5 +157,10 @@ def test_the_transforms_load_without_the_world_of_the_uavs():
     code = (
         f"import sys, damian.transforms; print([name for name in {heavy} if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout.strip() == "[]"

@@ -4,8 +4,6 @@ somewhere."""
 import re
 import runpy
 import shlex
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import yaml
@@ -34,9 +32,9 @@ def test_the_readmes_python_runs(capsys):
     assert 0.9 < corrected < 1
 
 
-def commands(file: Path) -> Iterator[tuple[str, list[str]]]:
+def commands(file):
     """The commands that a file names: program and words."""
-    text = file.read_text(encoding="utf-8").replace("\\\n", "")
+    text = file.read_text("utf-8").replace("\\\n", "")
     for line in re.findall(r"(?:^[ #]*|`)damian ([a-z]+ [^`\n|]*)", text, re.MULTILINE):
         command = re.split(r"  +[#(]", line)[0]  # an explanation stands behind some spaces
         name, *words = shlex.split(command, comments=True)
@@ -62,21 +60,17 @@ def test_every_command_that_a_file_names_exists(file):
 @pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
 def test_every_link_and_anchor_of_a_document_leads_somewhere(file):
     nowhere = []
-    for link in links(file.read_text(encoding="utf-8")):
+    for link in links(file.read_text("utf-8")):
         path, _, anchor = link.partition("#")
         target = file.parent / path if path else file
-        there = target.exists() and (
-            not anchor or anchor in anchors(target.read_text(encoding="utf-8"))
-        )
+        there = target.exists() and (not anchor or anchor in anchors(target.read_text("utf-8")))
         nowhere += [] if there else [link]
     assert nowhere == []
 
 
 def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
-    guide = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
-    results = "".join(
-        (ROOT / name).read_text(encoding="utf-8") for name in ("RESULTS.md", "docs/report.md")
-    )
+    guide = (ROOT / "docs" / "methods.md").read_text("utf-8")
+    results = "".join((ROOT / name).read_text("utf-8") for name in ("RESULTS.md", "docs/report.md"))
     numbers = {*re.findall(r"-?\d+\.\d|-\d{3,}", guide)}
     assert len(numbers) > 20
     assert [
@@ -86,8 +80,8 @@ def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
 
 def test_the_leaderboard_is_that_of_the_stored_results():
     page = runpy.run_path(str(ROOT / "docs" / "figures.py"))["leaderboard_page"]()
-    assert (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8") == page
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert (ROOT / "docs" / "leaderboard.md").read_text("utf-8") == page
+    readme = (ROOT / "README.md").read_text("utf-8")
     for method in ("timeline", "timeline+gru", "naive+timeline", "backupdate+gru", "naive+gru"):
         row = next(line for line in page.splitlines() if line.startswith(f"| {method} |"))
         (published,) = re.findall(rf"^\| \*{re.escape(method)}\* \|.*", readme, re.MULTILINE)

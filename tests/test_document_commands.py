@@ -28,8 +28,9 @@ TINY = [
     "eval_episodes=2",
     "model.hidden=[8]",
     "logger=csv",
+    "region.lattice_step=60",
+    "episode.max_steps=12",
 ]
-TINY += ["region.lattice_step=60", "episode.max_steps=12"]
 OF_RUNS = f"overrides={json.dumps([word for word in TINY if word != 'logger=csv'])}".replace(
     '"', "'"
 )
@@ -53,14 +54,14 @@ INSTEAD = {
 PARK = [[-4.134, 52.808], [-4.122, 52.808], [-4.122, 52.817], [-4.134, 52.817], [-4.134, 52.808]]
 
 
-def commands(text: str) -> list[list[str]]:
+def commands(text):
     """The words of the commands in the blocks of a document, without ``damian``."""
     blocks = re.findall(r"^```\w*\n(.*?)^```", text.replace("\\\n", ""), re.DOTALL | re.MULTILINE)
     lines = [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
     return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("damian ")]
 
 
-def shortened(words: list[str]) -> list[str]:
+def shortened(words):
     """A command with tiny numbers."""
     words = [INSTEAD.get(word, word) for word in words]
     if any(word.startswith("resume=") for word in words):
@@ -78,7 +79,7 @@ COMMANDS = {file.name: commands(file.read_text()) for file in DOCUMENTS}
 COMMANDS = {name: found for name, found in COMMANDS.items() if found}
 
 
-def call(words: list[str], folder: Path) -> str:
+def call(words, folder):
     """Run a command in a folder; returns what it prints."""
     done = subprocess.run(
         [*PROGRAM, *words],
@@ -95,7 +96,7 @@ def call(words: list[str], folder: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
+def trained(tmp_path_factory):
     """A trained run and the files that the documents name."""
     folder = tmp_path_factory.mktemp("documents")
     call(["train", *TINY, "hydra.run.dir=runs/FOLDER"], folder)
@@ -121,10 +122,15 @@ def trained(tmp_path_factory) -> Path:
     return folder
 
 
-def write_journal(path: Path) -> None:
+def write_journal(path):
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines: list[dict] = [
-        {"journal": "damian-advice", "version": 3, "fleet": "north", "uavs": ["A", "B"]}
+    lines = [
+        {
+            "journal": "damian-advice",
+            "version": 3,
+            "fleet": "north",
+            "uavs": ["A", "B"],
+        }
     ]
     for n in range(60):
         row = {
@@ -136,7 +142,7 @@ def write_journal(path: Path) -> None:
         }
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
     path.parent.mkdir(exist_ok=True)
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines), "utf-8")
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from episodes import flight
 from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 
 import damian.transforms
-from damian.delays.laws import Uniform
+from damian import Uniform
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -36,12 +35,12 @@ is."""
 DOCUMENT = (ROOT / "docs" / "backupdating.md").read_text()
 
 
-def load(name: str) -> dict[str, Any]:
+def load(name):
     """The names that an example defines, whose program does not run."""
     return runpy.run_path(str(EXAMPLES / f"{name}.py"))
 
 
-def run(name: str) -> dict[str, Any]:
+def run(name):
     """The names that an example about transforms defines when its program runs."""
     return runpy.run_path(str(EXAMPLES / "transforms" / f"{name}.py"), run_name="__main__")
 
@@ -51,7 +50,7 @@ def test_a_program_is_imported(path):
     if not path.relative_to(ROOT).as_posix().startswith(tuple(ELSEWHERE)):
         runpy.run_path(str(path))
         return
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "damian":
             exec(ast.unparse(node), {})
 
@@ -139,14 +138,18 @@ def test_an_example_runs(name, entry):
 
 
 def test_workers_draw_the_same_delays_again_each_its_own():
-    draw = run("late_workers")["draw"]
+    draw = load("transforms/late_workers")["draw"]
     one, other = draw(SerialEnv)
     assert one != other
     assert draw(SerialEnv) == [one, other]
 
 
 def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew():
-    storage, _ = load("sac_backupdating")["train"](delay=6, frames=150, warm_up=120)
+    storage, _ = load("sac_backupdating")["train"](
+        delay=6,
+        frames=150,
+        warm_up=120,
+    )
     learnt = storage.steps[storage.latest()[:-6]]
     assert len(learnt) == 150 - 6
     assert learnt["next", "state"].equal(learnt["next", "observation"])
@@ -162,6 +165,11 @@ def test_ppo_behind_delays_takes_a_few_steps():
 def test_multi_agent_ppo_behind_delays_takes_a_few_steps():
     pytest.importorskip("vmas")
     assert len(load("ppo_vmas")["train"](batches=1)) == 1
+
+
+@pytest.mark.slow
+def test_worker_processes_draw_late_messages():
+    run("late_workers")
 
 
 @pytest.mark.slow
@@ -203,5 +211,10 @@ def test_a_search_with_optuna_keeps_its_trials_and_goes_on(tmp_path):
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for n in ("1", "2"):
         command = [sys.executable, str(EXAMPLES / "tune.py"), n, *words]
-        subprocess.run(command, cwd=tmp_path, env=os.environ | {"PATH": path}, check=True)
+        subprocess.run(
+            command,
+            cwd=tmp_path,
+            env=os.environ | {"PATH": path},
+            check=True,
+        )
     assert len([*tmp_path.glob("runs/tune/*/result.csv")]) == 2

@@ -4,8 +4,6 @@ there."""
 import html
 import posixpath
 import re
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 import yaml
@@ -37,7 +35,7 @@ def test_every_link_and_anchor_of_the_site_leads_somewhere():
     assert nowhere == []
 
 
-def leaves(nav: Any) -> Iterator[str]:
+def leaves(nav):
     """The pages of a navigation."""
     if isinstance(nav, str):
         yield nav
@@ -69,7 +67,7 @@ def test_every_setting_program_and_example_has_a_place():
         *(ROOT / "examples" / "fleet").rglob("*")
     }:
         text = pages()[f"examples/{example.relative_to(ROOT / 'examples').as_posix()}.md"]
-        assert example.read_text(encoding="utf-8") in text
+        assert example.read_text("utf-8") in text
 
 
 def test_every_public_name_leads_to_what_documents_it():

@@ -6,7 +6,6 @@ Run by `make test-site`.
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
@@ -56,7 +55,7 @@ def site(tmp_path_factory):
     server.server_close()
 
 
-def pages(folder: Path) -> list[str]:
+def pages(folder):
     """The addresses of the pages, relative to the site."""
     found = [
         path.relative_to(folder).parent.as_posix() for path in sorted(folder.rglob("index.html"))

@@ -1,14 +1,12 @@
 """The slow reference implementation (twin): one world, one UAV at a time, in plain Python."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
 
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, RewardConfig
 
 LOCAL = ["battery", "spotted"]
 GLOBAL = [
@@ -18,8 +16,6 @@ GLOBAL = [
     "source_time",
     "agent_distances",
     "coverage",
-]
-GLOBAL += [
     "mean_distance",
     "mean_distance_not_spotting",
     "mean_distance_spotting",
@@ -49,9 +45,7 @@ class Uav:
     heard_from: tuple[float, float] = (0.0, 0.0)
 
 
-def features(
-    uavs: Sequence[Uav], now: float, scale: float, time_scale: float, resolution: float = 5.0
-) -> dict[str, list]:
+def features(uavs, now, scale, time_scale, resolution=5.0):
     """The features of the paper's Table 2 except the coverage: a list with one value for each
     UAV."""
     heard = [uav for uav in uavs if uav.heard_at is not None]
@@ -59,7 +53,7 @@ def features(
     if heard:
         last = max(uav.heard_at for uav in heard)
         source = tuple(sum(uav.heard_from[axis] for uav in heard) / len(heard) for axis in (0, 1))
-    table: dict[str, list] = {}
+    table = {}
     for uav in uavs:
         others = [other for other in uavs if other is not uav]
         row = {
@@ -93,17 +87,17 @@ def features(
     return table
 
 
-def near(one: tuple[float, float], other: tuple[float, float], scale: float) -> float:
+def near(one, other, scale):
     """Distance over the scale, at most 1."""
     return min(math.dist(one, other) / scale, 1.0)
 
 
-def mean(values: list[float]) -> float:
+def mean(values):
     """Mean, at most 1; 0 for an empty list."""
     return min(sum(values) / len(values), 1.0) if values else 0.0
 
 
-def terms(values: dict[str, float], motions: int, task: RewardConfig) -> dict[str, float]:
+def terms(values, motions, task):
     """The reward terms of one UAV (paper, eq. 6 and 7), times their weights (eq. 8)."""
     weighted = {}
     for name, value in values.items():
@@ -113,7 +107,7 @@ def terms(values: dict[str, float], motions: int, task: RewardConfig) -> dict[st
     return weighted
 
 
-def term(name: str, value: float, motions: int, task: RewardConfig) -> float:
+def term(name, value, motions, task):
     """One reward term before its weight (paper, eq. 6 and 7)."""
     desired = {
         "spotting_agents": task.desired_spotting,
@@ -136,12 +130,10 @@ def term(name: str, value: float, motions: int, task: RewardConfig) -> float:
     return 1 - value
 
 
-def end(
-    uavs: Sequence[Uav], steps: int, now: float, dt: float, episode: EpisodeConfig
-) -> tuple[bool, bool, bool]:
+def end(uavs, steps, now, dt, episode):
     """Whether the episode ends: success, terminated, truncated."""
 
-    def enough(share: float, flags: list[bool]) -> bool:
+    def enough(share, flags):
         return sum(flags) >= max(share * len(flags), 1) - 1e-9
 
     success = failure = timeout = False
@@ -158,7 +150,7 @@ def end(
     return success, ended, timeout and not ended
 
 
-def final(ended: tuple[bool, bool, bool], steps: int, task: RewardConfig) -> float:
+def final(ended, steps, task):
     """Bonus or penalty at the end of an episode; 0 before."""
     success, terminated, truncated = ended
     if success:
@@ -166,12 +158,10 @@ def final(ended: tuple[bool, bool, bool], steps: int, task: RewardConfig) -> flo
     return -task.penalty if terminated or truncated else 0.0
 
 
-def assign_landing_points(
-    preferences: Sequence[Sequence[int]], standing: Sequence[int], ready: Sequence[bool]
-) -> list[int]:
+def assign_landing_points(preferences, standing, ready):
     """Book points by preference, in index order; points that others hold or have booked are not
     free."""
-    booked: list[int] = []
+    booked = []
     for i, preferred in enumerate(preferences):
         busy = {*booked, *standing[:i], *standing[i + 1 :]}
         own = standing[i]
@@ -198,12 +188,12 @@ class World:
     steps: int = 0
     ended: tuple[bool, bool, bool] = field(default=(False, False, False))
 
-    def begin(self) -> None:
+    def begin(self):
         """Let every UAV listen for the source at time 0."""
         for uav in self.uavs:
             self._listen(uav)
 
-    def step(self, moves: Sequence[tuple[float, float]]) -> list[float]:
+    def step(self, moves):
         """Fly each UAV's (distance [m], heading [rad]) and return each UAV's reward."""
         preferences = [self._preferences(*pair) for pair in zip(self.uavs, moves, strict=True)]
         standing = [uav.point for uav in self.uavs]
@@ -227,11 +217,11 @@ class World:
             rewards.append(sum(terms(own, uav.motions, self.task).values()) + end_reward)
         return rewards
 
-    def observe(self) -> dict[str, list]:
+    def observe(self):
         """The features of all UAVs now."""
         return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale)
 
-    def _preferences(self, uav: Uav, move: tuple[float, float]) -> list[int]:
+    def _preferences(self, uav, move):
         """Landing points, nearest the target first; only the UAV's own point if the target is
         outside."""
         distance, heading = move
@@ -243,7 +233,7 @@ class World:
             return [uav.point]
         return sorted(range(len(self.points)), key=lambda p: math.dist(self.points[p], target))
 
-    def _move(self, uav: Uav, point: int) -> None:
+    def _move(self, uav, point):
         place = tuple(self.points[point])
         if point != uav.point:
             east, north = (b - a for a, b in zip(uav.place, place, strict=True))
@@ -252,7 +242,7 @@ class World:
         uav.place = place
         uav.moved += 1
 
-    def _listen(self, uav: Uav) -> None:
+    def _listen(self, uav):
         uav.motions = uav.moved
         uav.spots = math.dist(uav.place, self.source) <= self.radius
         if uav.spots:

@@ -23,7 +23,7 @@ LAYOUT = {
 }
 
 
-def docstrings(source: str) -> set[tuple[int, int]]:
+def docstrings(source):
     """Where statements that are nothing but a text begin, as (line, column)."""
     texts = set()
     for node in ast.walk(ast.parse(source)):
@@ -33,7 +33,7 @@ def docstrings(source: str) -> set[tuple[int, int]]:
     return texts
 
 
-def weight(path: Path) -> tuple[int, int]:
+def weight(path):
     """Number of tokens of a file, and of the lines that hold one."""
     left_out = docstrings(path.read_text(encoding="utf-8"))
     tokens = 0
@@ -46,11 +46,16 @@ def weight(path: Path) -> tuple[int, int]:
     return tokens, len(lines)
 
 
-def main() -> None:
-    listed = subprocess.run(["git", "ls-files", "*.py"], check=True, capture_output=True, text=True)
+def main():
+    listed = subprocess.run(
+        ["git", "ls-files", "*.py"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     for group, folders in GROUPS.items():
-        tokens = Counter[str]()
-        lines = Counter[str]()
+        tokens = Counter()
+        lines = Counter()
         for name in listed.stdout.split():
             if name.startswith(folders):
                 for key in (group, str(Path(name).parent)):

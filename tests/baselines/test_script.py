@@ -7,23 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import everything, sent_messages, walking
-from tensordict import TensorDictBase
-from torch import Tensor
 
-from damian import keys
+from damian import DelayConfig, ScenarioConfig, keys, make_env
 from damian.baselines.random import random_policy
 from damian.baselines.script import Coverer, Seeker, script_policy
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
-from damian.server.config import ObservationConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features.search import BLUR_M, RECENT, TRUST, likely_places
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian.world.config import RegionConfig, SourceConfig
 from damian.world.landing import ActionConfig, action_table, displacement
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
 
 FIELD = [[0.0, 0.0], [400.0, 0.0], [400.0, 400.0], [0.0, 400.0]]
 STARTS = [[50.0, 50.0], [200.0, 200.0], [360.0, 260.0]]
@@ -33,7 +24,7 @@ COVER = RewardConfig(spotted=0.0, coverage=1.0)
 SEARCH = RewardConfig(spotted=0.0, spotting_agents=1.0)
 
 
-def field(**changed) -> DelayedEnv:
+def field(**changed):
     """Three UAVs across a large square, and a source in a corner that none of them hears at
     first."""
     region = RegionConfig(
@@ -52,7 +43,7 @@ def field(**changed) -> DelayedEnv:
     return make_env(ScenarioConfig(**(sections | changed)), 2, extras=["message"])
 
 
-def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
+def landing_points(env, td):
     """Landing points to which the policy sends the UAVs of the first world, if all are free,
     [N, 2]."""
     action = script_policy(env)(td)["agents", "action"][0]
@@ -67,9 +58,7 @@ def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
     return points[torch.cdist(target, points).argmin(-1)]
 
 
-def detection(
-    env: DelayedEnv, place: list[float], ago: float = 0.0, now: float = 9.0
-) -> TensorDictBase:
+def detection(env, place, ago=0.0, now=9.0):
     """A reset's output, changed to time ``now`` [s], with the second UAV's detection ``ago`` [s]
     earlier."""
     td = env.reset()
@@ -198,9 +187,7 @@ def test_uavs_choose_one_after_the_other_where_their_footprints_hold_most_new_gr
             claimed.append(ends[torch.where(best, flown, torch.inf).argmin()])
 
 
-def ends_and_gains(
-    env: DelayedEnv, region: int, start: Tensor, weight: Tensor
-) -> tuple[Tensor, ...]:
+def ends_and_gains(env, region, start, weight):
     """Where each action leads [A, 2], the weight in the footprint there, and the way [m], [A]."""
     simulation = env.uav_env.simulation
     points = simulation.airspace.points[region]
@@ -211,9 +198,7 @@ def ends_and_gains(
     return ends, gain, distances(start.unsqueeze(0), ends)[0]
 
 
-def check_choice(
-    env: DelayedEnv, region: int, start: Tensor, weight: Tensor, legal: Tensor, action: Tensor
-) -> None:
+def check_choice(env, region, start, weight, legal, action):
     """Check that a legal action leads to where the footprint holds most weight, by the shortest
     flight."""
     _, gain, flown = ends_and_gains(env, region, start, weight)
@@ -222,7 +207,7 @@ def check_choice(
     assert flown[action] == pytest.approx(flown[best].min().item(), abs=1e-3)
 
 
-def distances(some: Tensor, others: Tensor) -> Tensor:
+def distances(some, others):
     """Exact distances [P, Q] between points [P, 2] and points [Q, 2]."""
     return torch.linalg.vector_norm(some.unsqueeze(1) - others, dim=-1)
 

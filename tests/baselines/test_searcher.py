@@ -4,18 +4,13 @@ import pytest
 import torch
 from helpers import SQUARE, square
 
-from damian import keys
+from damian import DelayConfig, keys, make_env
 from damian.baselines.script import Searcher, script_policy
-from damian.delays.config import DelayConfig
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.world.landing import ActionConfig
-from damian.world.regions.sources import RegionConfig
+from damian.server.config import ObservationConfig, RewardConfig
+from damian.world.config import ActionConfig, RegionConfig
 
 
-def believing(own: bool = False, **changed) -> DelayedEnv:
+def believing(own=False, **changed):
     """Three UAVs in the south-west of a square, which fly up to 300 m in 16 directions."""
     region = RegionConfig(
         kind="vertices",

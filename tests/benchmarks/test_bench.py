@@ -62,7 +62,12 @@ def test_every_method_trains_and_has_a_row_for_each_width(monkeypatch):
 
 @pytest.mark.slow
 def test_the_script_for_gpus_compares_and_skips_rows_for_which_no_time_is_left():
-    options = Namespace(device="cpu", worlds=[4], trainings=[4], minutes=0)
+    options = Namespace(
+        device="cpu",
+        worlds=[4],
+        trainings=[4],
+        minutes=0,
+    )
     _, compared, speed = bench_gpu.measure(options)
     assert [f"| {kind}, eager | 0.00e+00 |" in compared for kind in bench_gpu.KINDS] == [True] * 3
     assert speed.count("no time left") == len(bench_gpu.KINDS) + len(bench.RIVAL_TASKS) + 1

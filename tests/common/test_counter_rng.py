@@ -11,7 +11,7 @@ N = 20_000
 
 
 def test_the_hash_agrees_with_a_plain_python_implementation():
-    def mixed(key: int, counter: int) -> int:
+    def mixed(key, counter):
         mask = 2**64 - 1
         x = (counter * 0x9E3779B97F4A7C15 & mask) ^ key
         x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 & mask
@@ -40,7 +40,12 @@ def test_the_hash_agrees_with_a_plain_python_implementation():
 def chi_square(draws, n_bins=64):
     """Pearson's statistic of uniform draws, standardised: about normal(0, 1) if they are
     uniform."""
-    counts = torch.histc(draws.double(), bins=n_bins, min=0, max=1)
+    counts = torch.histc(
+        draws.double(),
+        bins=n_bins,
+        min=0,
+        max=1,
+    )
     expected = draws.numel() / n_bins
     statistic = ((counts - expected).square() / expected).sum().item()
     return (statistic - (n_bins - 1)) / (2 * (n_bins - 1)) ** 0.5

@@ -9,17 +9,17 @@ from damian.common.registry import Registry, check_parameters, load_plugins
 from damian.delays.laws import LAWS, law_of
 
 
-def greetings() -> Registry:
+def greetings():
     registry = Registry("greeting", callable, "is not a function")
 
     @registry.register("plain")
-    def plain() -> str:
+    def plain():
         return "hello"
 
     return registry
 
 
-def polite(*, to: str, loud: bool = False) -> str:
+def polite(*, to, loud=False):
     return f"good day, {to}"
 
 

@@ -23,7 +23,7 @@ DEUTERANOPIA = [
 """What is seen without green receptors, in linear RGB (Machado, Oliveira and Fernandes 2009)."""
 
 
-def oklab(colour: str, seen: np.ndarray) -> np.ndarray:
+def oklab(colour, seen):
     srgb = np.array(to_rgb(colour))
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.array(TO_LAB) @ np.cbrt(np.array(TO_CONES) @ (seen @ linear).clip(0, 1))
@@ -47,7 +47,11 @@ def test_a_sweep_has_a_curve_for_each_value_of_the_settings_that_are_not_along_t
 ):
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
-    returns = {("none", 4): 2.0, ("none", 0): 9.0, ("timeline", 4): 7.0}
+    returns = {
+        ("none", 4): 2.0,
+        ("none", 0): 9.0,
+        ("timeline", 4): 7.0,
+    }
     rows = pd.DataFrame(
         [
             (*place, policy, seed, 9, mean + seed - 10 * (policy == "script"), 0.0, 1.0, 0.0, 0.0)

@@ -24,15 +24,7 @@ def test_recovery_is_nan_if_the_delay_costs_less_than_a_tenth(naive, defined):
     assert np.isnan(recovery(scores)) == (not defined)
 
 
-def test_all_methods_share_their_resamples():
-    seeds = np.arange(5.0)
-    drawn = resampled(np.stack([seeds, seeds + 10]), draws=50)
-    assert drawn.shape == (50, 2, 5)
-    np.testing.assert_array_equal(drawn[:, 1], drawn[:, 0] + 10)
-    assert set(drawn[:, 0].ravel()) == set(seeds)
-
-
-def exact_interval(values: list[float], weights: list[float]) -> tuple[float, float]:
+def exact_interval(values, weights):
     """The 95 % percentile interval of a discrete distribution with these values and weights."""
     total = 0.0
     low = math.nan

@@ -20,19 +20,31 @@ QUEUE = np.where(np.arange(N) % 200 < 60, 60 - np.arange(N) % 200, 0) + LEVEL
 """A minute without a link, whose messages come in together at its end."""
 NEWEST_FIRST = np.where(np.arange(N) % 200 < 60, 60 + 1.8 * (30 - np.arange(N) % 200), 0).clip(0.4)
 BATCHES = 10.4 - np.arange(N) % 10
-DELAYS = {"level": LEVEL, "uniform": UNIFORM, "bursts": HELD, "queue": QUEUE, "batches": BATCHES}
+DELAYS = {
+    "level": LEVEL,
+    "uniform": UNIFORM,
+    "bursts": HELD,
+    "queue": QUEUE,
+    "batches": BATCHES,
+}
 DELAYS |= {"newest first": NEWEST_FIRST}
 
 
-def log_of(delays, behind=0.0, numbers=None, uav="u1") -> pd.DataFrame:
+def log_of(delays, behind=0.0, numbers=None, uav="u1"):
     """A log of a sender whose clock is behind by so much [s], in the order in which it came in."""
-    log = pd.DataFrame({"uav": uav, "time": TIMES - behind, "received": TIMES + delays})
+    log = pd.DataFrame(
+        {
+            "uav": uav,
+            "time": TIMES - behind,
+            "received": TIMES + delays,
+        }
+    )
     log["sequence"] = np.arange(N, dtype=float) if numbers is None else numbers
     log["where"] = [f"line {n}" for n in range(2, N + 2)]
     return log.sample(frac=1, random_state=0)
 
 
-def wrong_ones(log: pd.DataFrame) -> list[int]:
+def wrong_ones(log):
     messages = in_order(log)
     return sorted(messages.index[~are_right(messages)])
 

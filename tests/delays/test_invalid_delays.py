@@ -7,16 +7,14 @@ import pytest
 from delay_twin import ACTION, Crowd, delayed, trace
 from helpers import square
 
+from damian import ActionDelay, ObservationDelay, RewardDelay, TableSampler, make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.laws import LONGEST, Burst, Lag, Law, Uniform
-from damian.delays.samplers import TableSampler
 from damian.delays.scenario import ScenarioDelays
-from damian.envs.pipeline import make_env
-from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 
-def delays(**settings) -> ScenarioDelays:
+def delays(**settings):
     """The delays of a scenario with these settings."""
     return ScenarioDelays(DelayConfig(**settings), LinkConfig(), 1.0)
 
@@ -26,14 +24,12 @@ INVALID_LAWS = [
         -1,
         ": -1 is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7",
     ),
-    ("3x", ": 3x is not a delay"),
     ("3h", f": 3h is more than {LONGEST} steps"),
     ({"law": "gauss"}, ".law: gauss is not one of constant, uniform, geometric, burst, trace"),
     (
         {"law": "uniform", "high": 2.5},
         ".high: 2.5 is neither a number of steps >= 0 (3) nor a time (3s",
     ),
-    ({"law": "uniform", "low": 4, "high": 2}, ".low: 4 and high=2 are not two steps or two times"),
     ({"law": "burst", "bad": {"law": "burst"}}, ".bad: {'law': 'burst'} is not a memoryless law"),
     ({"law": "distance", "speed": math.nan}, ".speed: nan m/s is not above 0 m/s"),
     ("7..1", ": 7..1 is not a range of two numbers of steps"),

@@ -12,7 +12,14 @@ from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, OWN, fit_laws
 from damian.delays.laws import sampler_of
 
 UNIFORM = {"law": "uniform", "low": 3, "high": 7}
-BURST = {"law": "burst", "enter": 0.05, "leave": 0.2, "good": 1, "bad": UNIFORM, "bad_loss": 0.3}
+BURST = {
+    "law": "burst",
+    "enter": 0.05,
+    "leave": 0.2,
+    "good": 1,
+    "bad": UNIFORM,
+    "bad_loss": 0.3,
+}
 LAWS = [
     3,
     UNIFORM,
@@ -22,7 +29,7 @@ LAWS = [
 LOSSES = {**BURST, "good": 0, "bad": 0, "bad_loss": 1.0}
 
 
-def drawn(law, loss: float = 0.0, seed: int = 0) -> np.ndarray:
+def drawn(law, loss=0.0, seed=0):
     """Delays [steps] of the messages of 30 senders: 15 send 200 messages each, the others 150."""
     sampler = sampler_of(law, loss=loss)
     delays = delay_twin.drawn(sampler, counter_rng.world_seeds(seed, 30), 200).T
@@ -31,7 +38,7 @@ def drawn(law, loss: float = 0.0, seed: int = 0) -> np.ndarray:
     return found
 
 
-def check_alike(found, law) -> None:
+def check_alike(found, law):
     """Check that settings are the same, probabilities and means about."""
     if isinstance(law, dict):
         assert found.keys() == law.keys()

@@ -5,9 +5,9 @@ import shlex
 
 import pytest
 
+from damian import Trace
 from damian.common.errors import InputError
 from damian.delays.clocks import are_right, in_order
-from damian.delays.laws import Trace
 from damian.delays.logs import delays_of, read_log, trace_rows
 from damian.recipes.cli import settings
 from damian.recipes.command import main
@@ -17,7 +17,7 @@ DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
 """Of the messages of a UAV [s]; None: lost."""
 
 
-def table(numbered: bool = True, period: float = 1.0, uavs: int = 2, start: float = 1.7e9) -> str:
+def table(numbered=True, period=1.0, uavs=2, start=1.7e9):
     """A table of reports in the order in which they came in, one of them twice."""
     rows = []
     for uav in range(uavs):
@@ -40,7 +40,7 @@ def fitted_log(path):
 
 @pytest.fixture
 def log(tmp_path):
-    def written(text: str, name: str = "reports.csv"):
+    def written(text, name="reports.csv"):
         path = tmp_path / name
         path.write_text(text)
         return path
@@ -75,12 +75,30 @@ def test_a_law_reads_the_trace(log, tmp_path, capsys):
 
 
 def test_a_journal_is_a_log(log):
-    head = {"journal": "damian-advice", "version": 3, "fleet": "x", "uavs": ["A"], "about": {}}
+    head = {
+        "journal": "damian-advice",
+        "version": 3,
+        "fleet": "x",
+        "uavs": ["A"],
+        "about": {},
+    }
     reports = [
-        {"received": i + 0.25, "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}]}
+        {
+            "received": i + 0.25,
+            "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}],
+        }
         for i in range(4)
     ]
-    lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]
+    lines = [
+        head,
+        *reports,
+        {
+            "asked": 5.0,
+            "step": 5,
+            "told": {},
+            "advice": [],
+        },
+    ]
     path = log("".join(f"{json.dumps(line)}\n" for line in lines) + '{"cut', "x.jsonl")
     assert trace_rows(fitted_log(path)) == ["0.250000s"] * 4
 

@@ -6,16 +6,15 @@ import math
 import pytest
 import torch
 from delay_twin import drawn
-from torch import Tensor
 
+from damian import Distance, Lag, Uniform
 from damian.common import counter_rng
-from damian.delays.laws import Distance, Lag, Uniform
 from damian.delays.samplers import ContextSampler, LinkSampler, MessageContext, Recorded, Sampler
 
 SENDERS = 20_000
 
 
-def require_share(found: Tensor, expected: float) -> None:
+def require_share(found, expected):
     """Is the share of true flags as expected, within five standard deviations of a binomial
     distribution?"""
     deviation = math.sqrt(max(expected * (1 - expected), 1e-9) / found.numel())
@@ -29,7 +28,7 @@ class Doubling(Sampler):
     """The state is a float, which doubles with every message: 0.4, 0.8, 1.6, ... steps, rounded
     down."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(3, loses=False)
 
     def initial_state(self, streams):
@@ -52,7 +51,7 @@ def test_links_keep_the_states_of_all_samplers_floats_or_not():
 # Contexts.
 
 
-def context_of(uniform: Tensor, dt: float = 1.0, **entries: Tensor) -> MessageContext:
+def context_of(uniform, dt=1.0, **entries):
     """A context of messages about which nothing but a random number and some entries are known."""
     zero = torch.zeros_like(uniform).long()
     return MessageContext(zero, zero - 1, zero + 1, zero.float(), uniform, dt, entries)
@@ -88,9 +87,7 @@ def test_the_rounding_errors_of_a_float_cost_no_step():
 # Distances.
 
 
-def at_distance(
-    law: Distance, distance: float, loss: float = 0.0, dt: float = 1.0, **entries
-) -> Tensor:
+def at_distance(law, distance, loss=0.0, dt=1.0, **entries):
     """Delays of messages sent at this distance east of the origin [M], -1 for a lost one."""
     streams = counter_rng.world_seeds(3, SENDERS)
     clock = torch.tensor(1)

@@ -10,10 +10,8 @@ from delay_twin import trace
 from delayed_envs import choices
 from helpers import all_same, play, square
 
+from damian import TableSampler, UavEnv, make_env
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.delays.samplers import TableSampler
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
 from damian.learners.config import MappoConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
@@ -23,10 +21,21 @@ from damian.world.config import RegionConfig, SourceConfig
 
 def test_an_environment_reads_a_trace_once(tmp_path):
     delay = DelayConfig(
-        obs=trace(tmp_path, 1, 2, 0), act={"law": "uniform", "high": 2}, rew=1, history=2
+        obs=trace(tmp_path, 1, 2, 0),
+        act={
+            "law": "uniform",
+            "high": 2,
+        },
+        rew=1,
+        history=2,
     )
     scenario = square(delay=delay, links=LinkConfig("matrix", delay=1))
-    config = TrainConfig(**vars(scenario), learner=MappoConfig(steps=5), worlds=2, backupdate=True)
+    config = TrainConfig(
+        **vars(scenario),
+        learner=MappoConfig(steps=5),
+        worlds=2,
+        backupdate=True,
+    )
     check_learning(config)
     env = learning_env(config)
     next(tmp_path.iterdir()).unlink()  # so that to read it again fails
@@ -34,11 +43,11 @@ def test_an_environment_reads_a_trace_once(tmp_path):
     env.rollout(3)
 
 
-def write_trace(path, delay: int) -> None:
+def write_trace(path, delay):
     path.write_text("delay\n" + f"{delay}\n" * 20)
 
 
-def write_region(path, side: int) -> None:
+def write_region(path, side):
     places = [
         [x * side * 1e-5, y * side * 1e-5] for x, y in [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
     ]
@@ -95,7 +104,11 @@ def test_an_environment_keeps_the_settings_with_which_it_was_made(make, change):
 
 
 def test_a_learner_keeps_the_settings_with_which_it_was_made():
-    config = TrainConfig(**vars(square()), learner=MappoConfig(steps=5), worlds=2)
+    config = TrainConfig(
+        **vars(square()),
+        learner=MappoConfig(steps=5),
+        worlds=2,
+    )
     env = learning_env(config)
     learner = make_learner(config, env, None)
     config.learner.epochs = 40

@@ -4,7 +4,6 @@ steps."""
 import math
 import runpy
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -33,20 +32,23 @@ from delay_twin import LAWS as TABLES
 from delayed_envs import choices as uav_choices
 from helpers import everything, play
 
+from damian import ActionDelay, DelayConfig, Lag, ObservationDelay, RewardDelay, Uniform, make_env
 from damian.common import counter_rng
-from damian.delays.config import DelayConfig
-from damian.delays.laws import Lag, Uniform
-from damian.envs.pipeline import make_env
-from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
-Route: Any = runpy.run_path(str(Path(__file__).parents[2] / "examples/extending/law.py"))["Route"]
+Route = runpy.run_path(str(Path(__file__).parents[2] / "examples/extending/law.py"))["Route"]
 DT = 2.0
-LAWS: dict[str, Any] = {
+LAWS = {
     "each message": Lag(Uniform(1, 5)),
     "time": Lag(Uniform(1, 5), "8s"),
     "episode": Lag(Uniform(1, 5), "episode"),
     "hold": Lag(Uniform(1, 5), 2, hold_probability=0.5),
-    "all": Lag(Uniform(1, 5), 3, hold_probability=0.4, shared=True, stagger=True),
+    "all": Lag(
+        Uniform(1, 5),
+        3,
+        hold_probability=0.4,
+        shared=True,
+        stagger=True,
+    ),
     "context": Crowd("seen", column=4),
     "state of one's own": Route(4, change=0.6),
 }
@@ -62,25 +64,28 @@ def law(request, tmp_path):
 class LagSender:
     """Delays of one sender's messages by a law ``Lag``."""
 
-    def __init__(self, lag: Lag, stream: int, loss: float) -> None:
+    def __init__(self, lag, stream, loss):
         self.stream = torch.tensor(stream)
         self.lag = lag
         self.loss = loss
-        self.period = {"episode": math.inf, "8s": 4}.get(str(lag.update_period), lag.update_period)
+        self.period = {
+            "episode": math.inf,
+            "8s": 4,
+        }.get(str(lag.update_period), lag.update_period)
         self.begin()
 
-    def begin(self) -> None:
+    def begin(self):
         """Begin an episode."""
         self.held = None
         self.update_at = 0
 
-    def bits(self, *counters: int) -> int:
+    def bits(self, *counters):
         return int(counter_rng.bits(self.stream, *map(torch.tensor, counters)))
 
-    def share(self, *counters: int) -> float:
+    def share(self, *counters):
         return float(counter_rng.uniform(self.stream, *map(torch.tensor, counters)))
 
-    def send(self, now: int, value: float, n_sending: int) -> int | None:
+    def send(self, now, value, n_sending):
         """The delay of the message that is sent at this step; None if it is lost."""
         drawn = 1 + 5 * self.bits(now) // 2**32
         if self.held is None:
@@ -99,17 +104,17 @@ class CrowdSender(LagSender):
     """Delays of one sender's messages by the law ``Crowd``; the first one is sent after so many
     steps."""
 
-    def __init__(self, agent: int, stream: int, loss: float = 0.0, first: int = 1) -> None:
+    def __init__(self, agent, stream, loss=0.0, first=1):
         self.agent = agent
         self.stream = torch.tensor(stream)
         self.loss = loss
         self.first = first
         self.begin()
 
-    def begin(self) -> None:
+    def begin(self):
         self.elapsed = self.first
 
-    def send(self, now: int, value: float, n_sending: int) -> int | None:
+    def send(self, now, value, n_sending):
         delay = twin_delay(value, n_sending, self.agent, self.elapsed, self.share(now))
         self.elapsed += 1
         return None if self.share(now, 0) < self.loss else delay
@@ -118,16 +123,16 @@ class CrowdSender(LagSender):
 class RouteSender(LagSender):
     """Delays of one sender's messages by the law ``Route`` of docs/extending.md."""
 
-    def __init__(self, law: Any, stream: int, loss: float) -> None:
+    def __init__(self, law, stream, loss):
         self.law = law
         self.stream = torch.tensor(stream)
         self.loss = loss
         self.delay = self.bits() % (law.longest + 1)
 
-    def begin(self) -> None:
+    def begin(self):
         """The walk goes on."""
 
-    def send(self, now: int, value: float, n_sending: int) -> int | None:
+    def send(self, now, value, n_sending):
         draw = self.share(now)
         half = self.law.change / 2
         self.delay = min(max(self.delay + (draw < half) - (draw >= 1 - half), 0), self.law.longest)
@@ -137,21 +142,25 @@ class RouteSender(LagSender):
 class TableSender(LagSender):
     """Delays of one sender's messages as the sampler itself draws them, from ``drawn``."""
 
-    def __init__(self, delays: list[int], lost: int) -> None:
+    def __init__(self, delays, lost):
         self.delays = [None if delay == lost else delay for delay in delays]
 
-    def begin(self) -> None:
+    def begin(self):
         """The draws go on."""
 
-    def send(self, now: int, value: float, n_sending: int) -> int | None:
+    def send(self, now, value, n_sending):
         return self.delays[now - 1]
 
 
-def senders(transform: Any, law: Any, loss: float = 0.0, first: int = 1) -> list[LagSender]:
+def senders(transform, law, loss=0.0, first=1):
     """A sender for each row, with the random stream of the transform."""
     streams = transform.memory["streams"]
     sampler = transform.sampler
-    own = {Lag: LagSender, Route: RouteSender, Crowd: CrowdSender}.get(type(law))
+    own = {
+        Lag: LagSender,
+        Route: RouteSender,
+        Crowd: CrowdSender,
+    }.get(type(law))
     if own is None:
         return [TableSender(d, sampler.lost) for d in drawn(sampler, streams, STEPS).T.tolist()]
     assert len(streams.unique()) >= len(WORLDS), "worlds draw apart"
@@ -161,7 +170,7 @@ def senders(transform: Any, law: Any, loss: float = 0.0, first: int = 1) -> list
     ]
 
 
-def options(law: Any) -> dict[str, Any]:
+def options(law):
     """Arguments of a transform that delays by this law."""
     keys = {"context_keys": {"seen": "observation"}} if isinstance(law, Crowd) else {}
     return keys | {"dt": DT if type(law) in (Lag, Crowd, Route) else 1.0}
@@ -234,7 +243,15 @@ def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key
 
 @pytest.mark.sample(2)
 def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
-    law = Crowd("seen", column=4, loses=False) if isinstance(law, Crowd) else law
+    law = (
+        Crowd(
+            "seen",
+            column=4,
+            loses=False,
+        )
+        if isinstance(law, Crowd)
+        else law
+    )
     earned = after(play(Counting(WORLDS, N_AGENTS), choices()), *REWARD)
     transform = RewardDelay(
         law, REWARD, delay_key="reward_delay", earned_key="earned", **options(law)

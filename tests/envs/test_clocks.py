@@ -5,17 +5,15 @@ import itertools
 import pytest
 import torch
 from helpers import square
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
+from damian import ClockConfig, DelayConfig
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig
 from damian.learners.schedule import SystemClock
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, spotting, ticks
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig
 from damian.world.messages import Messages
 
 SPOTTED = torch.tensor([[False, True]])
@@ -23,11 +21,11 @@ NOT_SPOTTED = torch.tensor([[False, False]])
 WORLDS = 4
 
 
-def triggered(period: int, trigger: str = "2s", **bounds: str) -> SystemClock:
+def triggered(period, trigger="2s", **bounds):
     return SystemClock(ClockConfig(trigger=trigger, **bounds), period)
 
 
-def periods(clock: SystemClock, *spotted: torch.Tensor) -> list[int]:
+def periods(clock, *spotted):
     """The period after each tick."""
     result = []
     for flags in spotted:
@@ -36,17 +34,9 @@ def periods(clock: SystemClock, *spotted: torch.Tensor) -> list[int]:
     return result
 
 
-@pytest.mark.parametrize(
-    ("clock", "message"),
-    [
-        ({"simulation": "1s", "agents": "1.5s"}, "clock.agents: 1.5s is not a multiple"),
-        ({"agents": "2s", "server": "3s"}, "clock.server: 3s is not a multiple of clock.agents=2s"),
-    ],
-)
-def test_impossible_periods_are_refused(clock, message):
-    with pytest.raises(InputError, match="clock") as error:
-        ClockConfig(**clock)
-    assert message in str(error.value)
+def test_an_impossible_period_is_refused():
+    with pytest.raises(InputError, match=r"clock.server: 3s is not a multiple of clock.agents=2s"):
+        ClockConfig(agents="2s", server="3s")
 
 
 def test_a_triggered_clock_stays_within_its_bounds():
@@ -86,14 +76,14 @@ def test_the_period_shrinks_if_the_source_is_spotted_in_half_of_the_worlds_or_mo
 # Batches that the training recipe collects between two ticks.
 
 
-def config(clock: ClockConfig, level_db: float) -> TrainConfig:
+def config(clock, level_db):
     scenario = square(episode=EpisodeConfig(max_steps=7), delay=DelayConfig(obs=2))
     scenario.source.level_db = level_db
     sections = {name: getattr(scenario, name) for name in ("region", "source", "episode", "delay")}
     return TrainConfig(**sections, clock=clock, worlds=WORLDS, backupdate=True)
 
 
-def batches(config: TrainConfig, n_steps: int, period: int) -> list[tuple[int, TensorDictBase]]:
+def batches(config, n_steps, period):
     """Batches of ``n_steps`` steps or more in all, each with the system clock's period at that
     time."""
     env = learning_env(config)

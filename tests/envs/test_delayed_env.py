@@ -1,21 +1,19 @@
 """``DelayedEnv``: what holds in a scenario with any delays, losses and clocks, eager and
 compiled."""
 
-from collections.abc import Sequence
-
 import pytest
 import torch
 from delayed_envs import DELAYS, after_steps, choices, delayed, every_delay
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, square
-from tensordict import TensorDictBase
-from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter, Transform, TransformedEnv
+from torchrl.envs import RewardSum, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from damian import (
+    compose_scenario,
+)
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import EpisodeTotals
-from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
+from damian.envs.pipeline import make_env, make_transforms
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.keys import (
     ACTION,
@@ -23,36 +21,15 @@ from damian.keys import (
     EPISODE_REWARD,
     GLOBAL_OBSERVATION,
     MESSAGE,
-    OBSERVATION,
-    READY,
     RECEIVED,
     REWARD,
 )
-from damian.recipes.shared.environments import compose_scenario
-from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
-from damian.world.landing import ActionConfig
+from damian.world.config import ActionConfig
 
 # Without delays.
 
 
-def all_transforms(scenario: ScenarioConfig, n_worlds: int) -> DelayedEnv:
-    """An environment with every transform, each with a delay of 0."""
-    env = UavEnv(scenario, n_worlds, extras=EXTRAS, messages_only=True)
-    keys = {"sent_key": "ready", "valid_key": "action_valid"}
-    transforms = [
-        ActionDelay(0, ACTION, default=hold_action(scenario.actions), **keys),
-        *server_transforms(scenario, scenario.make_delays(), env.server, EXTRAS),
-        RewardDelay(0, REWARD),
-        CumulativeReward(1, 0.9, REWARD),
-        SampleAndHold(1, [OBSERVATION, GLOBAL_OBSERVATION]),
-        SampleAndHold(1, [OBSERVATION], ready_key=READY),
-    ]
-    delayed_env = DelayedEnv(env, Compose(*transforms))
-    delayed_env.set_seed(0)
-    return delayed_env
-
-
-def check_equals_undelayed(env: EnvBase, scenario: ScenarioConfig, n_steps: int = 25) -> None:
+def check_equals_undelayed(env, scenario, n_steps=25):
     """Everything that the environment without transforms outputs is output, bit for bit."""
     undelayed = UavEnv(scenario, env.batch_size[0])
     expected = play(undelayed, choices(undelayed, n_steps))
@@ -63,18 +40,15 @@ def check_equals_undelayed(env: EnvBase, scenario: ScenarioConfig, n_steps: int 
     assert sum(td["done"].sum() for td in expected) > 0
 
 
-@both_kinds
-@both_motions
-def test_with_delays_of_0_all_transforms_output_what_the_environment_without_them_does(
-    motion, kind
-):
-    scenario = everything(motion, kind)
-    check_equals_undelayed(all_transforms(scenario, 8), scenario)
-
-
 def test_without_any_delay_there_are_no_transforms():
     nothing = DelayConfig(
-        obs="0s", act={"law": "uniform", "high": "7s", "low": "3s", "probability": 0.0}
+        obs="0s",
+        act={
+            "law": "uniform",
+            "high": "7s",
+            "low": "3s",
+            "probability": 0.0,
+        },
     )
     env = make_env(everything(delay=nothing), 4, extras=EXTRAS)
     assert not [*env.transform.transforms]
@@ -100,13 +74,13 @@ class FalsifyMessage(Transform):
     """Changes the position in the message that one UAV sends in one step, for all later
     transforms."""
 
-    def __init__(self, world: int, agent: int, step: int) -> None:
+    def __init__(self, world, agent, step):
         super().__init__()
         self.sender = (world, agent)
         self.step_to_change = step
         self.steps = 0
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(self, tensordict, next_tensordict):
         self.steps += 1
         if self.steps == self.step_to_change:
             message = next_tensordict[MESSAGE].clone()
@@ -114,15 +88,23 @@ class FalsifyMessage(Transform):
             next_tensordict.set(MESSAGE, message)
         return next_tensordict
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict, tensordict_reset):
         return tensordict_reset
 
 
 @pytest.mark.sample(4)
 @pytest.mark.parametrize("order", ["generation", "arrival"])
-@pytest.mark.parametrize("obs", [4, {"law": "geometric", "mean": 3}], ids=["constant", "random"])
+@pytest.mark.parametrize(
+    "obs",
+    [
+        4,
+        {
+            "law": "geometric",
+            "mean": 3,
+        },
+    ],
+    ids=["constant", "random"],
+)
 def test_a_message_has_no_effect_before_it_arrives(obs, order):
     scenario = everything(episode=KEEPS_GOING, delay=DelayConfig(obs=obs, order=order))
     original = play(env := delayed(scenario), choices(env, 20))
@@ -180,7 +162,7 @@ def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
 def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
     scenario = everything(motion, **DELAYS[delays] | {"episode": KEEPS_GOING})
 
-    def rollout(mask: Sequence[bool]) -> list[TensorDictBase]:
+    def rollout(mask):
         env = delayed(scenario)
         outputs = []
         td = env.reset()
@@ -220,12 +202,11 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, kin
     check_equals_torchrls_way(scenario, delayed(scenario))
 
 
-@both_motions
 @pytest.mark.parametrize(
     "route", [pytest.param(r, marks=[pytest.mark.slow] * (r != "everything")) for r in ROUTES]
 )
-def test_a_compiled_step_equals_torchrls_too(motion, route):
-    scenario = everything(motion, **ROUTES[route])
+def test_a_compiled_step_equals_torchrls_too(route):
+    scenario = everything("polynomial", **ROUTES[route])
     check_equals_torchrls_way(scenario, delayed(scenario).compile(backend="eager"))
 
 
@@ -238,10 +219,15 @@ def test_a_scenario_compiles_to_kernels(name):
     actions = choices(eager, 8)
     for expected, found in zip(steps_of(eager, actions), steps_of(compiled, actions), strict=True):
         for key, value in expected.items(True, True):
-            torch.testing.assert_close(found[key], value, msg=str(key), equal_nan=True)
+            torch.testing.assert_close(
+                found[key],
+                value,
+                msg=str(key),
+                equal_nan=True,
+            )
 
 
-def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None:
+def check_equals_torchrls_way(scenario, env):
     base = env.base_env
     uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
     one_by_one = TransformedEnv(
@@ -259,7 +245,7 @@ def check_equals_torchrls_way(scenario: ScenarioConfig, env: DelayedEnv) -> None
     assert all_same(expected, found)
 
 
-def steps_of(env: EnvBase, actions: list[torch.Tensor]) -> list[TensorDictBase]:
+def steps_of(env, actions):
     """What each step returns, and that with which the next one begins, without what a policy has
     written."""
     following = env.reset()

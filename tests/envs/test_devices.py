@@ -1,9 +1,7 @@
 """What a GPU would run, without a GPU: nothing waits for it, and it touches no tensor of another
 device."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -16,17 +14,21 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from damian.common import compiling, devices
 from damian.common.tensors import tree_map
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.uav_env import Outputs
-from damian.transforms.base import Memory, StatefulTransform
-from damian.transforms.entries import Entries
-from damian.world.state import PackedState
+from damian.transforms.base import StatefulTransform
 
 LATE = DelayConfig(
-    obs={"law": "geometric", "mean": 2}, rew={"law": "uniform", "low": 0, "high": 30}
+    obs={
+        "law": "geometric",
+        "mean": 2,
+    },
+    rew={"law": "uniform", "low": 0, "high": 30},
 )
-LAG = {"law": "lag", "lag": {"law": "uniform", "low": 0, "high": 3}, "update_period": 2}
+LAG = {
+    "law": "lag",
+    "lag": {"law": "uniform", "low": 0, "high": 3},
+    "update_period": 2,
+}
 LINKS = {
     "own": {
         "delay": DelayConfig(obs=2),
@@ -34,7 +36,12 @@ LINKS = {
     },
     "updown": {"links": LinkConfig("updown", delay=2, loss=0.1)},
     "matrix": {
-        "links": LinkConfig("matrix", delay=[[0, 1, LAG]] * 3, loss=0.1, range=100.0),
+        "links": LinkConfig(
+            "matrix",
+            delay=[[0, 1, LAG]] * 3,
+            loss=0.1,
+            range=100.0,
+        ),
         "delay": LATE,
     },
 }
@@ -44,7 +51,13 @@ SCENARIOS = {
         f"{name} in flight": square(motion=MOTIONS["polynomial"], **KINDS[name])
         for name in ("coverage", "energy")
     },
-    **{name: everything(**sections) for name, sections in {**DELAYS, **LINKS}.items()},
+    **{
+        name: everything(**sections)
+        for name, sections in {
+            **DELAYS,
+            **LINKS,
+        }.items()
+    },
     "continuous": everything("polynomial", "continuous", delay=LATE),
 }
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
@@ -63,7 +76,7 @@ WAITS |= {"_unique", "_unique2", "unique_dim", "unique_consecutive"}
 INDEXES = {"index", "index_put", "index_put_", "_index_put_impl_"}
 
 
-def tensors(values: Any) -> Iterator[Tensor]:
+def tensors(values):
     """All tensors within lists, tuples and dictionaries."""
     if isinstance(values, Tensor):
         yield values
@@ -77,7 +90,7 @@ def tensors(values: Any) -> Iterator[Tensor]:
 class Watched(TorchDispatchMode):
     """Watches every operator, also those within the custom operators of the package."""
 
-    def check(self, name: str, func: Any, args: Any, out: Any) -> None:
+    def check(self, name, func, args, out):
         raise NotImplementedError
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
@@ -94,7 +107,7 @@ class Watched(TorchDispatchMode):
 class NothingWaits(Watched):
     """Refuses operators for which a CPU would wait for a GPU, and copies from the host."""
 
-    def check(self, name: str, func: Any, args: Any, out: Any) -> None:
+    def check(self, name, func, args, out):
         waits = name in WAITS or (name == "repeat_interleave" and func._overloadname == "Tensor")
         waits |= name in INDEXES and any(index.dtype == torch.bool for index in tensors(args[1]))
         assert not waits, f"waits for {func}"
@@ -104,7 +117,7 @@ class NothingWaits(Watched):
 class OnMeta(Watched):
     """Refuses tensors that are not on the device ``meta``, except for numbers."""
 
-    def check(self, name: str, func: Any, args: Any, out: Any) -> None:
+    def check(self, name, func, args, out):
         for tensor in tensors([args, out]):
             assert tensor.device.type == "meta" or not tensor.dim(), f"{func} on {tensor.device}"
 
@@ -113,25 +126,22 @@ class Recording(TorchDispatchMode):
     """Stands in for a CUDA graph: records operators, and runs them again on the same tensors, in
     place."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.calls: list[tuple[Any, Any, dict[str, Any], Any]] = []
+        self.calls = []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         self.calls.append((func, args, kwargs or {}, func(*args, **kwargs or {})))
         return self.calls[-1][-1]
 
-    def replay(self) -> None:
+    def replay(self):
         for func, args, kwargs, found in self.calls:
             for old, new in zip(tensors([found]), tensors([func(*args, **kwargs)]), strict=True):
                 if old.data_ptr() != new.data_ptr():
                     old.copy_(new)
 
 
-Inputs = tuple[DelayedEnv, PackedState, list[Memory], Entries, Tensor]
-
-
-def inputs(scenario: ScenarioConfig) -> Inputs:
+def inputs(scenario):
     """An environment in the middle of an episode, the inputs of its next step, and worlds to
     reset."""
     env = delayed(scenario)
@@ -153,9 +163,7 @@ def inputs(scenario: ScenarioConfig) -> Inputs:
     )
 
 
-def step_and_reset(
-    env: DelayedEnv, worlds: PackedState, memories: list[Memory], entries: Entries, mask: Tensor
-) -> tuple[Outputs, Outputs]:
+def step_and_reset(env, worlds, memories, entries, mask):
     """The outputs of a step, and of a reset of some worlds."""
     with torch.no_grad():
         worlds, memories, stepped = env.step_fn(worlds, memories, entries)

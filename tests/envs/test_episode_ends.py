@@ -7,20 +7,17 @@ import math
 import pytest
 import torch
 from helpers import MOTIONS, act, both_motions, clock, fresh, one_uav, sent_messages, walking
-from tensordict import TensorDictBase
 
-from damian.envs.uav_env import UavEnv
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, RewardConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
-from damian.world.motion import MotionConfig
+from damian.world.config import MotionConfig
 
 FAR = [[390.0, 10.0]]
 HERE, EAST = [[0.0, 0.0]], [[1.0, 0.25]]
 """Continuous actions of one UAV: hold, and 100 m east (a quarter of a turn from north)."""
 
 
-def go(env: UavEnv, *actions: list) -> TensorDictBase:
+def go(env, *actions):
     """Step through the actions; return the output of the last step."""
     for action in actions:
         after = act(env, torch.tensor([action]))
@@ -48,7 +45,14 @@ def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding
     )
     episode = EpisodeConfig(max_steps=None, discharged_share=1.0)
     task = RewardConfig(penalty=2.0)
-    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion], episode=episode, reward=task))
+    env = fresh(
+        one_uav(
+            battery=battery,
+            motion=MOTIONS[motion],
+            episode=episode,
+            reward=task,
+        )
+    )
     env.state = env.state._replace(battery=torch.tensor([[level]]))
     output = go(env, HERE)
     assert sent_messages(output).empty.item() == empty
@@ -58,7 +62,13 @@ def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding
 
 
 def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_configured():
-    once = {"n_hotspots": 1, "min_stops": 1, "max_stops": 1, "min_wait": 0.9, "max_wait": 0.9}
+    once = {
+        "n_hotspots": 1,
+        "min_stops": 1,
+        "max_stops": 1,
+        "min_wait": 0.9,
+        "max_wait": 0.9,
+    }
     source = walking(level_db=170.0, after_walk="stop", local_distance=1e-3, **once)
     for terminates in (True, False):
         episode = EpisodeConfig(max_steps=None, end_with_source=terminates)

@@ -17,13 +17,10 @@ import pytest
 import torch
 from golden_records import FEATURES, close, converted
 from helpers import DATA, GOLDEN, usecase
-from torch import Tensor
 
+from damian import ContextSampler, MessageContext, UavEnv
 from damian.delays.line import DelayLine
-from damian.delays.samplers import ContextSampler, MessageContext
-from damian.envs.uav_env import UavEnv
 from damian.server.config import ObservationConfig
-from damian.server.server import Server
 from damian.world.messages import Messages
 
 RUNS = json.loads((DATA / "delayed_runs.json").read_text())
@@ -46,18 +43,18 @@ class Step(NamedTuple):
     """The messages that the server holds, [N]."""
 
     @property
-    def uavs(self) -> range:
+    def uavs(self):
         return range(len(self.recorded("positions")))
 
-    def recorded(self, field: str) -> Any:
+    def recorded(self, field):
         """What the record says of the step; None if episodes do not end and it lacks ``info``."""
         return self.run[field][self.number - 1] if field in self.run else None
 
-    def observed(self, uav: int) -> dict[str, float]:
+    def observed(self, uav):
         """The recorded features of a UAV, by our names."""
         return dict(zip(self.run["features"], self.recorded("obs_global")[uav], strict=True))
 
-    def reset_came_last(self, uav: int) -> bool:
+    def reset_came_last(self, uav):
         """Whether the UAV's message of the reset was late, and arrived after its other messages so
         far."""
         now = self.number - 1
@@ -68,13 +65,13 @@ class Step(NamedTuple):
         return 0 < first <= now and bool(others) and max(others) < first
 
     @property
-    def lost_in_reset(self) -> bool:
+    def lost_in_reset(self):
         """Whether the server of the original has replaced a newer message by a late one of the
         reset."""
         return any(map(self.reset_came_last, self.uavs))
 
 
-def sent_messages(case: int, run: dict[str, Any]) -> Messages:
+def sent_messages(case, run):
     """What the UAVs of a run sent at its reset and in each step, [1 + T, N].
 
     As in the original, a UAV that hears nothing passes on the newest detection that the server has
@@ -106,7 +103,7 @@ def sent_messages(case: int, run: dict[str, Any]) -> Messages:
     )
 
 
-def received_messages(case: int, run: dict[str, Any]) -> Messages:
+def received_messages(case, run):
     """What the server holds after each step of a run, [T, N]: messages arrive as recorded."""
     first, *sent = sent_messages(case, run).pack()
     arrivals = ContextSampler(lambda context: context.entries["late"], LONGEST, loses=False)
@@ -123,7 +120,7 @@ def received_messages(case: int, run: dict[str, Any]) -> Messages:
 
 
 @cache
-def replay(case: int, *kinds: str) -> list[Step]:
+def replay(case, *kinds):
     """All recorded steps of some kinds of runs, with what our server holds after each."""
     steps = []
     for kind in kinds:
@@ -138,7 +135,7 @@ def replay(case: int, *kinds: str) -> list[Step]:
     return steps
 
 
-def held_by_server(steps: list[Step]) -> tuple[Messages, Tensor]:
+def held_by_server(steps):
     """What the server holds after M steps, [M, N], and the numbers of the steps, [M]."""
     held = Messages(*map(torch.stack, zip(*(step.held for step in steps), strict=True)))
     return held, torch.tensor([step.number for step in steps])
@@ -171,7 +168,7 @@ ONCE = "a place that several UAVs report counts once"
 NO_BEARING = "no bearing to where it stands"
 
 
-def make_server(case: int) -> Server:
+def make_server(case):
     """The server of a use case that computes every recorded feature."""
     names = [FEATURES[name] for name in RUNS[f"usecase{case}"][KINDS[0]]["observations_order"]]
     names = [name for name in names if name not in ("spotted", "coverage")]
@@ -179,7 +176,7 @@ def make_server(case: int) -> Server:
     return UavEnv(usecase(case, observation=observation), extras=()).server
 
 
-def reason_for_other_feature(step: Step, name: str, uav: int) -> str | None:
+def reason_for_other_feature(step, name, uav):
     """Why a feature differs from the original's; None if it does not."""
     if step.lost_in_reset:
         return LATE_RESET
@@ -211,7 +208,17 @@ ESTIMATED = ("source_distance", "source_bearing", "source_drift", "mean_distance
     ("case", "compared", "reasons"),
     [
         (1, 974, {NOTHING_COVERED: 181, NO_BEARING: 112, LATE_RESET: 14}),
-        (2, 4593, {ONCE: 672, NOTHING_COVERED: 603, LATE_RESET: 270, DIVIDED: 136, NO_BEARING: 26}),
+        (
+            2,
+            4593,
+            {
+                ONCE: 672,
+                NOTHING_COVERED: 603,
+                LATE_RESET: 270,
+                DIVIDED: 136,
+                NO_BEARING: 26,
+            },
+        ),
     ],
 )
 def test_the_server_computes_the_recorded_features(case, compared, reasons):

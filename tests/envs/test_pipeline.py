@@ -7,10 +7,8 @@ import torch
 from delayed_envs import choices, delayed
 from helpers import FLYING, KEEPS_GOING, all_same, everything, play, square
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig
+from damian import ClockConfig, DelayConfig, UavEnv
 from damian.envs.pipeline import action_codes
-from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, OBSERVATION, READY, RECEIVED
 from damian.world.landing import action_table
 from damian.world.messages import Messages
@@ -31,10 +29,26 @@ def test_the_action_history_holds_the_chosen_displacements_east_and_north():
         expected = torch.cat([codes[actions[t - 1]], codes[actions[t]]], -1)
         observation = outputs[2 * t + 1][OBSERVATION]
         assert observation.shape[-1] == undelayed.observation_spec[OBSERVATION].shape[-1] + 4
-        torch.testing.assert_close(observation[..., -4:], expected, rtol=0, atol=1e-6)
+        torch.testing.assert_close(
+            observation[..., -4:],
+            expected,
+            rtol=0,
+            atol=1e-6,
+        )
 
 
-@pytest.mark.parametrize("obs", [2, {"law": "uniform", "low": 0, "high": 5, "probability": 1.0}])
+@pytest.mark.parametrize(
+    "obs",
+    [
+        2,
+        {
+            "law": "uniform",
+            "low": 0,
+            "high": 5,
+            "probability": 1.0,
+        },
+    ],
+)
 def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
     delay = DelayConfig(obs=obs, history=3)
     motion = replace(FLYING, sensing_time=4.0)
@@ -65,7 +79,16 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
 
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(
-    "act", [0, 2, {"law": "geometric", "mean": 2}], ids=["none", "2", "random"]
+    "act",
+    [
+        0,
+        2,
+        {
+            "law": "geometric",
+            "mean": 2,
+        },
+    ],
+    ids=["none", "2", "random"],
 )
 @pytest.mark.parametrize(
     ("motion", "agents"), [("instant", "3s"), ("polynomial", "1s"), ("polynomial", "3s")]

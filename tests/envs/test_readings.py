@@ -4,18 +4,13 @@ import pytest
 import torch
 from helpers import both_motions, everything, play, random_actions
 from sensor_cases import GLOBAL, LOCAL, SENSORS
-from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian import ClockConfig, DelayConfig, make_env
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 
 
-def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioConfig:
+def sensing(motion="instant", own=False, **changed):
     """Episodes without end, and readings in the actor's and the critic's observation and in the
     reward."""
     observation = ObservationConfig(
@@ -26,11 +21,10 @@ def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioCo
     return everything(motion, episode=EpisodeConfig(max_steps=None), **(sections | changed))
 
 
-def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
+def fly(scenario, n_steps=20):
     """The first output, and those after each of the same random actions."""
     env = make_env(scenario, 4, seed=1, extras=["message"])
-    generator = torch.Generator().manual_seed(0)
-    outputs = play(env, [random_actions(env.uav_env, generator) for _ in range(n_steps)])
+    outputs = play(env, [random_actions(env.uav_env) for _ in range(n_steps)])
     return [outputs[0], *outputs[1::2]]
 
 
@@ -49,7 +43,10 @@ def test_a_reward_term_reads_features_of_any_width_and_range(motion):
     "changed",
     [
         {},
-        {"delay": DelayConfig(obs=2, history=3), "clock": ClockConfig(agents="2s", server="2s")},
+        {
+            "delay": DelayConfig(obs=2, history=3),
+            "clock": ClockConfig(agents="2s", server="2s"),
+        },
         {"delay": DelayConfig(obs=2, history=1), "own": True},
     ],
 )

@@ -1,22 +1,18 @@
 """Settings of scenarios and arguments of ``make_env``: what is taken, and what is refused in one
 line."""
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 from helpers import square
 
+from damian import ClockConfig, make_env
 from damian.common.errors import InputError
 from damian.delays.config import LinkConfig
-from damian.envs.config import ClockConfig
-from damian.envs.pipeline import make_env
 from damian.server.config import ObservationConfig
-from damian.world.motion import MotionConfig
+from damian.world.config import MotionConfig
 
 OWN = ObservationConfig(own=True)
 BELIEF = ObservationConfig(belief=["belief_gain"])
-REFUSED: dict[str, Callable[[], Any]] = {
+REFUSED = {
     "observation.own: True does not go with clock.server": lambda: square(
         observation=OWN, clock=ClockConfig(server="2s")
     ),

@@ -10,19 +10,18 @@ from helpers import all_same, both_motions, everything, play, saved_and_loaded
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, StepCounter
 
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
+from damian import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.keys import ACTION
 
 
-def some(fast: str) -> pytest.MarkDecorator:
+def some(fast):
     """Every delay; all but the ``fast`` one are slow tests."""
     names = [pytest.param(n, marks=[] if n == fast else pytest.mark.slow) for n in DELAYS]
     return pytest.mark.parametrize("delays", names)
 
 
-def built(delays: str, motion: str, n_worlds: int = 4) -> DelayedEnv:
+def built(delays, motion, n_worlds=4):
     env = make_env(everything(motion, **DELAYS[delays]), n_worlds, extras=EXTRAS)
     env.append_transform(RewardSum())
     env.append_transform(StepCounter())

@@ -16,13 +16,10 @@ from helpers import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
+from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.keys import ACTION
 from damian.server.config import BUILT_IN
-from damian.world.landing import ActionConfig
+from damian.world.config import ActionConfig
 
 # Specs and TorchRL's rules.
 
@@ -30,15 +27,21 @@ from damian.world.landing import ActionConfig
 @both_motions
 def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
     delay = DelayConfig(
-        obs={"law": "burst"}, act={"law": "uniform", "low": 0, "high": 2}, rew=1, history=2
+        obs={"law": "burst"},
+        act={
+            "law": "uniform",
+            "low": 0,
+            "high": 2,
+        },
+        rew=1,
+        history=2,
     )
     scenario = everything(motion, delay=delay)
     skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
     td = skipping.reset()
     other = steady.reset()
-    generator = torch.Generator().manual_seed(0)
     for _ in range(6):
-        action = random_actions(steady.base_env, generator)
+        action = random_actions(steady.base_env)
         after = steady.step(other.clone().set(ACTION, action))["next"]
         for world in (0, 1):  # first the one, then the other
             mask = torch.arange(2) == world
@@ -62,7 +65,11 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
         agents=2,
         region=REGIONS[region],
         motion=MOTIONS[motion],
-        actions=ActionConfig(kind=kind, distances=[0.0, 60.0], headings=[0.0, 90.0, 180.0, 270.0]),
+        actions=ActionConfig(
+            kind=kind,
+            distances=[0.0, 60.0],
+            headings=[0.0, 90.0, 180.0, 270.0],
+        ),
     )
     check_env_specs(UavEnv(config, num_worlds=2), seed=0, break_when_any_done="both")
 
@@ -71,10 +78,7 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
 @both_motions
 def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_terms(motion, kind):
     env = UavEnv(everything(motion, kind), num_worlds=16)
-    generator = torch.Generator().manual_seed(0)
-    td = env.rollout(
-        40, lambda td: td.set(ACTION, random_actions(env, generator)), break_when_any_done=False
-    )
+    td = env.rollout(40, lambda td: td.set(ACTION, random_actions(env)), break_when_any_done=False)
     for name in ("observation", "global_observation"):
         observation = td["next", "agents", name]
         ways = 4 * (3 * env.server.observation.timeline + 3)  # of the timeline, which come last
@@ -84,7 +88,12 @@ def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_t
     assert set(terms.keys()) == {*BUILT_IN} - {"served"}
     rest = td["next", "agents", "reward"].squeeze(-1) - sum(terms.values())
     final = 1.0 * td["next", "success"] - 0.25 * (td["next", "done"] & ~td["next", "success"])
-    torch.testing.assert_close(rest, final.expand_as(rest), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        rest,
+        final.expand_as(rest),
+        atol=1e-5,
+        rtol=0,
+    )
     assert td["next", "done"].any()
 
 
@@ -93,8 +102,7 @@ def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_t
 
 def test_set_seed_repeats_a_rollout_and_worlds_and_episodes_differ():
     env = UavEnv(everything(), num_worlds=8)
-    generator = torch.Generator().manual_seed(0)
-    actions = [random_actions(env, generator) for _ in range(12)]
+    actions = [random_actions(env) for _ in range(12)]
 
     def rollout(seed):
         env.set_seed(seed)

@@ -2,9 +2,7 @@
 
 import importlib
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -14,7 +12,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
 
 
 @pytest.fixture
-def example(request, monkeypatch) -> ModuleType:
+def example(request, monkeypatch):
     """The module of the examples that a test module tests, test_NAME.py."""
     name = request.module.__name__.removeprefix("test_")
     monkeypatch.syspath_prepend(str(EXAMPLES))
@@ -22,7 +20,7 @@ def example(request, monkeypatch) -> ModuleType:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """An empty folder with a copy of the examples, from which programs are started."""
     shutil.copytree(
         EXAMPLES, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__")
@@ -32,10 +30,10 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.fixture
-def run(folder) -> Callable[..., Path]:
+def run(folder):
     """Run a program of the command with overrides; returns its run folder."""
 
-    def run_program(*overrides: str, program: str = "train", name: str = "run") -> Path:
+    def run_program(*overrides, program="train", name="run"):
         main([program, *overrides, f"hydra.run.dir={name}"])
         return folder / name
 

@@ -11,9 +11,8 @@ from helpers import SQUARE, check_refused, everything
 from damian import make_env
 from damian.common.errors import InputError
 from damian.runs.run_folder import read_results
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.world.regions.sources import RegionConfig
+from damian.server.config import ObservationConfig, RewardConfig
+from damian.world.config import RegionConfig
 
 LAW = ["delay.obs={law: law:Satellite, hop: 2s, extra: 0.3}"]
 LAW += ["delay.act={law: law:Distance, antenna: [0, 20], speed: 40, reach: 90}"]
@@ -112,7 +111,7 @@ def flipped(state, world):
 """
 
 
-def seen(name: str) -> dict[str, ObservationConfig]:
+def seen(name):
     return {"observation": ObservationConfig([f"lies:{name}"], [])}
 
 

@@ -1,38 +1,29 @@
 """The learnt belief: its attention and loss beside slow twins, what it may know, and that it
 learns."""
 
-from typing import Any
-
 import pytest
 import torch
 from helpers import FLYING, square, walking
-from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from damian import keys
-from damian.delays.config import DelayConfig
-from damian.envs.delayed_env import DelayedEnv
+from damian import DelayConfig, keys
 from damian.keys import next_key
 from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.runs.config import LoggerConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
-from damian.world.motion import MotionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import ActionConfig, MotionConfig
 
 NAME = "predictive_mappo:PredictiveMappoConfig"
 SMALL = MlpConfig(hidden=[16, 8])
 LATE = {"law": "uniform", "low": 0, "high": 3}
 
 
-def build(
-    example, kind: str = "discrete", flights: bool = False, act: int = 0, **learner
-) -> tuple[Any, DelayedEnv]:
+def build(example, kind="discrete", flights=False, act=0, **learner):
     """A learner of few prediction steps, and an environment whose messages are up to 3 steps late
     or lost."""
-    few: dict[str, Any] = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
+    few = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
     scenario = square(
         source=walking(),
         actions=ActionConfig(kind=kind),
@@ -56,12 +47,12 @@ def build(
 
 
 @torch.no_grad()
-def collected(learner: Any, env: DelayedEnv) -> TensorDictBase:
+def collected(learner, env):
     """A batch [4, 12] of the learner's actor."""
     return env.rollout(12, learner.actor, break_when_any_done=False)
 
 
-def encoding(example, *batch: int) -> tuple[Any, list[Tensor]]:
+def encoding(example, *batch):
     """An encoder, and an observation of 5, a timeline of 2 senders and 4 slots of 2 + 1, and 3
     codes of 4."""
     torch.manual_seed(1)
@@ -71,7 +62,7 @@ def encoding(example, *batch: int) -> tuple[Any, list[Tensor]]:
     return encoder, inputs
 
 
-def twin(encoder: Any, observation: Tensor, timeline: Tensor, code: Tensor) -> Tensor:
+def twin(encoder, observation, timeline, code):
     """The encoding of an observation [F], timeline [S, K, C] and code [E], by loops over
     messages."""
     rows = [
@@ -99,7 +90,12 @@ def test_the_attention_is_that_of_a_loop_over_heads_and_known_messages(example):
         for j in range(3):
             for q in range(3):
                 expected = twin(encoder, observation[i, j], history[i, j], codes[i, j, q])
-                torch.testing.assert_close(encoded[i, j, q], expected, atol=1e-5, rtol=1e-4)
+                torch.testing.assert_close(
+                    encoded[i, j, q],
+                    expected,
+                    atol=1e-5,
+                    rtol=1e-4,
+                )
 
 
 def test_targets_use_nothing_that_has_not_arrived_by_now(example):
@@ -128,7 +124,7 @@ def test_learning_to_predict_does_not_change_what_the_policy_has_done(example, k
     learner, env = build(example, kind)
     batch = collected(learner, env)
 
-    def log_prob() -> Tensor:
+    def log_prob():
         with set_recurrent_mode(True):
             return learner.actor.get_dist(batch.clone()).log_prob(batch[keys.ACTION])
 

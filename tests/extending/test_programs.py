@@ -51,7 +51,7 @@ class Reader(Reinforce):
 """
 
 
-def last_metrics(folder: Path) -> dict[str, str]:
+def last_metrics(folder):
     with (folder / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file))[-1]
 

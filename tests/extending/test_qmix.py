@@ -10,11 +10,10 @@ from helpers import everything, learning
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
-from damian import keys
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv, keys
 from damian.models.config import MlpConfig
 from damian.replay.time_storage import TimeStorage
-from damian.world.landing import ActionConfig
+from damian.world.config import ActionConfig
 
 
 def learner_of(example, env, **changed):
@@ -23,7 +22,7 @@ def learner_of(example, env, **changed):
     return config.make(env, learning(MlpConfig(hidden=[8]), worlds=4, **changed), buffer)
 
 
-@pytest.mark.parametrize("mixer", ["qmix", "vdn"])
+@pytest.mark.parametrize("mixer", ["qmix", pytest.param("vdn", marks=pytest.mark.slow)])
 def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run, mixer):
     words = [
         *TINY,

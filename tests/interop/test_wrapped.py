@@ -12,9 +12,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
-from damian import ObservationDelay, compose_scenario, keys
+from damian import ObservationDelay, compose_scenario, keys, make_env
 from damian.common.errors import InputError
-from damian.envs.pipeline import make_env
 from damian.interop import TASKS, UavGymEnv, UavVectorEnv
 from damian.interop.pettingzoo import UavParallelEnv
 
@@ -103,6 +102,7 @@ def test_pettingzoos_environment_does_what_torchrls_does():
     assert env.step({}) == ({}, {}, {}, {}, {})
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
 def test_every_world_of_the_vector_environment_equals_a_single_one(actions):
     options = {"overrides": [f"actions={actions}", "delay=paper", "episode.max_steps=5"]}

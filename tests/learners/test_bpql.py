@@ -4,31 +4,32 @@ since."""
 import pytest
 import torch
 from helpers import both_kinds, everything, learning
-from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian import keys
+from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
 from damian.learners.config import BpqlConfig
-from damian.learners.sac import Sac
 from damian.models.config import MlpConfig
-from damian.replay.backupdate import BackupdateStorage
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig
 
 SMALL = MlpConfig(hidden=[16])
 LONGEST = 5
 
 
-def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase, TensorDictBase]:
+def learnt(kind="discrete", steps=40):
     """A learner after several batches, all steps that it was given [B, T], and the last transitions
     drawn."""
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": LONGEST}, history=3)
+    delay = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 0,
+            "high": LONGEST,
+        },
+        history=3,
+    )
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, 1, extras=["message", "privileged"])
     env.append_transform(StepCounter())
@@ -42,7 +43,7 @@ def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase
     drawn = []
     update = learner.update
 
-    def recording(batch: TensorDictBase) -> TensorDictBase:
+    def recording(batch):
         drawn.append(batch.clone())
         return update(batch)
 
@@ -52,7 +53,7 @@ def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase
     return learner, flight, drawn[-1]
 
 
-def rows(before: TensorDictBase, after: TensorDictBase, state: str) -> Tensor:
+def rows(before, after, state):
     """What an update reads of each decision: the actor's observation, and a state, before and after
     it."""
     return torch.cat(

@@ -7,52 +7,33 @@ import math
 import pytest
 import torch
 from helpers import both_kinds, both_motions, everything, learning
-from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian import keys
+from damian import DelayConfig, ScenarioConfig, UavEnv, keys, make_env
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
-from damian.envs.uav_env import UavEnv
 from damian.learners.base import divergence
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.models.actor import make_actor
 from damian.models.config import MlpConfig
 from damian.models.critic import make_critic
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
-from damian.world.messages import Messages
-from damian.world.motion import MotionConfig
-from damian.world.regions.sources import RegionConfig
+from damian.server.config import EpisodeConfig, RewardConfig
+from damian.world.config import ActionConfig, MotionConfig, RegionConfig
 
 SMALL = MlpConfig(hidden=[16])
 REWARD = ("next", "agents", "reward")
 
 
-def scenario(**changes) -> ScenarioConfig:
+def scenario(**changes):
     region = RegionConfig(min_area=20_000, max_area=40_000, initial_conditions=16)
     return ScenarioConfig(**{"agents": 3, "region": region, **changes})
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_a_policy_made_for_three_uavs_works_with_ten(kind):
-    actions = ActionConfig(kind=kind)
-    actor = make_actor(UavEnv(scenario(actions=actions), 2), SMALL)
-    ten = UavEnv(scenario(agents=10, actions=actions), 2)
-    rollout = ten.rollout(4, actor)
-    assert rollout["agents", "action"].shape[:3] == (2, 4, 10)
-    assert rollout["agents", "action_log_prob"].shape == (2, 4, 10)
-
-
-def collect(motion: str, kind: str):
+def collect(motion, kind):
     """A batch with episodes of 9 steps, terminated in every other world and truncated in the
     others."""
     config = scenario(
@@ -108,10 +89,17 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
 # How back-updating changes the importance ratios of the first pass.
 
 
-def collect_delayed(kind: str) -> tuple[Mappo, TensorDictBase]:
+def collect_delayed(kind):
     """A learner with back-updating, and a batch of several episodes that its actor has flown under
     delay."""
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
+    delay = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 0,
+            "high": 5,
+        },
+        history=2,
+    )
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["message"])
     env.append_transform(StepCounter())
@@ -137,24 +125,6 @@ def test_with_backupdating_the_first_importance_ratios_are_one_as_actor_observat
     with torch.no_grad():
         log_prob = learner.actor.get_dist(corrected.clone()).log_prob(batch["agents", "action"])
     assert (log_prob - behaviour).abs().max() < 1e-4  # computed step by step, and in one batch
-
-
-def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():
-    learner, flight = collect_delayed("discrete")
-    undelayed = everything(episode=EpisodeConfig(max_steps=9))
-    learner.setup = learning(SMALL, 5)
-    server = make_env(undelayed, 4, seed=1).server
-    learnt = torch.cat([learner.backupdated_batch(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
-    assert learnt.shape[1] == len(flight[0]) - 5  # the first batch is shorter
-    settled = flight[:, :25]
-    assert learnt["agents", "action"].equal(settled["agents", "action"])
-    sent = settled["next", "agents", "message"]
-    steps = settled["next", "step_count"].squeeze(-1)
-    truth = server(Messages.unpack(sent), steps)
-    assert learnt["next", "agents", "global_observation"].equal(truth.global_observation)
-    assert not learnt["next", "agents", "global_observation"].equal(
-        settled["next", "agents", "global_observation"]
-    )
 
 
 def test_a_nan_counts_only_if_weights_are_wrong():

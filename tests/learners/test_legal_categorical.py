@@ -4,14 +4,13 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.modules import MaskedCategorical
 
 from damian.models.distribution import LegalCategorical
 
 
-def both(shape: tuple[int, ...], masked: bool) -> tuple[LegalCategorical, Categorical, Tensor]:
+def both(shape, masked):
     """Ours and the other one for random logits and legal actions, and the logits."""
     logits = (3 * torch.randn(*shape, 7)).requires_grad_()
     mask = torch.rand(*shape, 7) < 0.4

@@ -7,17 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import everything, learning
-from tensordict import TensorDictBase
-from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.multiagent import MAPPOLoss
 
-from damian import keys
+from damian import keys, make_env
 from damian.common.compiling import COMPILE_OPTIONS, compiled
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.learners.mappo import (
     LOSS_KEYS,
     Mappo,
@@ -29,8 +25,8 @@ from damian.learners.mappo import (
 )
 from damian.models.config import MlpConfig
 from damian.models.memory import RECURRENT_KEYS, add_recurrent_state
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import ActionConfig
 
 SMALL = MlpConfig(hidden=[16, 8])
 CONFIG = MappoConfig(clip_epsilon=0.1, entropy_coeff=0.3, critic_coeff=0.7)
@@ -45,7 +41,7 @@ CASES = {
 every_case = pytest.mark.parametrize("case", CASES)
 
 
-def flown(case: str, **setup) -> tuple[DelayedEnv, Mappo, TensorDictBase]:
+def flown(case, **setup):
     """A learner and a batch [4, 12] with advantages: several episodes of 9 steps, real flight
     times, and importance ratios within and beyond the clipping."""
     actions, model = CASES[case]
@@ -63,13 +59,13 @@ def flown(case: str, **setup) -> tuple[DelayedEnv, Mappo, TensorDictBase]:
     return env, learner, batch
 
 
-def loss_entries(learner: Mappo, batch: TensorDictBase) -> dict:
+def loss_entries(learner, batch):
     """What the loss reads of a batch [B, T]."""
     read = [*LOSS_KEYS, *learner.critic.in_keys, *RECURRENT_KEYS]
     return {key: value for key in read if (value := batch.get(key, None)) is not None}
 
 
-def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
+def torchrl_losses(learner, batch):
     """The terms of TorchRL's loss, averaged over decisions, or for the critic over all steps."""
     config = learner.config
     norm = copy.deepcopy(learner.critic.module.norm).float() if config.normalize_value else None
@@ -102,14 +98,14 @@ def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
     return torch.stack([*decided, terms["loss_critic"].mean()])
 
 
-def losses_of(learner: Mappo, batch: TensorDictBase, config: MappoConfig | None = None) -> Tensor:
+def losses_of(learner, batch, config=None):
     """The terms of our loss on all steps of a batch [B, T]."""
     entries = loss_entries(learner, batch)
     config = config or learner.config
     return mappo_losses(entries, learner.actor, learner.critic, config)[0]
 
 
-def with_gradients(learner: Mappo, losses: Tensor) -> tuple[Tensor, list[Tensor]]:
+def with_gradients(learner, losses):
     """Losses, and the gradient of each of them for every weight."""
     gradients = [
         torch.autograd.grad(loss, learner.weights, retain_graph=True, materialize_grads=True)
@@ -192,7 +188,7 @@ def test_values_are_those_of_two_passes_over_the_batch(case):
 def test_rewards_of_any_scale_teach_the_same_if_values_are_normalised(case, advantage):
     env, _, batch = flown(case)
 
-    def learnt(scale: float, normalize: bool) -> Tensor:
+    def learnt(scale, normalize):
         """The change of the actor's weights by two batches with scaled rewards."""
         torch.manual_seed(3)
         config = MappoConfig(

@@ -2,31 +2,25 @@
 good for."""
 
 import itertools
-from collections.abc import Iterator
 
 import pytest
 import torch
 from helpers import everything, learning
-from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import EnvBase, StepCounter
+from torchrl.envs import StepCounter
 
-from damian.delays.config import DelayConfig
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
+from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.envs.recompute import server_recompute
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
 from damian.models.actor import make_actor
 from damian.models.config import MlpConfig
 from damian.recipes.shared.learning import make_collector
-from damian.replay.backupdate import BackupdateStorage
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig
 
 GRU = MlpConfig(hidden=[16, 8], rnn="gru")
 ROUNDING = 3e-5
 """Largest difference between numbers that are computed step by step and in one batch."""
-OBSERVATION, ACTION = (("agents", name) for name in ("observation", "action"))
 
 both_kinds_and_motions = pytest.mark.parametrize(
     ("kind", "motion"),
@@ -34,9 +28,7 @@ both_kinds_and_motions = pytest.mark.parametrize(
 )
 
 
-def delayed_env(
-    kind: str = "discrete", motion: str = "instant", worlds: int = 4, **changed
-) -> DelayedEnv:
+def delayed_env(kind="discrete", motion="instant", worlds=4, **changed):
     """An environment with late messages, and episodes of 9 steps."""
     delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5})
     scenario = everything(
@@ -47,14 +39,14 @@ def delayed_env(
     return env
 
 
-def batches(env: EnvBase, actor: torch.nn.Module, steps: int, n: int) -> Iterator[TensorDictBase]:
+def batches(env, actor, steps, n):
     """Collect n consecutive batches [B, T]."""
     collector = make_collector(env, actor, env.batch_size.numel() * steps)
     yield from (batch.clone() for batch in itertools.islice(collector, n))
     collector.shutdown()
 
 
-def ratios(learner: Mappo, batch: TensorDictBase) -> torch.Tensor:
+def ratios(learner, batch):
     """Importance ratios in the loss, [B, T, N]."""
     return policy_terms(batch.clone(), learner.actor)[1].detach().exp()
 
@@ -98,7 +90,7 @@ def test_a_batch_from_the_replay_buffer_keeps_its_first_hidden_state(settle):
         corrected = learner.backupdated_batch(batch)
         flown = flight[:, begin : begin + corrected.shape[1]]
         assert corrected[HIDDEN_BEFORE].equal(flown[HIDDEN_BEFORE])
-        assert corrected[OBSERVATION].equal(flown[OBSERVATION])
+        assert corrected[keys.OBSERVATION].equal(flown[keys.OBSERVATION])
         assert (ratios(learner, corrected) - 1).abs().max() < ROUNDING
         begin += corrected.shape[1]
     assert begin == 30 - settle

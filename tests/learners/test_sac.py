@@ -7,25 +7,23 @@ import pytest
 import torch
 from helpers import everything, learning
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss
 
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv, make_env
 from damian.keys import OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.sac import Sac, SacConfig
 from damian.models.config import MlpConfig
 from damian.replay.time_storage import TimeStorage
-from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import ActionConfig
 
 SMALL = MlpConfig(hidden=[16])
 FAST = SacConfig(updates=2, batch_size=64, warm_up=0)
 
 
-def learner_of(env, config=FAST, settle=0, steps=200) -> Sac:
+def learner_of(env, config=FAST, settle=0, steps=200):
     torch.manual_seed(0)
     buffer = ReplayBuffer(storage=TimeStorage(steps * env.batch_size[0]))
     return Sac(env, config, learning(SMALL, settle), buffer)
@@ -89,14 +87,12 @@ class RecordingSac(Sac):
 
     drawn: tuple[TensorDictBase, ...] = ()
 
-    def update(self, drawn: TensorDictBase) -> TensorDictBase:
+    def update(self, drawn):
         self.drawn = (*self.drawn, drawn.clone())
         return super().update(drawn)
 
 
-def decision(
-    flight: TensorDictBase, world: int, begin: int, agent: int, last: int
-) -> Tensor | None:
+def decision(flight, world, begin, agent, last):
     """Transition of a UAV over a decision at step ``begin``, as a row of numbers (``ROW``).
 
     None if the UAV was not ready, or if the outcome is not known by the last step.
@@ -180,10 +176,19 @@ def test_steps_after_an_end_that_was_known_only_later_are_not_learnt_from():
     assert found == {tuple(row) for row in flight[OBSERVATION][:, 7].flatten(0, 1).tolist()}
 
 
-def recording_learner(env: UavEnv | None = None, **changed) -> RecordingSac:
+def recording_learner(env=None, **changed):
     """A learner that has made one update."""
     env = env or UavEnv(everything(kind="discrete"), 4)
-    config = SacConfig(**({"updates": 1, "batch_size": 64, "warm_up": 0} | changed))
+    config = SacConfig(
+        **(
+            {
+                "updates": 1,
+                "batch_size": 64,
+                "warm_up": 0,
+            }
+            | changed
+        )
+    )
     learner = RecordingSac(env, config, learning(SMALL), ReplayBuffer(storage=TimeStorage(100)))
     learner.learn(fly(env, learner.actor, 8))
     return learner

@@ -7,9 +7,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,8 +18,17 @@ from damian.recipes.train import main
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.metrics_log import MetricsLog
 
-TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "checkpoint_every=3"]
-TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]
+TINY = [
+    "worlds=4",
+    "learner.steps=8",
+    "eval_episodes=2",
+    "model.hidden=[8]",
+    "checkpoint_every=3",
+    "region.lattice_step=60",
+    "episode.max_steps=12",
+    "frames=256",
+    "logger=csv",
+]
 SAC = ["learner=sac", "learner.updates=1", "learner.batch_size=16", "learner.warm_up=40"]
 SAC += ["learner.buffer_steps=160"]
 FINISHED = {
@@ -40,11 +47,11 @@ class Killed(BaseException):
 
 
 @contextmanager
-def at_each_update(act: Callable[[MetricsLog], None]) -> Iterator[None]:
+def at_each_update(act):
     """Act when the run inside has logged an update."""
     add = MetricsLog.add
 
-    def add_and_act(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
+    def add_and_act(log, frames, numbers):
         add(log, frames, numbers)
         act(log)
 
@@ -54,10 +61,10 @@ def at_each_update(act: Callable[[MetricsLog], None]) -> Iterator[None]:
 
 
 @contextmanager
-def killed_after(rows: int) -> Iterator[None]:
+def killed_after(rows):
     """Stop the run inside when it has logged so many updates in all."""
 
-    def stop(log: MetricsLog) -> None:
+    def stop(log):
         if len(log.rows) == rows:
             raise Killed
 
@@ -66,18 +73,18 @@ def killed_after(rows: int) -> Iterator[None]:
 
 
 @contextmanager
-def counted_updates() -> Iterator[list[int]]:
+def counted_updates():
     """Count the updates that the run inside logs itself, without those of its checkpoint."""
     count = [0]
 
-    def add_one(_: MetricsLog) -> None:
+    def add_one(_):
         count[0] += 1
 
     with at_each_update(add_one):
         yield count
 
 
-def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
+def forked(words, prepare=lambda: None):
     """Start the recipe with words in a forked child, which needs no second for imports; returns its
     id."""
     child = os.fork()
@@ -108,7 +115,7 @@ def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
         os._exit(code)
 
 
-def ended(child: int, limit: float = 120.0) -> int:
+def ended(child, limit=120.0):
     """Wait for a child; returns its exit code, or minus the signal that killed it."""
     until = time.monotonic() + limit
     while time.monotonic() < until:
@@ -121,7 +128,7 @@ def ended(child: int, limit: float = 120.0) -> int:
     raise TimeoutError("the run did not end")
 
 
-def stored(folder: Path) -> dict[str, Tensor]:
+def stored(folder):
     """Every tensor of the checkpoint and of the best policy of a run, by path."""
     return {
         f"{name}.{path}": tensor
@@ -130,7 +137,7 @@ def stored(folder: Path) -> dict[str, Tensor]:
     }
 
 
-def leaves(value: object, path: str = "") -> Iterator[tuple[str, Tensor]]:
+def leaves(value, path=""):
     """Every tensor and number of nested dictionaries and lists, with its path."""
     if isinstance(value, dict):
         for key, each in value.items():
@@ -144,7 +151,7 @@ def leaves(value: object, path: str = "") -> Iterator[tuple[str, Tensor]]:
         yield path, torch.tensor(value, dtype=torch.float64)
 
 
-def check_equal(whole: Path, other: Path) -> None:
+def check_equal(whole, other):
     """Check that two runs have the same metrics, results, checkpoints and files, bit for bit."""
     for name in ("metrics.csv", "result.csv"):
         assert (other / name).read_bytes() == (whole / name).read_bytes(), name
@@ -159,6 +166,6 @@ def check_equal(whole: Path, other: Path) -> None:
     assert {str(path) for path in FINISHED} <= files(whole)
 
 
-def files(folder: Path) -> set[str]:
+def files(folder):
     """The files of a run folder."""
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}

@@ -54,9 +54,19 @@ def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path):
     subprocess.run([sys.executable, "-c", WITHOUT_DAMIAN], cwd=folder, check=True)
     for file in ("program.pt", "onnx.pt"):
         outputs = dict(zip(described["outputs"], torch.load(folder / file), strict=True))
-        torch.testing.assert_close(outputs["action"], rollout[keys.ACTION], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            outputs["action"],
+            rollout[keys.ACTION],
+            rtol=1e-4,
+            atol=1e-5,
+        )
         for name in {*outputs} - {"action", "probability"}:
-            torch.testing.assert_close(outputs[name], rollout["agents", name], rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(
+                outputs[name],
+                rollout["agents", name],
+                rtol=1e-4,
+                atol=1e-5,
+            )
         if "probability" in outputs:
             log_prob = (
                 outputs["probability"]

@@ -17,8 +17,16 @@ from stopped_runs import SAC
 from damian.common.errors import InputError
 from damian.recipes.command import main
 
-TINY = ["frames=64", "worlds=2", "learner.steps=16", "eval_episodes=2", "model.hidden=[4]"]
-TINY += ["region.lattice_step=90", "episode.max_steps=8", "learner.minibatches=1"]
+TINY = [
+    "frames=64",
+    "worlds=2",
+    "learner.steps=16",
+    "eval_episodes=2",
+    "model.hidden=[4]",
+    "region.lattice_step=90",
+    "episode.max_steps=8",
+    "learner.minibatches=1",
+]
 OFF_POLICY = [word for word in TINY if "minibatches" not in word] + SAC
 HERE = "hydra.run.dir=named"
 COMPARE = ["compare", "--config-dir=conf", "experiment=x", "seeds=1", HERE, f"overrides={TINY}"]
@@ -45,11 +53,11 @@ DOORS = {
 }
 """Ways to write in ``named``: whose finished folder each begins with, or none, and its words."""
 
-_written: set[str] | None = None
+_written = None
 """The paths that are written, made or removed while it is a set."""
 
 
-def _listen(event: str, arguments: tuple) -> None:
+def _listen(event, arguments):
     writes = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
     if _written is not None and (writes or event in ("os.mkdir", "os.rename", "os.remove")):
         paths = [each for each in arguments[:2] if isinstance(each, str | bytes | os.PathLike)]
@@ -59,7 +67,7 @@ def _listen(event: str, arguments: tuple) -> None:
 sys.addaudithook(_listen)  # none can be removed
 
 
-def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
+def contents(folder):
     """All below a folder, with the times of the last changes, since the same may be written
     again."""
     return {
@@ -80,13 +88,13 @@ def place(tmp_path_factory):
         patch.chdir(folder)
         patch.setattr(sys, "argv", [])
         Path("conf/experiment").mkdir(parents=True)
-        Path("conf/experiment/x.yaml").write_text(EXPERIMENT, encoding="utf-8")
-        Path("table.csv").write_text(TABLE, encoding="utf-8")
-        Path("log.csv").write_text(LOG, encoding="utf-8")
+        Path("conf/experiment/x.yaml").write_text(EXPERIMENT, "utf-8")
+        Path("table.csv").write_text(TABLE, "utf-8")
+        Path("log.csv").write_text(LOG, "utf-8")
         yield folder
 
 
-def begin(state: Path | None) -> Path:
+def begin(state):
     """The folder ``named`` as it is in a state; empty, and not there, without one."""
     named = Path("named")
     shutil.rmtree(named, ignore_errors=True)
@@ -95,7 +103,7 @@ def begin(state: Path | None) -> Path:
     return named
 
 
-def finished(door: str) -> tuple[Path, list[str]]:
+def finished(door):
     """A door's folder after a run without links, and what was written below it."""
     global _written  # noqa: PLW0603
     kept = Path("finished", door)
@@ -110,11 +118,11 @@ def finished(door: str) -> tuple[Path, list[str]]:
         below = [path for path in map(Path, sorted(_written)) if named in path.parents]
         _written = None
         shutil.copytree(named, kept)
-        told.write_text("\n".join(str(path.relative_to(named)) for path in below), encoding="utf-8")
-    return kept, told.read_text(encoding="utf-8").splitlines()
+        told.write_text("\n".join(str(path.relative_to(named)) for path in below), "utf-8")
+    return kept, told.read_text("utf-8").splitlines()
 
 
-def link(path: Path, original: Path, outside: Path, dangling: bool) -> None:
+def link(path, original, outside, dangling):
     """Put a link where a path was, or shall be, to a copy of the original outside, or to nothing
     there."""
     shutil.rmtree(outside, ignore_errors=True)

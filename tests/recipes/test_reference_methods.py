@@ -8,7 +8,6 @@ import torch
 from helpers import (
     KEEPS_GOING,
     MOTIONS,
-    all_same,
     both_kinds,
     both_motions,
     everything,
@@ -16,13 +15,10 @@ from helpers import (
     random_actions,
     square,
 )
-from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from twin import GLOBAL, LOCAL
 
-from damian.delays.config import DelayConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.pipeline import make_env
+from damian import ClockConfig, DelayConfig, make_env
 from damian.envs.uav_env import EXTRAS
 from damian.keys import PRIVILEGED_OBSERVATION as PRIVILEGED
 from damian.learners.config import MappoConfig, SacConfig
@@ -30,31 +26,28 @@ from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.server.config import ObservationConfig
-from damian.world.landing import ActionConfig
-from damian.world.signal_source import SourceConfig
+from damian.world.config import ActionConfig, SourceConfig
 from damian.world.state import Truth
 
 UNIFORM = {"law": "uniform", "low": 1, "high": 3, "probability": 0.3}
-BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.0}
+BURST = {
+    "law": "burst",
+    "enter": 0.2,
+    "leave": 0.3,
+    "bad": 4,
+    "bad_loss": 0.0,
+}
 LATE = {
     "delay": DelayConfig(obs=BURST, loss=0.3, history=2, rew=1),
     "clock": ClockConfig(server="2s"),
 }
 
 
-def rollout_of(scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS) -> list[TensorDictBase]:
+def rollout_of(scenario, extras=EXTRAS):
     """Outputs of the environment for random actions, which are the same at each call."""
     env = make_env(scenario, 4, extras=extras)
     generator = torch.Generator().manual_seed(3)
     return play(env, [random_actions(env.uav_env, generator) for _ in range(20)])
-
-
-@pytest.mark.sample(2)
-@both_motions
-@pytest.mark.parametrize(("obs", "longest"), [(UNIFORM, 3), (BURST, 4)], ids=["uniform", "burst"])
-def test_held_messages_arrive_as_with_a_constant_delay(obs, longest, motion):
-    held = rollout_of(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
-    assert all_same(held, rollout_of(everything(motion, delay=DelayConfig(obs=longest, history=2))))
 
 
 @both_motions
@@ -84,7 +77,12 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
         uavs = Truth.unpack(td["state"]).position[..., :2]
         from_centre = torch.tensor(position) - 100.0  # the middle of the square
         to_source = (from_centre - uavs) / (200 * math.sqrt(2))
-        torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            td[PRIVILEGED][..., -2:],
+            to_source,
+            atol=1e-6,
+            rtol=0,
+        )
 
 
 @both_kinds

@@ -12,9 +12,8 @@ import torch
 from helpers import check_refused, usecase
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch import Tensor
 
-from damian.envs.pipeline import make_env
+from damian import make_env
 from damian.models.actor import make_actor
 from damian.models.critic import make_critic
 from damian.recipes import evaluate
@@ -28,12 +27,12 @@ TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and 
 SAC = ["learner=sac", "learner.updates=2", "learner.batch_size=32", "learner.warm_up=100"]
 
 
-def metrics(folder: Path) -> list[dict[str, float]]:
+def metrics(folder):
     with (folder / "metrics.csv").open(newline="") as file:
         return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
 
 
-def weights(folder: Path, *names: str) -> dict[str, Tensor]:
+def weights(folder, *names):
     """Parameters of the named networks of a run, actor or critic."""
     config = stored_config(folder, "folder")
     env = make_env(config)
@@ -46,7 +45,7 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
+def trained(tmp_path_factory):
     """The folder of a trained run."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:

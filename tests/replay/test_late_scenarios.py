@@ -1,23 +1,17 @@
 """UAVs whose rewards are late too, or summed, or whose server has a slow clock: hindsight equals no
 delay."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from helpers import everything, random_actions, square
-from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from twin import GLOBAL, LOCAL
 
-from damian import keys
+from damian import ClockConfig, keys, make_env
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ClockConfig, ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
@@ -32,13 +26,13 @@ SUMMED = {"reward_window": 3, "reward_discount": 0.7}
 ENDS = ["success", "done", "terminated", "truncated"]
 
 
-def training_env(scenario: ScenarioConfig, n_worlds: int = WORLDS) -> DelayedEnv:
+def training_env(scenario, n_worlds=WORLDS):
     env = make_env(scenario, n_worlds, extras={"message", "reward_terms"})
     env.append_transform(StepCounter())
     return env
 
 
-def fly(env: DelayedEnv, n_steps: int = STEPS) -> TensorDictBase:
+def fly(env, n_steps=STEPS):
     """Steps [T, B] with random actions, the same at each call."""
     generator = torch.Generator().manual_seed(5)
     steps = []
@@ -50,7 +44,7 @@ def fly(env: DelayedEnv, n_steps: int = STEPS) -> TensorDictBase:
     return torch.stack(steps)
 
 
-def buffer_of(env: DelayedEnv, corrected: Sequence[str]) -> ReplayBuffer:
+def buffer_of(env, corrected):
     """A buffer in which late messages and rewards correct what is named."""
     late = env.delays.obs.late
     recompute = server_recompute(env.server, corrected, reward_terms=True) if late else None
@@ -62,14 +56,12 @@ def buffer_of(env: DelayedEnv, corrected: Sequence[str]) -> ReplayBuffer:
     )
 
 
-def in_order(buffer: ReplayBuffer) -> TensorDictBase:
+def in_order(buffer):
     """The stored steps in order of time, [T, B]."""
     return buffer.storage[buffer.storage.latest()]
 
 
-def backupdated(
-    scenario: ScenarioConfig, corrected: Sequence[str], n_worlds: int = WORLDS, n_steps: int = STEPS
-) -> tuple[TensorDictBase, TensorDictBase]:
+def backupdated(scenario, corrected, n_worlds=WORLDS, n_steps=STEPS):
     """Such steps as collected, and as corrected by all that has arrived after the last one,
     [T, B]."""
     env = training_env(scenario, n_worlds)
@@ -80,14 +72,14 @@ def backupdated(
     return late, in_order(buffer)
 
 
-REQUESTS: dict[str, Any] = {
+REQUESTS = {
     "source": SourceConfig(level_db=142.0),
     "requests": RequestConfig(rate=40.0, most=3),
     "observation": ObservationConfig(["served"], ["others", "requests"], own=True),
     "reward": RewardConfig(spotted=0.0, served=1.0),
 }
 UNSURE = SourceConfig(count=2, level_db=140.0, miss=0.4, false_alarm=0.3)
-CASES: dict[str, dict[str, Any]] = {
+CASES = {
     "late messages": {"delay": DelayConfig(obs=LATE)},
     "late messages, the same features for all": {
         "delay": DelayConfig(obs=LATE, history=2),
@@ -100,7 +92,6 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "late messages and rewards": {"delay": DelayConfig(obs=LATE, rew=LATE)},
     "late and summed rewards": {"delay": DelayConfig(rew=LATE, **SUMMED)},
-    "late rewards, slow server": {"delay": DelayConfig(rew=3), "clock": ClockConfig(server="2s")},
     "order of arrival": {
         "delay": DelayConfig(obs=LATE, rew=3, order="arrival", **SUMMED),
         "clock": ClockConfig(server="4s"),
@@ -108,10 +99,6 @@ CASES: dict[str, dict[str, Any]] = {
     "slow agents, history": {
         "delay": DelayConfig(obs=LATE, rew=LATE, history=2, **SUMMED),
         "clock": ClockConfig(server="2s", agents="4s"),
-    },
-    "late messages, timeline": {
-        "delay": DelayConfig(obs=LATE),
-        "observation": ObservationConfig(["spotted"], ["spotting_agents"], timeline=7),
     },
     "late messages of two stops, timeline": {
         "delay": DelayConfig(obs=LATE),
@@ -146,7 +133,15 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     case = CASES[name]
     motion = "polynomial" if name in FLYING else "instant"
     scenario = everything(motion, episode=EpisodeConfig(max_steps=9), **case)
-    on_time = replace(scenario, delay=replace(scenario.delay, obs=0, rew=0, order="generation"))
+    on_time = replace(
+        scenario,
+        delay=replace(
+            scenario.delay,
+            obs=0,
+            rew=0,
+            order="generation",
+        ),
+    )
     late_messages = scenario.make_delays().obs.late
     actor = scenario.links.kind == "server" and late_messages
     corrected = ["reward", "critic", *["actor"] * actor]
@@ -158,6 +153,7 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
     for key in [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]:
         assert found[key].equal(true[key]), key
     assert not late[next_key(keys.REWARD)].equal(true[next_key(keys.REWARD)])
+    assert found[keys.BACKUPDATED].any()
     if actor:
         n_features = true[keys.OBSERVATION].shape[-1] - 2 * scenario.delay.history
         for key in (keys.OBSERVATION, next_key(keys.OBSERVATION)):
@@ -222,16 +218,3 @@ def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happe
             assert ends[steps, b].tolist() == true_ends[: len(steps), b].tolist()
     assert (~corrected["valid"]).any()
     assert corrected["next", "done"][corrected["reset_after"]].all()
-
-
-def test_a_saved_storage_continues_in_the_same_way():
-    env = training_env(everything(episode=EpisodeConfig(max_steps=9), delay=DelayConfig(obs=LATE)))
-    late, (one, other) = fly(env), (buffer_of(env, ["reward", "critic"]) for _ in range(2))
-    one.extend(late[:25].transpose(0, 1))
-    other.load_state_dict(one.state_dict())
-    assert other.storage.latest().equal(one.storage.latest())
-    for buffer in (one, other):
-        buffer.extend(late[25:].transpose(0, 1))
-    original = in_order(one)
-    loaded = in_order(other)
-    assert all(original[key].equal(loaded[key]) for key in original.keys(True, True))

@@ -2,29 +2,33 @@
 is."""
 
 from helpers import square
-from tensordict import TensorDictBase
-from torch import Tensor
 
-from damian import keys
-from damian.delays.config import DelayConfig
+from damian import DelayConfig, keys
 from damian.keys import next_key
-from damian.learners.mappo import MappoConfig
+from damian.learners.config import MappoConfig
 from damian.models.config import MlpConfig
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, replay_buffer
 from damian.runs.config import LoggerConfig
-from damian.server.termination import EpisodeConfig
-from damian.world.motion import MotionConfig
+from damian.server.config import EpisodeConfig
+from damian.world.config import MotionConfig
 
 
-def truth(env, steps: TensorDictBase) -> Tensor:
+def truth(env, steps):
     """The rewards of steps [T, B], had all messages that were sent arrived at once, [T, B, N]."""
     sent = env.server.messages(steps[next_key(keys.MESSAGE)])
     return env.server(sent, steps["next", "step_count"].squeeze(-1)).reward
 
 
 def test_the_programs_learn_the_same_rewards_from_flights_in_any_order_of_arrival():
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, order="arrival")
+    delay = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 0,
+            "high": 4,
+        },
+        order="arrival",
+    )
     motion = MotionConfig(kind="polynomial", max_speed=10.0, max_acceleration=2.0)
     scenario = square(delay=delay, motion=motion, episode=EpisodeConfig(max_steps=60))
     config = TrainConfig(

@@ -13,7 +13,7 @@ B = 5
 N = 3
 
 
-def flags(seed: int):
+def flags(seed):
     """Random ``ready``, ``ready_next``, ``done`` and ``terminated`` that a rollout could have."""
     torch.manual_seed(seed)
     after = torch.rand(T, B, N) < 0.4
@@ -46,11 +46,17 @@ def test_decisions_are_those_that_a_loop_finds(seed):
     assert len(found) == len(expected) > 20
 
 
-def random_steps(seed: int) -> TensorDict:
+def random_steps(seed):
     """Random steps, as a ring buffer holds them whose oldest step lies at index 4."""
     torch.manual_seed(seed)
-    agents = {"action": torch.rand(T, B, N, 2), "observation": torch.rand(T, B, N, 4)}
-    after = {"observation": torch.rand(T, B, N, 4), "reward": torch.rand(T, B, N, 1)}
+    agents = {
+        "action": torch.rand(T, B, N, 2),
+        "observation": torch.rand(T, B, N, 4),
+    }
+    after = {
+        "observation": torch.rand(T, B, N, 4),
+        "reward": torch.rand(T, B, N, 1),
+    }
     ends = {key: torch.rand(T, B, 1) < 0.3 for key in ("done", "terminated")}
     return TensorDict({"agents": agents, "next": {"agents": after, **ends}}, [T, B])
 

@@ -16,7 +16,7 @@ from damian.runs.training_state import load_networks
 
 
 @pytest.fixture
-def file(tmp_path) -> Path:
+def file(tmp_path):
     path = tmp_path / "checkpoint.pt"
     write_checkpoint(path, {"components": {}, "training": {"weights": torch.arange(99)}})
     return path
@@ -26,9 +26,18 @@ def test_everything_that_states_consist_of_is_read_as_it_was(tmp_path):
     whole = torch.arange(1000.0)
     step = TensorDict({"done": torch.zeros(2, 1, dtype=torch.bool)}, [2])
     step["agents"] = TensorDict({"x": whole[:6].view(2, 3)}, [2, 3])
-    numbers = {"a": [1, 2.5, None, "text", True], "b": (np.float64(3.5), np.int64(4)), 7: b"bytes"}
+    numbers = {
+        "a": [1, 2.5, None, "text", True],
+        "b": (np.float64(3.5), np.int64(4)),
+        7: b"bytes",
+    }
     module = nn.BatchNorm1d(3)
-    content = {"step": step, **numbers, "module": module.state_dict(), "size": torch.Size([2])}
+    content = {
+        "step": step,
+        **numbers,
+        "module": module.state_dict(),
+        "size": torch.Size([2]),
+    }
     write_checkpoint(tmp_path / "x.pt", content)
     assert (
         tmp_path / "x.pt"
@@ -49,7 +58,7 @@ def test_what_a_checkpoint_cannot_store_is_refused_before_anything_is_written(fi
     assert file.read_bytes() == before
 
 
-def flipped(data: bytes) -> bytes:
+def flipped(data):
     """With one bit of a weight changed, which the file's checksum tells."""
     place = data.index(torch.arange(99).numpy().tobytes()[:80]) + 50
     return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
@@ -67,7 +76,7 @@ def test_a_damaged_file_is_refused_in_one_line_and_stays_as_it_is(file, damage):
 class Payload:
     """Makes a folder when it is unpickled."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
 
     def __reduce__(self):

@@ -3,43 +3,41 @@
 import math
 import time
 from statistics import fmean
-from typing import Any
 
 import pytest
 import torch
 from helpers import MOTIONS, both_motions, everything, square, walking
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, StepCounter
 
-from damian import keys
+from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.baselines.random import random_policy
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
 from damian.envs.nodes import EpisodeTotals
-from damian.envs.pipeline import make_env
 from damian.envs.recompute import server_recompute
-from damian.replay.backupdate import BackupdateStorage
 from damian.runs.checkpoint import plain
 from damian.runs.metrics import EpisodeLog, HindsightReturns, evaluation
 from damian.runs.metrics_log import MetricsLog, TensorBoard
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.server import Server
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
+from damian.world.config import SourceConfig
 from damian.world.messages import Messages
-from damian.world.signal_source import SourceConfig
 
 HORIZON = 24
-BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}
+BURSTS = {
+    "law": "burst",
+    "enter": 0.3,
+    "leave": 0.3,
+    "good": 0,
+    "bad": 5,
+    "bad_loss": 0.2,
+}
 DELAYS = {
     "bursts and losses": DelayConfig(obs=BURSTS, loss=0.1),
     "rewards and actions too": DelayConfig(obs=2, act=1, rew=2),
 }
 
 
-def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
+def joint_spotting(motion, delay, **changed):
     """Two of three UAVs must spot the source at the same time; it is near many of the landing
     points."""
     sections = {
@@ -57,7 +55,7 @@ def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioC
     return square(**(sections | changed))
 
 
-def fly(scenario: ScenarioConfig, n_worlds: int = 24) -> tuple[TensorDictBase, Server]:
+def fly(scenario, n_worlds=24):
     """A flight of the random policy, [B, HORIZON], and the server."""
     torch.manual_seed(1)
     env = make_env(scenario, n_worlds, seed=2, extras=["message"])
@@ -68,7 +66,7 @@ POOLED = ("age", "late", "lost")
 """Measures that are means over all messages, not over episodes."""
 
 
-def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
+def delays_by_hand(world, steps):
     """Ages of the messages held [steps], and whether each message sent is late or lost, in an
     episode."""
     agents = world["next", "agents"]
@@ -89,7 +87,7 @@ def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
     return delays
 
 
-def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[str, Any]:
+def episode_by_hand(world, server, needed):
     """Measures of the first episode of a flight [T], counted step by step."""
     row = {
         "perceived_return": 0.0,
@@ -116,7 +114,7 @@ def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[
     return row | delays_by_hand(world, t)
 
 
-def by_hand(flight: TensorDictBase, server: Server, needed: int) -> dict[str, float]:
+def by_hand(flight, server, needed):
     """The measures of an ``Evaluation`` by name."""
     rows = [episode_by_hand(world, server, needed) for world in flight]
     found = {name: fmean(row[name] for row in rows) for name in rows[0] if name not in POOLED}
@@ -138,7 +136,11 @@ def test_an_evaluation_equals_counting_step_by_step(motion, delay):
 @both_motions
 def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion):
     ends = EpisodeConfig(max_steps=9, success_share=0.3, discharged_share=0.6, end_with_source=True)
-    stops = everything(motion, episode=ends, source=walking(emission="per_step", after_walk="stop"))
+    stops = everything(
+        motion,
+        episode=ends,
+        source=walking(emission="per_step", after_walk="stop"),
+    )
     for scenario in (joint_spotting(motion, DelayConfig()), stops):
         flight, server = fly(scenario)
         row = evaluation(flight, server)
@@ -178,7 +180,7 @@ def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_o
 # Measures in training.
 
 
-def training_batch() -> TensorDictBase:
+def training_batch():
     env = make_env(
         joint_spotting(
             "instant", DelayConfig(), episode=EpisodeConfig(max_steps=7, success_share=0.6)
@@ -191,7 +193,7 @@ def training_batch() -> TensorDictBase:
     return env.rollout(40, random_policy(env), break_when_any_done=False)
 
 
-def ended_episodes(world: TensorDictBase) -> list[dict[str, float]]:
+def ended_episodes(world):
     """Return, success and steps of each ended episode of a world [T]."""
     total = 0.0
     steps = 0
@@ -238,14 +240,21 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_nothing_is_lost(loss):
-    late = DelayConfig(obs={"law": "uniform", "low": 1, "high": 4}, loss=loss)
+    late = DelayConfig(
+        obs={
+            "law": "uniform",
+            "low": 1,
+            "high": 4,
+        },
+        loss=loss,
+    )
     env = make_env(square(delay=late, episode=EpisodeConfig(max_steps=7)), 3, extras=["message"])
     server = env.server
     env.append_transform(EpisodeTotals())
     torch.manual_seed(0)
     data = env.rollout(44, break_when_any_done=False)
 
-    def make() -> HindsightReturns:
+    def make():
         return HindsightReturns(BackupdateStorage(72, server_recompute(server, ["reward"]), 4), 2)
 
     measured = make()
@@ -275,19 +284,6 @@ def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_no
             else:
                 assert found[world, t].isnan()
     assert (found.isnan().logical_not().sum(1) == 5).all()
-
-
-def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
-    log = MetricsLog(tmp_path)
-    log.add(10, {"loss": 2.0, "old": 3.0})
-    log.add(15, {"loss": 9.0, "old": 9.0})
-    log.sync()
-    log = MetricsLog(tmp_path, frames=10)
-    log.add(20, {"new": 4.0, "loss": 5.0})
-    log.add(30, {"loss": 6.0})
-    log.close()
-    lines = ["frames,loss,old,new", "10.0,2.0,3.0,nan", "20.0,5.0,nan,4.0", "30.0,6.0,nan,nan"]
-    assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
 
 
 def test_tensorboard_shows_numbers_up_to_where_a_run_resumed(tmp_path):

@@ -8,19 +8,16 @@ import torch
 from belief_twin import chance_at, emission_of
 from helpers import everything, square, walking
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv, feature, make_env
 from damian.server.belief import places, predict
 from damian.server.config import ObservationConfig
-from damian.server.features import feature
 from damian.server.features.belief import BELIEF_RINGS, BELIEF_SECTORS
 from damian.world.config import SourceConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
 
 
-def believing(own: bool = False, **changed) -> ScenarioConfig:
+def believing(own=False, **changed):
     observation = ObservationConfig(
         local_features=["spotted"], global_features=[], belief=ALL, own=own
     )
@@ -96,7 +93,12 @@ def test_moments_are_mean_spread_and_entropy(flown):
         x, y = messages.position[world, uav].tolist()
         expected = [(east - x) / scale, (north - y) / scale, math.sqrt(variance) / scale, entropy]
         found = features["belief_moments"][world, uav].view(2, 4)[source]
-        torch.testing.assert_close(found, torch.tensor(expected).clamp(-1, 1), rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(
+            found,
+            torch.tensor(expected).clamp(-1, 1),
+            rtol=1e-3,
+            atol=1e-4,
+        )
 
 
 def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
@@ -114,7 +116,12 @@ def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
             )
             expected[ring * BELIEF_SECTORS + sector] += p
         found = features["belief_map"][world, uav].view(2, -1)[source]
-        torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            found,
+            torch.tensor(expected),
+            rtol=1e-4,
+            atol=1e-5,
+        )
         assert found.sum().item() == pytest.approx(1, abs=1e-4)
 
 

@@ -17,7 +17,12 @@ shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
 
 
 @settings(max_examples=settings.default.max_examples // 2)
-@given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(1, 6), heard=shares, spots=shares)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_agents=st.integers(1, 6),
+    heard=shares,
+    spots=shares,
+)
 def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
     seed, n_agents, heard, spots
 ):
@@ -55,7 +60,12 @@ def test_the_actor_observes_the_age_of_the_uavs_message_and_the_critic_does_not(
     messages, server = messages_of(random_worlds(0, 3, 1.0, 0.5))
     delayed = messages._replace(time=server.now.unsqueeze(-1) - torch.tensor([0.0, 4.0, 25.0]))
     age = observe(delayed, server, ["age"])["age"]
-    torch.testing.assert_close(age, torch.tensor([0.0, 0.4, 1.0]).expand_as(age), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        age,
+        torch.tensor([0.0, 0.4, 1.0]).expand_as(age),
+        rtol=0,
+        atol=1e-5,
+    )
     config = ObservationConfig(["spotted"], ["source_time"], ctde=True, age=True)
     assert config.actor == ["spotted", "age"]
     assert config.critic == ["source_time", "spotted"]

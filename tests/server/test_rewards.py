@@ -77,5 +77,14 @@ def status_of(spots, empty=False, steps=5, over=False, **ends):
 def test_empty_batteries_or_the_end_of_the_sources_walk_terminate_without_success():
     ends = {"max_steps": 5, "discharged_share": 0.5}
     assert status_of([False, False], empty=True, **ends) == (False, True, False)
-    assert status_of([False], over=True, max_steps=5, end_with_source=True) == (False, True, False)
-    assert status_of([False], over=True, max_steps=None) == (False, False, False)
+    assert status_of(
+        [False],
+        over=True,
+        max_steps=5,
+        end_with_source=True,
+    ) == (False, True, False)
+    assert status_of(
+        [False],
+        over=True,
+        max_steps=None,
+    ) == (False, False, False)

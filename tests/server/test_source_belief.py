@@ -8,11 +8,9 @@ import pytest
 import torch
 from belief_twin import belief, chance_at
 from helpers import everything, square, walking
-from torch import Tensor
 
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv
 from damian.server.belief import (
-    SourceGrid,
     _advance,
     _begin,
     _parts,
@@ -22,14 +20,12 @@ from damian.server.belief import (
     empty_window,
     latest,
 )
-from damian.world.signal_source import SourceConfig
+from damian.world.config import SourceConfig
 
 LONGEST = 4
 
 
-def make_grid(
-    emission: float = 0.6, moves: bool = True, regions: int = 1, **detection: float
-) -> SourceGrid:
+def make_grid(emission=0.6, moves=True, regions=1, **detection):
     """A small grid, over one or several regions."""
     emits = {"emission": "per_step", "emission_probability": emission, **detection}
     airspace = UavEnv(square() if regions == 1 else everything()).simulation.airspace
@@ -90,20 +86,20 @@ every_grid = pytest.mark.parametrize("grid", grids.values(), ids=grids)
 class Flight:
     """Random reports with random delays, in worlds that begin new episodes and pause at random."""
 
-    def __init__(self, grid: SourceGrid, n_worlds: int, own: bool, seed: int = 0) -> None:
+    def __init__(self, grid, n_worlds, own, seed=0):
         self.grid = grid
         self.rng = np.random.default_rng(seed)
         self.n_agents = 3
         self.window = empty_window(grid, LONGEST, n_worlds, self.n_agents, own)
         self.region = self.draw(len(grid.prior), n_worlds)
-        self.steps: list[list] = [[] for _ in range(n_worlds)]
+        self.steps = [[] for _ in range(n_worlds)]
         self.first = torch.zeros(n_worlds, self.n_agents, dtype=torch.long)
         self.begin(torch.ones(n_worlds, dtype=torch.bool))
 
-    def draw(self, below: int, *shape: int) -> Tensor:
+    def draw(self, below, *shape):
         return torch.as_tensor(self.rng.integers(below, size=shape))
 
-    def rows(self) -> Tensor:
+    def rows(self):
         """Reports from landing points of the world's own region; some UAVs send none."""
         per_region = (len(self.grid.log_reports) - 1) // 4 // len(self.grid.prior)
         shape = (len(self.region), self.n_agents)
@@ -111,14 +107,14 @@ class Flight:
         row = 2 * point + (self.draw(3, *shape) == 0)
         return torch.where(self.draw(5, *shape) == 0, self.grid.no_report, row)
 
-    def begin(self, mask: Tensor) -> None:
+    def begin(self, mask):
         new = self.rows()
         self.first = torch.where(mask.unsqueeze(-1), new, self.first)
         _begin(*_parts(self.grid, self.window), new, self.region, mask)
         for world in mask.nonzero().squeeze(-1).tolist():
             self.steps[world] = []
 
-    def step(self, stepped: Tensor) -> None:
+    def step(self, stepped):
         rows = self.rows()
         delay = self.draw(LONGEST + 2, *self.first.shape) - 1
         slot, *_ = _advance(*_parts(self.grid, self.window), rows, delay, self.region, stepped)
@@ -126,7 +122,7 @@ class Flight:
         for world in stepped.nonzero().squeeze(-1).tolist():
             self.steps[world].append((rows[world].tolist(), delay[world].tolist()))
 
-    def check(self) -> None:
+    def check(self):
         """Compare the beliefs of all receivers with the slow twin's."""
         server, own = latest(self.window, self.window.slot)
         for world, steps in enumerate(self.steps):

@@ -6,9 +6,7 @@ import pytest
 import shapely
 import torch
 
-from damian import keys, make_env
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
+from damian import DelayConfig, ScenarioConfig, keys, make_env
 from damian.server.config import ObservationConfig
 from damian.server.features.coverage import RINGS, SECTORS
 from damian.server.features.others import OTHERS

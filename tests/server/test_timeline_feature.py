@@ -6,13 +6,10 @@ import itertools
 import pytest
 import torch
 
-from damian import keys, make_env
+from damian import ScenarioConfig, keys, make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.config import ScenarioConfig
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import RegionConfig, RequestConfig, SourceConfig
 
 SLOTS = 4
@@ -22,12 +19,21 @@ QUIET = RequestConfig(rate=0.0)
 CASES = {
     "no delay": {},
     "delays beyond the slots, losses": {"delay": DelayConfig(obs=UNIFORM, loss=0.2)},
-    "held back": {"delay": DelayConfig(obs={"law": "uniform", "low": 0, "high": 2}, hold="max")},
+    "held back": {
+        "delay": DelayConfig(
+            obs={
+                "law": "uniform",
+                "low": 0,
+                "high": 2,
+            },
+            hold="max",
+        )
+    },
     "links": {"links": LinkConfig("matrix", delay=UNIFORM, loss=0.2)},
 }
 
 
-def scenario(own: bool = True, stops: int | None = None, **changed) -> ScenarioConfig:
+def scenario(own=True, stops=None, **changed):
     """UAVs that move at once and observe their own places and the timeline, in short episodes."""
     sections = {
         "agents": AGENTS,

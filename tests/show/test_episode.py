@@ -7,19 +7,13 @@ import numpy as np
 import pytest
 from episodes import flight
 
-from damian import keys
+from damian import DelayConfig, ScenarioConfig, keys, make_env
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.server.config import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.show.episode import COLUMNS, Episode, record
-from damian.world.config import BatteryConfig
+from damian.world.config import BatteryConfig, SourceConfig
 from damian.world.regions.region import local_places
-from damian.world.signal_source import SourceConfig
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +22,14 @@ def flown():
     source = SourceConfig(motion="dynamic", emission="per_step", emission_probability=0.5)
     scenario = ScenarioConfig(
         source=source,
-        delay=DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, loss=0.2),
+        delay=DelayConfig(
+            obs={
+                "law": "uniform",
+                "low": 0,
+                "high": 4,
+            },
+            loss=0.2,
+        ),
         observation=ObservationConfig(belief=["belief_moments"]),
         episode=EpisodeConfig(max_steps=25),
     )

@@ -11,14 +11,12 @@ import torch
 from geojson_pydantic import FeatureCollection
 from shapely.geometry import shape
 
+from damian import DelayConfig, ScenarioConfig, make_env
 from damian.baselines.random import random_policy
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
 from damian.server.config import ObservationConfig
 from damian.show.episode import record
+from damian.world.config import RegionConfig
 from damian.world.regions.geodesy import to_local
-from damian.world.regions.sources import RegionConfig
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "geojson_episode.py"
 
@@ -42,7 +40,7 @@ def episode():
 feature_collection = runpy.run_path(str(EXAMPLE))["feature_collection"]
 
 
-def local(feature: dict, origin: tuple[float, float]) -> np.ndarray:
+def local(feature, origin):
     """Corners of a feature's geometry in local metres, [C, 2]."""
     degrees = shapely.get_coordinates(shape(feature["geometry"]))
     return np.column_stack(to_local(degrees[:, 1], degrees[:, 0], origin))

@@ -14,9 +14,8 @@ import shapely
 from chromium import chromium, problems, resize
 from episodes import NO_SOURCE, SQUARE, crowd, flight
 
-from damian import compose_scenario
+from damian import compose_scenario, make_env
 from damian.baselines.random import random_policy
-from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.show.episode import record
 from damian.show.replay_page import save_page
@@ -280,7 +279,11 @@ def test_a_drag_shows_a_part_of_the_time_which_follows_the_present(opened):
 
 def test_rows_of_many_uavs_scroll_and_show_shares_of_a_long_time(opened):
     with opened(
-        crowd(300, cells=np.array([[-9.0, 0], [9, 0]]), belief=np.full((301, 1, 2), 0.5))
+        crowd(
+            300,
+            cells=np.array([[-9.0, 0], [9, 0]]),
+            belief=np.full((301, 1, 2), 0.5),
+        )
     ) as page:
         assert (page.shown("belief"), page.one(".scale").is_displayed()) == ("belief 1.0 bit", True)
         notes = [page.one(".note").text, page.press("t") or page.one(".note").text]

@@ -64,7 +64,11 @@ def test_a_page_is_small_and_loads_nothing():
     steps = 150
     cells = 256
     belief = rng.dirichlet(np.ones(cells), (steps + 1, 1))
-    ordinary = flight(steps, cells=rng.uniform(-200, 200, (cells, 2)), belief=belief)
+    ordinary = flight(
+        steps,
+        cells=rng.uniform(-200, 200, (cells, 2)),
+        belief=belief,
+    )
     text = page([ordinary])
     assert len(text.encode()) < 2_000_000
     parts = Parts(text)

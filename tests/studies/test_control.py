@@ -6,12 +6,11 @@ from control import Task, draw, make_env, make_learner, train
 from tqdm import tqdm
 
 from damian import keys, set_seed
-from damian.learners.sac import Sac
 
 DELAY = 3
 
 
-def trained(task: Task, bpql: bool) -> Sac:
+def trained(task, bpql):
     """The learner of a method after 20 steps with random actions."""
     torch.manual_seed(0)
     env = make_env(task)

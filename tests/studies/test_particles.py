@@ -12,16 +12,14 @@ from damian import keys
 WORLDS = 12
 
 
-def crowded(env: SimpleSpread) -> None:
+def crowded(env):
     """Begin episodes in which bodies often touch each other and landmarks lie among them."""
     env.reset()
     env.position = 0.4 * env.position
     env.landmarks = 0.4 * env.landmarks
 
 
-def as_in_mpe2(
-    env: SimpleSpread, theirs, world: int, actions: torch.Tensor
-) -> dict[str, np.ndarray | list[float]]:
+def as_in_mpe2(env, theirs, world, actions):
     """What mpe2 makes of a world's state and actions: the next state, observations and rewards."""
     theirs.reset(seed=0)
     state = theirs.unwrapped.world
@@ -76,7 +74,13 @@ def test_every_step_is_that_of_mpe2(game):
         }
         for key, values in found.items():
             twin = np.stack([world[key] for world in expected])
-            np.testing.assert_allclose(values.numpy(), twin, atol=1e-5, rtol=1e-5, err_msg=key)
+            np.testing.assert_allclose(
+                values.numpy(),
+                twin,
+                atol=1e-5,
+                rtol=1e-5,
+                err_msg=key,
+            )
         touching += sum(
             int((torch.pdist(places) < 2 * env.size[0]).sum()) for places in env.position
         )

@@ -7,8 +7,6 @@ import spread
 import torch
 from particles import AGES, DELAYS, HELD, HORIZON, KINEMATICS, SEEN
 from spread import METHODS, SLOTS, make_env, make_learner
-from tensordict import TensorDictBase
-from torch import Tensor
 
 from damian import keys, set_seed
 from damian.models.config import MlpConfig
@@ -17,7 +15,7 @@ WORLDS = 3
 LATE = (3, 9)
 
 
-def flown(method: str) -> TensorDictBase:
+def flown(method):
     """Two episodes of a method whose agents act at random, [T, B]."""
     torch.manual_seed(0)
     env = make_env(METHODS[method], WORLDS, LATE, 9)
@@ -26,24 +24,24 @@ def flown(method: str) -> TensorDictBase:
 
 
 @pytest.fixture(scope="module")
-def steps() -> TensorDictBase:
+def steps():
     return flown("registered+backupdate")
 
 
-def sent(steps: TensorDictBase, t: int) -> tuple[Tensor, Tensor]:
+def sent(steps, t):
     """Messages [B, 15, 2] and delays [B, 15] of the ``t``-th observation of the first episode."""
     if t == 0:
         return steps[SEEN][0], torch.zeros(WORLDS, 15, dtype=torch.long)
     return steps["next", *SEEN][t - 1], steps["next", *DELAYS][t - 1].squeeze(-1)
 
 
-def newest(steps: TensorDictBase, t: int, world: int, block: int) -> int:
+def newest(steps, t, world, block):
     """When the newest message of a block was sent that has arrived by the ``t``-th observation."""
     arrived = [g for g in range(t + 1) if g + int(sent(steps, g)[1][world, block]) <= t]
     return max(arrived)
 
 
-def at(steps: TensorDictBase, t: int, key) -> Tensor:
+def at(steps, t, key):
     """An entry of the ``t``-th observation of the first episode."""
     return steps[key][t] if t < HORIZON else steps["next", *key][t - 1]
 
@@ -62,7 +60,7 @@ def test_each_block_is_late_by_itself_and_agents_begin_with_what_they_see_at_the
     assert steps["next", *keys.DELAY].squeeze(-1).equal(delays.view(-1, WORLDS, 3, 5).amax(-1))
 
 
-def way(steps: TensorDictBase, t: int, then: int, world: int, agent: int, other: int) -> Tensor:
+def way(steps, t, then, world, agent, other):
     """The way from where an agent is at the ``t``-th observation to where another one was ``then``,
     [2]."""
     return (
@@ -93,13 +91,13 @@ def test_what_is_registered_stands_where_it_was_as_seen_from_where_the_agent_is_
 
 
 @pytest.fixture
-def small(monkeypatch) -> None:
+def small(monkeypatch):
     """Few worlds and small networks."""
     monkeypatch.setattr(spread, "WORLDS", 4)
     monkeypatch.setattr(spread, "MODEL", MlpConfig(hidden=[8]))
 
 
-def corrected(method: str) -> list[TensorDictBase]:
+def corrected(method):
     """What the learner of a method learns from, [B, T] each, and [B, T, N, 4 + C + N] for its
     critic."""
     env = make_env(METHODS[method], 4, LATE, 9)

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from delay_twin import ACTION
-from tensordict import TensorDictBase
 from torchrl.data import (
     Binary,
     Bounded,
@@ -11,12 +10,11 @@ from torchrl.data import (
     Composite,
     MultiOneHot,
     OneHot,
-    TensorSpec,
     Unbounded,
 )
 from torchrl.envs import EnvBase, TransformedEnv
 
-from damian.transforms import ActionDelay, ActionHistory
+from damian import ActionDelay, ActionHistory
 
 GROUP = (3, 2)
 """Worlds, and agents in each of them."""
@@ -25,38 +23,38 @@ GROUP = (3, 2)
 class Plain(EnvBase):
     """Three worlds of two agents, whose actions, of any spec [3, 2, ...], have no effect."""
 
-    def __init__(self, action: TensorSpec) -> None:
+    def __init__(self, action):
         super().__init__(batch_size=torch.Size(GROUP[:1]))
         self.action_spec = self._agents(action=action)
         self.observation_spec = self._agents(observation=Unbounded((*GROUP, 4)))
         self.reward_spec = self._agents(reward=Unbounded((*GROUP, 1)))
 
-    def _agents(self, **specs: TensorSpec) -> Composite:
+    def _agents(self, **specs):
         return Composite(agents=Composite(**specs, shape=GROUP), shape=self.batch_size)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+    def _reset(self, tensordict=None, **_):
         return self.observation_spec.zero()
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(self, tensordict):
         return (
             self.observation_spec.zero()
             .update(self.full_reward_spec.zero())
             .update(self.full_done_spec.zero())
         )
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed):
         """The environment has no randomness."""
 
 
 HISTORY = ("agents", "action_history")
 
 
-def numbered(first: int) -> torch.Tensor:
+def numbered(first):
     """Different whole numbers for each number of an action, [3, 2, 2]."""
     return first + torch.arange(12).view(*GROUP, 2)
 
 
-RANGES: dict[str, tuple[TensorSpec, torch.Tensor, torch.Tensor]] = {
+RANGES = {
     "different numbers": (
         Bounded(-numbered(3).double(), numbered(5).double(), (*GROUP, 2), dtype=torch.float64),
         -numbered(3),

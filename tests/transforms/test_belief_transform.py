@@ -1,34 +1,27 @@
 """The transform ``Belief`` in an environment, and back-updated beliefs, against the slow twin."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 from belief_twin import belief
 from delayed_envs import PAPER
 from helpers import square, walking
-from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
-from damian import keys
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
+from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.envs.recompute import server_recompute
-from damian.replay.backupdate import BackupdateStorage
-from damian.server.belief import SourceGrid, build_source_grid
+from damian.server.belief import build_source_grid
 from damian.server.config import ObservationConfig
-from damian.world.messages import Messages
-from damian.world.motion import MotionConfig
+from damian.world.config import MotionConfig
 from damian.world.signal_source import footprint_radius
 
 LONGEST = 7
 
 
-def tracking(law: object = PAPER, own: bool = False, **changed) -> ScenarioConfig:
+def tracking(law=PAPER, own=False, **changed):
     """A moving, intermittent source in a small square, with a coarse grid, which the slow twin can
     bear."""
     return square(
@@ -39,21 +32,19 @@ def tracking(law: object = PAPER, own: bool = False, **changed) -> ScenarioConfi
     )
 
 
-def rollout(env: DelayedEnv, steps: int = 14) -> TensorDictBase:
+def rollout(env, steps=14):
     """Steps [B, T] over the ends of several episodes."""
     return env.rollout(steps, break_when_any_done=False)
 
 
-def episodes(data: TensorDictBase) -> list[tuple[int, int]]:
+def episodes(data):
     """First and last step of each episode of one world [T]."""
     ends = data["next", "done"].flatten().nonzero().flatten().tolist()
     begins = [0, *(end + 1 for end in ends)]
     return [(a, b) for a, b in zip(begins, [*ends, len(data) - 1], strict=False) if a <= b]
 
 
-def expected(
-    env: DelayedEnv, data: TensorDictBase, begin: int, end: int, now: int, viewer: int | None = None
-):
+def expected(env, data, begin, end, now, viewer=None):
     """The slow twin's beliefs after step ``end`` of an episode that begins at ``begin``, of one
     world [T].
 
@@ -73,20 +64,29 @@ def expected(
     return torch.tensor(found)
 
 
-def grids_of(env: DelayedEnv) -> list[SourceGrid]:
+@cache
+def grids_of(env):
     """The tables of each source alone."""
     simulation = env.uav_env.simulation
     of_each = [(each, footprint_radius(each)) for each in simulation.sources]
-    return [build_source_grid(simulation.airspace, *each, dt=1.0, cell=50.0) for each in of_each]
+    return [
+        build_source_grid(
+            simulation.airspace,
+            *each,
+            dt=1.0,
+            cell=50.0,
+        )
+        for each in of_each
+    ]
 
 
-def rows_of(grid: SourceGrid, messages: Messages, source: int) -> Tensor:
+def rows_of(grid, messages, source):
     """Rows of what messages report of a source, [*, N]."""
     spots = messages.detected_time[..., source] == messages.time
     return torch.where(messages.in_flight, grid.no_report, 2 * messages.trail[..., 0] + spots)
 
 
-def check(actual: Tensor, wanted: Tensor) -> None:
+def check(actual, wanted):
     torch.testing.assert_close(actual, wanted, rtol=2e-3, atol=1e-5)
 
 

@@ -1,33 +1,25 @@
 """Messages between agents do what an obvious program does, which follows one link at a time."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
 
 import pytest
 import torch
 from delay_twin import Counting, drawn
 from environments import vmas
-from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
+from damian import Channel, ContextSampler
 from damian.common import counter_rng
 from damian.delays.laws import Burst, Law, Trace, Uniform, law_of, sampler_of
-from damian.delays.samplers import ContextSampler, MessageContext
-from damian.transforms import Channel
 
 N = 3
 WORLDS = [3, 5, 8]
 STEPS = 25
 CLOCKS = 2 * STEPS + 2
 ALL = set(permutations(range(N), 2))
-
-Link = tuple[int, int]
-"""Receiver and sender."""
 
 
 class World:
@@ -42,11 +34,11 @@ class World:
 
     def __init__(
         self,
-        n_agents: int,
-        delay: Callable[[int, Link], int | None],
-        known: bool = False,
-        own_at_reset: bool = True,
-    ) -> None:
+        n_agents,
+        delay,
+        known=False,
+        own_at_reset=True,
+    ):
         self.agents = range(n_agents)
         self.delay = delay
         self.known = known
@@ -54,7 +46,7 @@ class World:
         self.clock = 0
         self.began = 0
 
-    def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
+    def step(self, contents, wanted, begins=False):
         """Send on the wanted links, and receive."""
         self.clock += 1
         if begins:
@@ -73,7 +65,7 @@ class World:
             }
         self.own = contents
 
-    def seen(self, receiver: int, sender: int, zeros: Any) -> tuple[Any, int, bool]:
+    def seen(self, receiver, sender, zeros):
         """Content and age of what a receiver holds of a sender, and whether it holds anything."""
         since = self.clock - self.began
         if receiver == sender:
@@ -84,17 +76,13 @@ class World:
         return content, self.clock - sent, True
 
 
-Wants = Callable[[TensorDictBase, TensorDictBase | None, int], Collection[Link]]
-"""The links on which a world wants to send, from the outputs, from the inputs (None at a reset)."""
-
-
 def check_against_twin(
-    env: TransformedEnv,
-    make: Callable[[int, Tensor], World],
-    wants: Wants,
-    forced: Callable[[int], list[int]] = lambda _: [],
-    sent: Any = ("agents", "observation"),
-) -> None:
+    env,
+    make,
+    wants,
+    forced=lambda _: [],
+    sent=("agents", "observation"),
+):
     """Compare every output of a rollout with partial resets with that of the twins.
 
     Args:
@@ -109,7 +97,7 @@ def check_against_twin(
     worlds = range(env.batch_size[0])
     twins = [make(b, env.transform[-1].memory["streams"]) for b in worlds]
 
-    def follow(outputs: TensorDictBase, inputs: TensorDictBase | None, mask: list[bool]) -> None:
+    def follow(outputs, inputs, mask):
         source = outputs if sent in outputs.keys(True) else inputs
         for b in worlds:
             if mask[b]:
@@ -131,7 +119,7 @@ def check_against_twin(
             follow(td, None, mask)
 
 
-def assert_same(twin: World, outputs: TensorDictBase) -> None:
+def assert_same(twin, outputs):
     """The messages that each agent has received from each other one are those of the twin."""
     got = [
         outputs["agents", name].tolist() for name in ("received", "received_age", "received_mask")
@@ -142,31 +130,29 @@ def assert_same(twin: World, outputs: TensorDictBase) -> None:
             assert tuple(part[i][j] for part in got) == tuple(twin.seen(i, j, zeros)), (i, j)
 
 
-def table(
-    law: Any, streams: Tensor, n_steps: int, loss: float = 0.0
-) -> Callable[[int, int], int | None]:
+def table(law, streams, n_steps, loss=0.0):
     """The delay that a law draws at a clock for a row; None if the message is lost."""
     sampler = sampler_of(law_of(law), loss=loss)
     delays = drawn(sampler, streams, n_steps).tolist()
     return lambda clock, row: None if (d := delays[clock - 1][row]) == sampler.lost else d
 
 
-def counting(channel: Channel, **options: Any) -> TransformedEnv:
+def counting(channel, **options):
     channel.set_seed(1)
     return TransformedEnv(Counting(WORLDS, N, **options), Compose(channel))
 
 
-def everyone(*_: Any) -> set:
+def everyone(*_):
     return ALL
 
 
-def twin_of(law: Any, loss: float = 0.0, **rules: Any) -> Callable[[int, Tensor], World]:
+def twin_of(law, loss=0.0, **rules):
     """Makes twins whose links all have one law."""
 
-    def make(b: int, streams: Tensor) -> World:
+    def make(b, streams):
         delays = table(law, streams, CLOCKS, loss)
 
-        def delay(clock: int, link: tuple) -> int | None:
+        def delay(clock, link):
             return delays(clock, b * N * N + link[0] * N + link[1])
 
         return World(N, delay, **rules)
@@ -174,7 +160,20 @@ def twin_of(law: Any, loss: float = 0.0, **rules: Any) -> Callable[[int, Tensor]
     return make
 
 
-@pytest.mark.parametrize("law", [0, 2, Uniform(1, 4), Burst(0.3, 0.4, good=Uniform(0, 2), bad=5)])
+@pytest.mark.parametrize(
+    "law",
+    [
+        0,
+        2,
+        Uniform(1, 4),
+        Burst(
+            0.3,
+            0.4,
+            good=Uniform(0, 2),
+            bad=5,
+        ),
+    ],
+)
 @pytest.mark.parametrize("known", [False, True])
 def test_messages_arrive_as_their_law_says(law, known):
     env = counting(Channel(law, loss=0.2, known_at_reset=known))
@@ -182,9 +181,14 @@ def test_messages_arrive_as_their_law_says(law, known):
 
 
 def test_a_flag_chooses_who_sends():
-    channel = Channel(Uniform(0, 3), sent_key="message_sent", loss=0.1, known_at_reset=True)
+    channel = Channel(
+        Uniform(0, 3),
+        sent_key="message_sent",
+        loss=0.1,
+        known_at_reset=True,
+    )
 
-    def wants(outputs: Any, _: Any, b: int) -> set:
+    def wants(outputs, _, b):
         sent = outputs["agents", "message_sent"][b]
         return {(i, j) for i, j in ALL if sent[j]}
 
@@ -201,10 +205,10 @@ def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
     losses = [[0.0, 0.3, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 1.0]]
     losses[2][1] = 0.5
 
-    def make(b: int, streams: Tensor) -> World:
+    def make(b, streams):
         tables = {link: table(laws[link[0]][link[1]], streams, CLOCKS) for link in ALL}
 
-        def delay(clock: int, link: tuple) -> int | None:
+        def delay(clock, link):
             row = b * N * N + link[0] * N + link[1]
             draw = counter_rng.uniform(streams[row], torch.tensor(clock), torch.tensor(3))
             return None if draw < losses[link[0]][link[1]] else tables[link](clock, row)
@@ -218,29 +222,29 @@ def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
 class Slow(Law):
     """A step per 0.3 m between sender and receiver; messages over more than 1.5 m are lost."""
 
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
+    def sampler(self, dt=1.0, loss=0.0, key="delay"):
         return ContextSampler(self.delays, 9, loss, reads=["position", "receiver_position"])
 
-    def delays(self, context: MessageContext) -> Tensor:
+    def delays(self, context):
         between = context.entries["position"] - context.entries["receiver_position"]
         metres = torch.linalg.vector_norm(between, dim=-1)
         return torch.where(metres > 1.5, -1, (metres / 0.3).floor())
 
 
-def place(outputs: Any, b: int, agent: int) -> list[float]:
+def place(outputs, b, agent):
     return outputs["agents", "observation"][b, agent, :2].tolist()
 
 
 @pytest.fixture
-def navigation() -> Callable[..., TransformedEnv]:
-    def make(channel: Channel) -> TransformedEnv:
+def navigation():
+    def make(channel):
         channel.set_seed(1)
         return TransformedEnv(vmas(len(WORLDS), N, max_steps=9), Compose(channel))
 
     return make
 
 
-def some_worlds(t: int) -> list[int]:
+def some_worlds(t):
     return [t % len(WORLDS)] if t % 4 == 1 else []
 
 
@@ -248,7 +252,7 @@ def test_agents_hear_only_those_in_their_range(navigation):
     env = navigation(Channel(Uniform(1, 5), comm_range=0.9, position_key="observation"))
     heard = []
 
-    def wants(outputs: Any, _: Any, b: int) -> set:
+    def wants(outputs, _, b):
         links = {
             (i, j) for i, j in ALL if math.dist(place(outputs, b, i), place(outputs, b, j)) <= 0.9
         }
@@ -263,14 +267,14 @@ def test_a_law_may_read_the_positions_of_sender_and_receiver(navigation):
     env = navigation(Channel(Slow(), position_key="observation"))
     now = {}
 
-    def make(b: int, _: Tensor) -> World:
-        def delay(clock: int, link: tuple) -> int | None:
+    def make(b, _):
+        def delay(clock, link):
             metres = math.dist(*(place(now["outputs"], b, agent) for agent in link))
             return None if metres > 1.5 else min(math.floor(metres / 0.3), 9)
 
         return World(N, delay)
 
-    def wants(outputs: Any, _: Any, b: int) -> set:
+    def wants(outputs, _, b):
         now["outputs"] = outputs
         return ALL
 
@@ -281,7 +285,7 @@ def test_an_agent_sends_what_its_policy_chooses(navigation):
     key = ("agents", "message")
     env = navigation(Channel(Uniform(0, 3), action_key=key, message_size=2))
 
-    def wants(_: Any, inputs: Any, b: int) -> set:
+    def wants(_, inputs, b):
         return set() if inputs is None else ALL
 
     make = twin_of(Uniform(0, 3), own_at_reset=False)

@@ -1,7 +1,5 @@
 """Sums of rewards, clocks and histories beside slow reference implementations in plain Python."""
 
-from collections.abc import Sequence
-
 import pytest
 import torch
 from delay_twin import (
@@ -21,15 +19,8 @@ from delay_twin import (
     delayed,
 )
 from helpers import play
-from tensordict import TensorDictBase
 
-from damian.transforms import (
-    ActionHistory,
-    CumulativeReward,
-    ObservationDelay,
-    RewardDelay,
-    SampleAndHold,
-)
+from damian import ActionHistory, CumulativeReward, ObservationDelay, RewardDelay, SampleAndHold
 
 
 @pytest.fixture(params=LAWS)
@@ -37,7 +28,7 @@ def law(request, tmp_path):
     return LAWS[request.param](tmp_path)
 
 
-def rewards_of(outputs: Sequence[TensorDictBase]) -> tuple[list, list]:
+def rewards_of(outputs):
     """Rewards [T][B][N][1], and flags of the ends of episodes [T][B][1], as nested lists."""
     return after(outputs, *REWARD), after(outputs, "done")
 
@@ -139,7 +130,7 @@ def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_
     ready = before(outputs, "agents", "ready")
     done = after(outputs, "done")
     for w, n in ROWS:
-        recorded: list[tuple[int, int]] = []
+        recorded = []
         for t in range(STEPS):
             recorded += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
             latest = [*[(-STEPS, default)] * 3, *recorded][-3:]

@@ -4,17 +4,10 @@ import pytest
 import torch
 from environments import LATE, OBSERVATION, Drift, uavs
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
+from damian import ActionDelay, ActionHistory, Channel, ObservationDelay, RewardDelay, SampleAndHold
 from damian.common.errors import InputError
-from damian.transforms import (
-    ActionDelay,
-    ActionHistory,
-    Channel,
-    ObservationDelay,
-    RewardDelay,
-    SampleAndHold,
-)
 
 MISSING = {
     "observatoin": lambda: ObservationDelay(3, ["observation", "observatoin"]),
@@ -69,11 +62,11 @@ def test_outside_an_environment_the_error_says_what_to_do(use):
 # Orders in which one transform would undo or miss the work of another.
 
 
-def delay() -> Transform:
+def delay():
     return ObservationDelay(LATE)
 
 
-def appending() -> Transform:
+def appending():
     return ActionHistory(2, append_to="observation")
 
 

@@ -1,55 +1,56 @@
 """Delays of stored steps equal those that the same transforms make in the environment."""
 
 import runpy
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from delay_twin import ACTION, OBSERVATION, REWARD, WORLDS, Counting
 from environments import vmas
 from helpers import same
-from tensordict import TensorDictBase
 from torchrl.envs import (
     Compose,
-    EnvBase,
     GymEnv,
     InitTracker,
     RewardSum,
     SerialEnv,
-    Transform,
     TransformedEnv,
 )
 
-from damian.delays.laws import Uniform
-from damian.transforms import (
+from damian import (
     ActionHistory,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
+    Uniform,
     set_seed,
 )
 
 EXAMPLE = runpy.run_path(
     str(Path(__file__).parents[2] / "examples/transforms/late_replay_buffer.py")
 )
-delay_trajectories: Callable[..., TensorDictBase] = EXAMPLE["delay_trajectories"]
+delay_trajectories = EXAMPLE["delay_trajectories"]
 
 LATE = Uniform(0, 3)
 
 
 ROOT = ("observation", "action", "reward")
 AGENTS = (OBSERVATION, ACTION, REWARD)
-KINDS: dict[str, tuple[Callable[[], EnvBase], Any]] = {
+KINDS = {
     "Pendulum": (lambda: GymEnv("Pendulum-v1"), ROOT),
     "CartPole, two": (lambda: SerialEnv(2, lambda: GymEnv("CartPole-v1")), ROOT),
     "counting": (lambda: Counting(WORLDS), AGENTS),
     "VMAS": (vmas, AGENTS),
 }
-CHAINS: dict[str, Callable[[Any, Any, Any], Transform]] = {
-    "observation": lambda o, a, r: ObservationDelay(LATE, [o], loss=0.1, delay_key="d", seed=1),
+CHAINS = {
+    "observation": lambda o, a, r: ObservationDelay(
+        LATE,
+        [o],
+        loss=0.1,
+        delay_key="d",
+        seed=1,
+    ),
     "all": lambda o, a, r: Compose(
         ObservationDelay(LATE, [o], order="arrival", seed=1),
         Compose(RewardDelay(LATE, r, seed=2), CumulativeReward(2, 0.9, r)),
@@ -61,7 +62,7 @@ CHAINS: dict[str, Callable[[Any, Any, Any], Transform]] = {
 }
 
 
-def collect(env: EnvBase, n_steps: int = 30) -> TensorDictBase:
+def collect(env, n_steps=30):
     """Steps under random actions, the same at each call, with resets in between; [*, T]."""
     set_seed(env, 0)
     torch.manual_seed(0)

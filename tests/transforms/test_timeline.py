@@ -4,15 +4,18 @@ import pytest
 import torch
 from environments import LATE
 from helpers import square
-from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
-from damian import keys
-from damian.delays.samplers import ContextSampler
-from damian.envs.uav_env import UavEnv
+from damian import (
+    Channel,
+    ObservationDelay,
+    ObservationTimeline,
+    UavEnv,
+    keys,
+    set_seed,
+)
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.transforms import Channel, ObservationDelay, ObservationTimeline, set_seed
 
 K = 3
 WORLDS = 2
@@ -21,9 +24,7 @@ ALL = [(False, False), (True, False), (True, True)]
 """Whether a timeline is that of a group, and whether it has one's own messages at once."""
 
 
-def late_uavs(
-    law: object = LATE, loss: float = 0.2, links: bool = False, **options
-) -> TransformedEnv:
+def late_uavs(law=LATE, loss=0.2, links=False, **options):
     """UAVs that send nothing in half of the steps; ``links``: every receiver has delays of its
     own."""
     uav_env = UavEnv(square(), num_worlds=WORLDS, extras=["message"])
@@ -42,13 +43,13 @@ def late_uavs(
 
 
 def twin(
-    data: TensorDictBase,
-    world: int,
-    receiver: int,
-    group: bool,
-    own: bool,
-    until: int | None = None,
-) -> list[torch.Tensor]:
+    data,
+    world,
+    receiver,
+    group,
+    own,
+    until=None,
+):
     """The timeline of one receiver after every step, from the messages and delays of one world.
 
     With ``until``, it is that of hindsight: from what has arrived after that step.
@@ -59,7 +60,7 @@ def twin(
     first = 0
     senders = [(receiver + i) % AGENTS for i in range(AGENTS)] if group else [receiver]
 
-    def arrived(entries: TensorDictBase, sender: int, since: int) -> bool:
+    def arrived(entries, sender, since):
         delay = entries[keys.DELAY][sender]
         return 0 <= int(delay[receiver] if len(delay) > 1 else delay) <= since
 
@@ -92,7 +93,11 @@ def twin(
 def test_the_timeline_holds_what_has_arrived_of_the_latest_steps(group, own, links):
     if links and not group:
         return
-    data = late_uavs(links=links, group=group, own=own).rollout(20, break_when_any_done=False)
+    data = late_uavs(
+        links=links,
+        group=group,
+        own=own,
+    ).rollout(20, break_when_any_done=False)
     assert data["next", "done"].sum() > WORLDS
     assert (data["next", "agents", "delay"] < 0).any()
     for world in range(WORLDS):
@@ -127,27 +132,6 @@ def test_stored_timelines_are_corrected_by_what_has_arrived_since(group, own):
                 found = stored[world]["next", *key][:, receiver].reshape(expected.shape)
                 assert found.equal(expected)
     assert not stored["next", *key].equal(data["next", *key])
-
-
-def test_the_worked_timeline_of_the_docstring():
-    delays = torch.tensor([3, 1, -1, 1])  # of the messages of t = 1, 2, 3 and 4
-
-    def delay(context):
-        return delays[context.time.long() - 1].float()
-
-    late = ObservationDelay(
-        ContextSampler(delay, longest=3), "observation", "received", delay_key="delay"
-    )
-    env = TransformedEnv(
-        GymEnv("Pendulum-v1"), Compose(late, ObservationTimeline(4, delay_key="delay"))
-    )
-    steps = env.rollout(4)
-    sent = [steps["observation"][0], *steps["next", "observation"]]
-    for t, held in ((3, [None, 2, None, 0]), (4, [None, None, 2, 1])):
-        found = steps["next", "timeline"][t - 1]
-        for slot, message in zip(found, held, strict=True):
-            assert slot[-1] == float(message is not None)
-            assert slot[:-1].equal(torch.zeros(3) if message is None else sent[message])
 
 
 def test_places_relative_to_the_observer_are_moved_into_its_present_frame():

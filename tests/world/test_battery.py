@@ -56,7 +56,11 @@ def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical
         flown = min(elapsed - cruise, 2 * vertical)
     expected = flown * 100 * 10 / (9 * 12 * 0.9) / 3600 + cruised / 20 * 100 * 10 / (9 * 12) / 3600
     values = (tensor(x) for x in (elapsed, vertical, cruise, cruised))
-    assert used_so_far(*values, BATTERY).item() == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert used_so_far(*values, BATTERY).item() == pytest.approx(
+        expected,
+        rel=1e-9,
+        abs=1e-12,
+    )
 
 
 def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
@@ -68,12 +72,11 @@ def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
     )  # % a second
     gain = 100 * battery.charging_power_kw / (3600 * battery.capacity_kwh)
     hardest = 10 * math.sqrt(3) / 3
-    generator = torch.Generator().manual_seed(0)
     flown = 0
     levels = env.state.battery.tolist()
     before = env.state.position[..., :2].tolist()
     for _ in range(12):
-        act(env, random_actions(env, generator))
+        act(env, random_actions(env))
         after = env.state.position[..., :2].tolist()
         for b, n in [(b, n) for b in range(4) for n in range(3)]:
             way = math.dist(before[b][n], after[b][n])
@@ -84,5 +87,10 @@ def test_levels_of_instant_flights_equal_those_of_a_plain_loop():
             levels[b][n] = min(max(levels[b][n] - drain, 0.0), 100.0)
             flown += way > 0
         before = after
-        torch.testing.assert_close(env.state.battery, torch.tensor(levels), rtol=0, atol=1e-3)
+        torch.testing.assert_close(
+            env.state.battery,
+            torch.tensor(levels),
+            rtol=0,
+            atol=1e-3,
+        )
     assert 20 < flown < 140

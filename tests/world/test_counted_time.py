@@ -8,7 +8,7 @@ from helpers import clock, fresh, one_uav
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.world.motion import MotionConfig
+from damian.world.config import MotionConfig
 
 
 @given(
@@ -23,7 +23,10 @@ def test_a_flight_ends_after_exactly_its_duration_but_for_its_float_error(
 ):
     motion = MotionConfig("polynomial", sensing_time=tenths / 10)
     env = fresh(one_uav(motion=motion, clock=clock(f"{period}s")))
-    flight = {"vertical": torch.tensor([[vertical]]), "cruise": torch.tensor([[cruise]])}
+    flight = {
+        "vertical": torch.tensor([[vertical]]),
+        "cruise": torch.tensor([[cruise]]),
+    }
     duration = 2 * Fraction(vertical) + Fraction(cruise)
     models = env.simulation.vehicles
     for holds, sensing in ((models.on_ground, 0), (models.ready, Fraction(tenths, 10))):

@@ -6,14 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import clock
+from helpers import clock, play
 
+from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.common import counter_rng
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.envs.config import ScenarioConfig
-from damian.envs.pipeline import make_env
-from damian.envs.uav_env import UavEnv
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import (
     ActionConfig,
@@ -103,28 +100,12 @@ def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
     assert flown > 50
 
 
-def test_equal_values_for_each_uav_are_bit_for_bit_one_value():
-    one = replace(
-        WORLD,
-        motion=replace(WORLD.motion, max_speed=12.3, max_acceleration=1.7),
-        battery=BatteryConfig(True),
-    )
-    motion = replace(one.motion, max_speed=[12.3] * 3, max_acceleration=[1.7] * 3)
-    each = replace(one, motion=motion, battery=BatteryConfig(True, capacity_kwh=[9.0] * 3))
-    flown = [UavEnv(scenario, 6, seed=4) for scenario in (one, each)]
-    torch.manual_seed(0)
-    actions = [torch.randint(24, (6, 3)) for _ in range(60)]
-    for env in flown:
-        td = env.reset()
-        for action in actions:
-            td = env.step(td.set(("agents", "action"), action))["next"]
-    for name, a, b in zip(flown[0].state._fields, flown[0].state, flown[1].state, strict=True):
-        if name != "sent":
-            assert a.equal(b), name
-
-
 def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
-    drawn = {"wind.speed": [0, 6], "motion.max_acceleration": [1, 2, 3], "source.miss": [0.0, 0.5]}
+    drawn = {
+        "wind.speed": [0, 6],
+        "motion.max_acceleration": [1, 2, 3],
+        "source.miss": [0.0, 0.5],
+    }
     flying = MotionConfig(kind="polynomial")
     gusty = WindConfig(gusts=2.0)
     scenario = replace(WORLD, motion=flying, wind=gusty, randomise=drawn)
@@ -194,34 +175,34 @@ def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     assert met == {*levels}
 
 
-@pytest.mark.parametrize(
-    "seen", [{"global_features": ["coverage_map"]}, {"belief": ["belief_map"]}]
-)
-def test_what_has_tables_for_each_level_refuses_a_range_of_them(seen):
+def test_what_has_tables_for_each_level_refuses_a_range_of_them():
+    seen = ObservationConfig(belief=["belief_map"])
     drawn = {"source.level_db": [138, 142]}
-    with pytest.raises(
-        InputError, match=r"randomise.source.level_db: .* is a range, .* give a list"
-    ):
-        make_env(replace(STILL, observation=ObservationConfig(**seen), randomise=drawn))
+    with pytest.raises(InputError, match=r"source.level_db: .* is a range, .* give a list"):
+        make_env(replace(STILL, observation=seen, randomise=drawn))
 
 
 def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
     losses = [0.0, 0.3, 0.9]
-    law = {"law": "lag", "lag": {"law": "uniform", "low": 1, "high": 4}}
-    scenarios = [replace(STILL, delay=DelayConfig(law), randomise={"delay.loss": losses})]
+    law = {
+        "law": "lag",
+        "lag": {
+            "law": "uniform",
+            "low": 1,
+            "high": 4,
+        },
+    }
+    scenarios = [
+        replace(
+            STILL,
+            delay=DelayConfig(law),
+            randomise={"delay.loss": losses},
+        )
+    ]
     scenarios += [replace(STILL, delay=DelayConfig(law, loss=loss)) for loss in losses]
     envs = [make_env(each, 12, 0, extras=["message"]) for each in scenarios]
-    actions = [
-        torch.randint(24, (12, 3), generator=torch.Generator().manual_seed(i)) for i in range(60)
-    ]
-    flown = []
-    for env in envs:
-        td = env.reset()
-        steps = []
-        for action in actions:
-            before, td = env.step_and_maybe_reset(td.set(("agents", "action"), action))
-            steps.append(before["next"])
-        flown.append(torch.stack(steps, 1))
+    actions = [*torch.randint(24, (60, 12, 3))]
+    flown = [torch.stack(play(env, actions)[1::2], 1) for env in envs]
     drawn = flown[0]["agents", "loss"][..., 0, 0]
     assert len(drawn.unique()) == 3
     for loss, one in zip(losses, flown[1:], strict=True):
@@ -230,28 +211,21 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
             assert flown[0]["agents", name][chosen].equal(one["agents", name][chosen])
 
 
-def test_misses_and_false_alarms_come_as_often_as_they_are_said_to():
-    source = replace(WORLD.source, level_db=150.0, miss=0.3, false_alarm=0.1)
-    env = UavEnv(replace(STILL, source=source), 64, seed=0)
-    td = env.reset()
-    counts = torch.zeros(2, 2)
-    for _ in range(40):
-        state = env.state
-        near = torch.linalg.vector_norm(state.position[..., :2] - state.source, dim=-1)
-        near = near <= env.simulation.radius
-        spotted = state.sent.spotted
-        for row, mask in enumerate((near, ~near)):
-            counts[row] += torch.tensor([(spotted & mask).sum(), mask.sum()])
-        td = env.rand_step(td)["next"]
-    share = counts[:, 0] / counts[:, 1]
-    spread = 4 * (torch.tensor([0.21, 0.09]) / counts[:, 1]).sqrt()
-    assert ((share - torch.tensor([0.7, 0.1])).abs() < spread).all(), share
-
-
 def test_reports_of_two_sources_are_those_of_a_plain_loop():
-    each = [{"level_db": 150.0, "miss": 0.4, "false_alarm": 0.1}, {"level_db": 145.0, "miss": 0.2}]
+    each = [
+        {
+            "level_db": 150.0,
+            "miss": 0.4,
+            "false_alarm": 0.1,
+        },
+        {"level_db": 145.0, "miss": 0.2},
+    ]
     moving = replace(WORLD.motion, max_speed=60.0, max_acceleration=40.0)
-    scenario = replace(WORLD, motion=moving, source=SourceConfig(count=2, each=each))
+    scenario = replace(
+        WORLD,
+        motion=moving,
+        source=SourceConfig(count=2, each=each),
+    )
     scenario = replace(scenario, episode=EpisodeConfig(None, all_sources=True))
     env = UavEnv(scenario, 8, seed=0)
     tag = torch.tensor(counter_rng.number_of("report"))
@@ -297,7 +271,14 @@ def test_the_truth_pays_and_ends_as_if_there_were_no_misses_and_false_alarms(end
     source = SourceConfig(count=2, level_db=150.0)
     episode = EpisodeConfig(12, **ends)
     clear = replace(STILL, reward=reward, source=source, episode=episode)
-    reported = replace(clear, source=replace(clear.source, miss=0.5, false_alarm=0.2))
+    reported = replace(
+        clear,
+        source=replace(
+            clear.source,
+            miss=0.5,
+            false_alarm=0.2,
+        ),
+    )
     judged = replace(reported, reward=replace(clear.reward, detection="truth"))
     rewards = []
     for scenario in (clear, judged, reported):
@@ -364,15 +345,10 @@ def test_a_battery_is_empty_where_it_allows_no_flight_in_this_wind(kind):
             {"randomise": {"agents": [1, 2]}},
             "randomise.agents: .* cannot be drawn, only motion.max_speed",
         ),
-        ({"randomise": {"wind.speed": [0, 1000]}}, "wind.speed: 1000"),
         ({"randomise": {"wind.speed": 3}}, "randomise.wind.speed: 3 is not a range"),
         (
             {"randomise": {"motion.max_speed": [5, 9]}},
             "randomise.motion.max_speed: .* one for each: leave one",
-        ),
-        (
-            {"source": SourceConfig(each=[{"miss": 0.5}]), "randomise": {"source.miss": [0, 0.2]}},
-            "randomise.source.miss: .* source.each tells miss: leave one",
         ),
     ],
 )

@@ -12,7 +12,6 @@ from golden_records import (
     EPISODES,
     PERSISTENT,
     TOLERANCE,
-    Transition,
     column,
     ready_env,
     recorded,
@@ -21,12 +20,12 @@ from golden_records import (
 )
 from helpers import DATA, GOLDEN, act, nearest, sent_messages, usecase
 
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv
+from damian.world.config import MotionConfig
 from damian.world.landing import action_table
-from damian.world.motion import MotionConfig
 
 
-def reason_for_other_point(case: int, transition: Transition, uav: int) -> str | None:
+def reason_for_other_point(case, transition, uav):
     """Why this project leads the UAV to another point than the original; None if it does not."""
     golden = GOLDEN[case]
     points = golden["scenario"]["landing_points"]

@@ -78,7 +78,7 @@ def test_booking_at_once_and_one_by_one_equals_a_sequential_loop(
     assert ours[case[-1] < 0].equal(case[2][case[-1] < 0])
 
 
-def centimetres(point, target) -> int:
+def centimetres(point, target):
     """Distance of two places in whole centimetres, half a one rounded up, without rounding errors.
 
     The boundary lies 1e-8 m below the half, so that float error cannot move a true half across it.
@@ -91,13 +91,13 @@ def centimetres(point, target) -> int:
     return whole + ((whole + 1 - up) ** 2 <= squared)
 
 
-def nearest_by_loop(points, target, n) -> list[int]:
+def nearest_by_loop(points, target, n):
     """The n nearest points; of equally near ones the lowest id first."""
     ids = sorted(range(len(points)), key=lambda i: (centimetres(points[i], target), i))
     return (ids + [-1] * n)[:n]
 
 
-def some_points(rng, kind, n) -> np.ndarray:
+def some_points(rng, kind, n):
     """Scattered points, points in two far clusters, or a lattice whose points are often equally
     far."""
     if kind == "lattice":
@@ -110,7 +110,11 @@ def some_points(rng, kind, n) -> np.ndarray:
 @settings(max_examples=settings.default.max_examples // 4)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    kinds=st.lists(st.sampled_from(["scattered", "clusters", "lattice"]), min_size=1, max_size=3),
+    kinds=st.lists(
+        st.sampled_from(["scattered", "clusters", "lattice"]),
+        min_size=1,
+        max_size=3,
+    ),
     n=st.integers(1, 9),
 )
 def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds, n):
@@ -174,7 +178,14 @@ def test_actions_that_lead_nowhere_are_refused_unless_there_is_one_landing_point
         )
         actions = ActionConfig(kind, distances=[0.0, distance], headings=[90.0])
         return Simulation(
-            WorldConfig(agents=1, region=region, actions=actions), 1.0, stops=1, seed=0
+            WorldConfig(
+                agents=1,
+                region=region,
+                actions=actions,
+            ),
+            1.0,
+            stops=1,
+            seed=0,
         )
 
     with pytest.raises(InputError, match=r"actions.distances: .* lead from no landing point"):

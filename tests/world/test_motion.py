@@ -49,10 +49,20 @@ def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(c
         (v,) = torch.autograd.grad(axis.sum(), elapsed, create_graph=True)
         velocity.append(v)
         acceleration.append(torch.autograd.grad(v.sum(), elapsed, retain_graph=True)[0])
-    torch.testing.assert_close(position.detach(), expected[:, :3], atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        position.detach(),
+        expected[:, :3],
+        atol=1e-4,
+        rtol=0,
+    )
     way = torch.linalg.vector_norm(expected[:, :2] - origin, dim=-1)
     length = torch.linalg.vector_norm(target - origin, dim=-1)
-    torch.testing.assert_close((crossed * length).detach(), way, atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        (crossed * length).detach(),
+        way,
+        atol=1e-4,
+        rtol=0,
+    )
     # Derivatives jump where two phases meet, so they are compared only inside the phases.
     inside = [i for i in range(15) if i % 5 in (1, 2, 3)]
     torch.testing.assert_close(

@@ -9,8 +9,7 @@ import shapely
 import torch
 from helpers import clock
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
+from damian import ScenarioConfig, UavEnv
 from damian.world.config import ActionConfig, MotionConfig, RegionConfig
 from damian.world.paths import detours
 from damian.world.regions.polygon import landing_lattice
@@ -79,23 +78,6 @@ def test_no_uav_leaves_the_region_or_enters_a_zone(kind):
     assert (flights < len(env.simulation.airspace.detours.pair)).any(), "some fly around"
 
 
-def test_a_flight_around_a_zone_takes_the_time_of_its_way():
-    region = RegionConfig(kind="vertices", vertices=DENTED, zones=ZONES, lattice_step=45.0)
-    env = UavEnv(
-        ScenarioConfig(agents=1, region=region, motion=MotionConfig(kind="polynomial")), 1, 0
-    )
-    airspace = env.simulation.airspace
-    vehicles = env.simulation.vehicles
-    first = divmod(int(airspace.detours.pair[0]), airspace.max_points)
-    origin, goal = (torch.tensor([[each]]) for each in first)
-    state = env.state._replace(goal=origin)
-    yes = torch.ones(1, 1, dtype=torch.bool)
-    state = vehicles.take_off(state, goal, yes, yes)
-    straight = torch.dist(airspace.points[0, origin.item()], airspace.points[0, goal.item()])
-    assert airspace.length(origin, goal) > straight
-    torch.testing.assert_close(state.cruise, vehicles.shortest_time(airspace.length(origin, goal)))
-
-
 @pytest.mark.parametrize(
     ("zones", "message"),
     [
@@ -111,5 +93,13 @@ def test_a_flight_around_a_zone_takes_the_time_of_its_way():
 def test_zones_that_cannot_be_are_refused(zones, message):
     with pytest.raises(ValueError, match=message):
         UavEnv(
-            ScenarioConfig(region=RegionConfig(kind="vertices", vertices=DENTED, zones=zones)), 1, 0
+            ScenarioConfig(
+                region=RegionConfig(
+                    kind="vertices",
+                    vertices=DENTED,
+                    zones=zones,
+                )
+            ),
+            1,
+            0,
         )

@@ -9,11 +9,9 @@ import pytest
 import torch
 
 from damian.common.errors import InputError
-from damian.world.battery import BatteryConfig
-from damian.world.config import WorldConfig
+from damian.world.config import BatteryConfig, SourceConfig, WorldConfig
 from damian.world.regions.geodesy import to_latlon
 from damian.world.regions.sources import RegionConfig, regions_of
-from damian.world.signal_source import SourceConfig
 from damian.world.simulation import Simulation
 
 SQUARE = RegionConfig(
@@ -22,7 +20,7 @@ SQUARE = RegionConfig(
 CORNERS = [[8.0, 45.0], [8.003, 45.0], [8.003, 45.002], [8.0, 45.002], [8.0, 45.0]]
 
 
-def build(region, **settings) -> Simulation:
+def build(region, **settings):
     places = {
         name: settings.pop(name)
         for name in ("start_positions", "start_together")
@@ -63,7 +61,15 @@ def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(tmp_path):
 
 @pytest.mark.parametrize(
     "place",
-    [[math.nan, 1.0], {"lat": 1.0, "lng": 2.0}, [0.0, 100.0], {"lat": 53.1, "lon": -4.5}],
+    [
+        [math.nan, 1.0],
+        {
+            "lat": 1.0,
+            "lng": 2.0,
+        },
+        [0.0, 100.0],
+        {"lat": 53.1, "lon": -4.5},
+    ],
     ids=[
         "not finite",
         "a misspelt key",

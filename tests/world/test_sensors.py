@@ -7,13 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
+from damian import UavEnv
 from damian.server.config import ObservationConfig
 from damian.world.messages import Messages, Widths
 
 
-def sensing(motion: str = "instant", **changed) -> ScenarioConfig:
+def sensing(motion="instant", **changed):
     """A scenario with everything, and with sensors and features of your own."""
     observation = ObservationConfig(["spotted", *LOCAL], ["source_distance", *GLOBAL])
     return everything(motion, **({"sensors": SENSORS, "observation": observation} | changed))
@@ -24,7 +23,6 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
     motion,
 ):
     env = UavEnv(sensing(motion), num_worlds=4, seed=2)
-    generator = torch.Generator().manual_seed(0)
     td = env.reset()
     expected = readings_of(env)
     kept = 0
@@ -35,9 +33,7 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
         observation = td["agents", "observation"]
         assert observation[..., -2:].equal(read[..., :2].sin())
         assert observation[..., 1].equal(read[..., 2].amax(-1, keepdim=True).expand(4, 3))
-        after, td = env.step_and_maybe_reset(
-            td.set(("agents", "action"), random_actions(env, generator))
-        )
+        after, td = env.step_and_maybe_reset(td.set(("agents", "action"), random_actions(env)))
         sends = td["agents", "message_sent"]
         expected = torch.where(sends.unsqueeze(-1), readings_of(env), expected)
         kept = kept + int((~sends).sum())
@@ -51,7 +47,11 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
     window=st.integers(1, 5),
     n_readings=st.integers(0, 5),
     n_sources=st.integers(1, 3),
-    shape=st.lists(st.integers(1, 3), min_size=1, max_size=3),
+    shape=st.lists(
+        st.integers(1, 3),
+        min_size=1,
+        max_size=3,
+    ),
 )
 def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, n_sources, shape):
     generator = torch.Generator().manual_seed(seed)
@@ -59,7 +59,7 @@ def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, n_sou
     blank = Messages.blank(torch.randint(2**24, (*shape, window), generator=generator), widths)
     assert blank.readings.shape == (*shape, n_readings)
 
-    def fill(field: torch.Tensor) -> torch.Tensor:
+    def fill(field):
         numbers = torch.randint(2**24, field.shape, generator=generator)
         return numbers % 2 == 0 if field.dtype == torch.bool else numbers.to(field.dtype)
 

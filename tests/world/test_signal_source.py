@@ -130,7 +130,14 @@ def test_every_stop_is_inside_the_polygon_and_near_its_hotspot(name):
     ),
 )
 def test_a_position_equals_the_integrated_speed_profile(seed, share, changed):
-    walk = dynamic_walks(n=3, seed=seed, min_stops=1, min_wait=0.0, max_wait=5.0, **changed)
+    walk = dynamic_walks(
+        n=3,
+        seed=seed,
+        min_stops=1,
+        min_wait=0.0,
+        max_wait=5.0,
+        **changed,
+    )
     walk = Walk(*(x if x.dtype == torch.bool else x.double() for x in walk))
     time = share * walk.depart[:, -1]
     located = locate(walk, time)

@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from damian.world.battery import BatteryConfig
-from damian.world.config import WorldConfig
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
+from damian.world.config import BatteryConfig, RegionConfig, SourceConfig, WorldConfig
 from damian.world.simulation import Simulation
 
 SQUARE = [[0.0, 0.0], [210.0, 0.0], [210.0, 210.0], [0.0, 210.0]]
@@ -28,7 +25,14 @@ def simulation(vertices, offset):
     source = SourceConfig(motion="dynamic", position=moved([30.0, 20.7])[0])
     battery = BatteryConfig(enabled=True, charging_points=moved([9.0, 9.0], [70, 8.5]))
     return Simulation(
-        WorldConfig(region=region, source=source, battery=battery), 1.0, stops=2, seed=0
+        WorldConfig(
+            region=region,
+            source=source,
+            battery=battery,
+        ),
+        1.0,
+        stops=2,
+        seed=0,
     )
 
 

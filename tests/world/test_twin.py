@@ -18,21 +18,17 @@ from helpers import (
 )
 from twin import GLOBAL, LOCAL
 
-from damian.envs.config import ScenarioConfig
-from damian.envs.uav_env import UavEnv
-from damian.server.config import BUILT_IN, ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
+from damian import ScenarioConfig, UavEnv
+from damian.server.config import BUILT_IN, EpisodeConfig, ObservationConfig, RewardConfig
+from damian.world.config import RegionConfig, SourceConfig
 from damian.world.landing import ActionConfig, action_table
-from damian.world.regions.sources import RegionConfig
-from damian.world.signal_source import SourceConfig
 
 TWIN_FEATURES = [name for name in GLOBAL if name != "coverage"]
 OBSERVED = [*TWIN_FEATURES, *LOCAL]
 """Features in the order of the critic's observation."""
 
 
-def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
+def twin_scenario(n_agents, kind, since):
     """Every reward term and feature except the coverage; uneven distances, so that no two points
     tie."""
     task = dict.fromkeys(BUILT_IN, 0.5) | {
@@ -65,7 +61,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
     )
 
 
-def twins(env: UavEnv) -> list[twin.World]:
+def twins(env):
     """The twin's worlds, in the initial conditions of the environment's worlds."""
     airspace = env.simulation.airspace
     state = env.state
@@ -90,7 +86,7 @@ def twins(env: UavEnv) -> list[twin.World]:
     return worlds
 
 
-def check_observation(world: twin.World, observation: torch.Tensor):
+def check_observation(world, observation):
     """Assert that the critic's observation [N, G] of one world equals the twin's."""
     features = world.observe()
     columns = [np.array(features[name]).reshape(len(world.uavs), -1) for name in OBSERVED]
@@ -110,7 +106,6 @@ def check_observation(world: twin.World, observation: torch.Tensor):
 def test_rollouts_equal_those_of_the_twin(n_agents, kind, since):
     env = UavEnv(twin_scenario(n_agents, kind, since), num_worlds=12, seed=n_agents)
     table = action_table(env.scenario.actions)
-    generator = torch.Generator().manual_seed(n_agents)
     compared = ended = spotted = 0
     for _ in range(3):
         output = env.reset()
@@ -118,7 +113,7 @@ def test_rollouts_equal_those_of_the_twin(n_agents, kind, since):
         for b, world in enumerate(worlds):
             check_observation(world, output["agents", "global_observation"][b])
         for _ in range(8):
-            action = random_actions(env, generator)
+            action = random_actions(env)
             moves = (
                 table[action] if kind == "discrete" else action * torch.tensor([118.4, math.tau])
             )
@@ -150,10 +145,9 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         episode=KEEPS_GOING,
     )
     env = fresh(scenario, num_worlds=3)
-    generator = torch.Generator().manual_seed(0)
     trails = env.state.position[..., :2].unsqueeze(2).expand(-1, -1, window, -1)
     for _ in range(5):
-        output = act(env, random_actions(env, generator))
+        output = act(env, random_actions(env))
         newest = env.state.position[..., :2].unsqueeze(2)
         trails = torch.cat([newest, trails[:, :, :-1]], 2)
         for b, region in enumerate(env.state.region.tolist()):
