@@ -78,10 +78,6 @@ POLICIES = (
         (["train", "checkpoint=nowhere"], "checkpoint: nowhere holds no config.yaml"),
         (["fly", "policy=deterministic"], "policy: deterministic needs checkpoint"),
         (["fly", "agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
-        (
-            ["fly", "formats=[geojson]", "region=usecase"],
-            "geojson: its region has no latitude and longitude",
-        ),
         (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
         (
             ["train", "resume=nowhere", "agents=4"],
