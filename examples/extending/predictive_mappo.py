@@ -77,7 +77,7 @@ class PredictiveMappoConfig(MappoConfig):
         checks.require(constant_delay, "learner", self.name, should)
         should = "does not go with this learner, whose actor has an encoder of its own"
         checks.require(not model.recurrent, "model.rnn", model.rnn, should)
-        checks.require(not model.prior, "model.skip", True, should)
+        checks.require(not model.prior, "model.prior", True, should)
         checks.require(bool(model.hidden), "model.hidden", [], should)
         checks.require(not setup.recompute_actor, "corrected", "actor", should)
 

@@ -54,7 +54,7 @@ class QmixConfig(LearnerConfig):
     buffer_steps: int = setting(100_000, "Environment steps in the replay buffer.", low=1)
 
     def check(self, setup: LearningSetup) -> None:
-        for name in ("recurrent", "skip"):
+        for name in ("recurrent", "prior"):
             checks.require(not getattr(setup.model, name), "model", name, "does not go with QMIX")
 
     def buffer_size(self, setup: LearningSetup) -> int:
