@@ -175,12 +175,6 @@ def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(co
     found = measured(folder)
     assert sorted(map(str, found)) == sorted(map(str, rows))
 
-    compare(
-        *words[:3], "methods=[undelayed]", "seeds=1", "experiment.first_seed=4", small, "keep=true"
-    )
-    assert {row["seed"] for row in measured(folder)} == {"3", "4"}
-    assert "1 seeds (4 to 4)" in (folder / "table.md").read_text()
-
 
 @pytest.mark.slow
 def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_named(compare, capsys):

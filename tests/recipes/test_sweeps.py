@@ -191,6 +191,7 @@ def test_a_difference_takes_only_seeds_that_both_have():
     assert difference(runs, others.assign(seed=[7, 8, 9]), "return") == {}
 
 
+@pytest.mark.slow
 def test_a_sweep_evaluates_runs_of_other_folders_as_they_are_now(sweep):
     for seed in (0, 1):
         main(["train", *TINY, f"seed={seed}", f"hydra.run.dir=trained/{seed}"])
