@@ -93,6 +93,7 @@ def test_the_script_finds_the_same_new_ground_in_turn(words):
     [
         ["scenario=energy", "observation.window=1"],
         ["scenario=delaybench/flights", BATTERY, "battery.capacity_kwh=0.03"],
+        ["scenario=energy", "agents=2", "battery.capacity_kwh=[0.03,0.06]"],
     ],
 )
 def test_batteries_and_ways_are_as_they_turn_out_to_be(words):
@@ -279,3 +280,14 @@ def test_actions_need_discrete_ones():
     observation = ObservationConfig(actions=True)
     with pytest.raises(InputError, match=r"observation\.actions: True needs discrete actions"):
         ScenarioConfig(observation=observation, actions=ActionConfig(kind="continuous"))
+
+
+def test_what_is_drawn_for_an_episode_is_taken_as_the_settings_say():
+    words = ["scenario=patrol", "randomise={motion.max_speed: [8, 15], wind.speed: [0, 6]}"]
+    times = []
+    for each in (words, words[:1]):
+        env, steps = roll(each, 1)
+        block = env.layout["observation"]["actions"]
+        first = block.of(steps[keys.OBSERVATION][:, 0])
+        times.append(first[..., block.entries.index("time")])
+    assert times[0].equal(times[1])

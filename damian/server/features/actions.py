@@ -16,6 +16,7 @@ from damian.server.features.search import Seeking, search_weights, seeking_of
 from damian.server.features.source import known_sources
 from damian.world.battery import battery_of, charge_gain, cruise_range, flight_drain, vertical_drain
 from damian.world.coverage import bit_count, packed_bits
+from damian.world.motion import minimum_time
 from damian.world.simulation import Simulation
 
 FLIGHT_COST = 1e-6
@@ -32,8 +33,7 @@ _POINTS_AT_ONCE = 1024
 class ActionTables(NamedTuple):
     """What actions offer before any message has come.
 
-    Rows are landing points by flat id, or, of ``seconds`` and ``drain``, landing points and kinds
-    of UAVs.
+    Rows are landing points by flat id, or, of ``seconds`` and ``drain``, landing points and UAVs.
     """
 
     goal: Tensor
@@ -45,13 +45,13 @@ class ActionTables(NamedTuple):
     needed: Tensor
     """The same as it must be within reach, infinite where the action leads outside, [R*L, A]."""
     seconds: Tensor
-    """Duration of the flight over ten steps, at most 1, [R*L*K, A] for K kinds of UAVs."""
+    """Duration of the flight over ten steps, at most 1, [R*L*N, A], if it is told."""
     drain: Tensor
-    """What the flight, or a step of holding, takes from the battery [%], [R*L*K, A]."""
+    """What the flight, or a step of holding, takes from the battery [%], [R*L*N, A]."""
     vertical: Tensor
-    """What the battery loses by a takeoff and a landing [%], [K]."""
+    """What the battery loses by a takeoff and a landing [%], [N]."""
     range: Tensor
-    """Way that one percent of the battery lasts [m], [K]."""
+    """Way that one percent of the battery lasts [m], [N]."""
     footprints: Tensor
     """The landing points in the footprint of each, as bits, [V*R*L, W] for V radii."""
     full: Tensor
@@ -106,17 +106,14 @@ def action_tables(simulation: Simulation, _: ObservationConfig) -> ActionTables:
     flies = (goal != start).unsqueeze(-1)
     # What is drawn for an episode is not told: flights are those of the settings.
     values = vehicles.values._replace(choices={})
-    battery = battery_of(values, length.new_zeros(0))
-    speed = values.get("motion.max_speed", length)
-    acceleration = values.get("motion.max_acceleration", length)
+    battery = battery_of(values, length)
+    limits = [values.settings[f"motion.{name}"] for name in ("max_speed", "max_acceleration")]
     airspace = simulation.airspace
     drains = config.battery.enabled
     seeks = config.seeks_source and len(simulation.sources) == 1
-    numbers = [*battery, speed, acceleration, vehicles.levels]
-    n_kinds = config.agents if any(isinstance(number, Tensor) for number in numbers) else 1
-    each = length.unsqueeze(-1).expand(*length.shape, n_kinds)
-    vertical = vehicles.shortest_time(vehicles.levels[:n_kinds])
-    seconds = (2 * vertical + vehicles.shortest_time(each)) * flies
+    each = length.unsqueeze(-1).expand(*length.shape, config.agents)
+    vertical = minimum_time(vehicles.levels, config.motion.degree, *limits)
+    seconds = (2 * vertical + minimum_time(each, config.motion.degree, *limits)) * flies
     rests = charge_gain(torch.full_like(each, simulation.dt), battery)
     rests = rests * gather_rows(vehicles.chargers, goal).unsqueeze(-1)
     drain = torch.where(flies, flight_drain(vertical, each, battery), -rests)
@@ -129,12 +126,12 @@ def action_tables(simulation: Simulation, _: ObservationConfig) -> ActionTables:
         way=way.nan_to_num().clamp(-1, 1),
         length=length,
         needed=candidates.distance,
-        seconds=_by_kind(seconds / slow).clamp(max=1),
-        drain=_by_kind(drain),
+        seconds=length[:0] if vehicles.instant else _by_uav(seconds / slow).clamp(max=1),
+        drain=_by_uav(drain) if drains else length[:0],
         vertical=vertical_drain(2 * vertical, battery),
-        range=cruise_range(torch.ones(n_kinds), battery)
+        range=cruise_range(torch.ones(config.agents), battery)
         if drains
-        else torch.full((n_kinds,), checks.METRES),
+        else torch.full((config.agents,), checks.METRES),
         footprints=torch.cat(found),
         full=torch.cat(sizes),
         inside=_listed(torch.cat(found), airspace.max_points) if seeks else goal[:0],
@@ -144,8 +141,8 @@ def action_tables(simulation: Simulation, _: ObservationConfig) -> ActionTables:
     )
 
 
-def _by_kind(values: Tensor) -> Tensor:
-    """Values [P, A, K] as rows for each landing point and kind, [P*K, A]."""
+def _by_uav(values: Tensor) -> Tensor:
+    """Values [P, A, N] as rows for each landing point and UAV, [P*N, A]."""
     return values.movedim(-1, 1).flatten(0, 1).float()
 
 
@@ -185,12 +182,6 @@ def stands(v: FeatureCache) -> Tensor:
     nearest = distances(messages.target, ground).argmin(-1)
     base = v.region.unsqueeze(-1) * v.context.n_points
     return torch.where(messages.in_flight, nearest + base, latest)
-
-
-def _kind_rows(v: FeatureCache, n_kinds: int) -> Tensor:
-    """Rows in tables of kinds of UAVs, of where each stands, [*, N]."""
-    uav = torch.arange(v.messages.time.shape[-1], device=v.messages.time.device)
-    return v(stands) * n_kinds + uav % n_kinds
 
 
 def legal(v: FeatureCache) -> Tensor:
@@ -348,12 +339,12 @@ def _actions(v: FeatureCache) -> Tensor:
     own = v.wanted(v(covered))
     east, north = gather_rows(tables.way, standing).unbind(-1)
     found = {"east": east, "north": north, "legal": allowed.float()}
-    n_kinds = len(tables.vertical)
-    rows = v.wanted(_kind_rows(v, n_kinds))
-    found["time"] = gather_rows(tables.seconds, rows)
+    row = standing * v.messages.time.shape[-1] + v(itself)
+    if "time" in names:
+        found["time"] = gather_rows(tables.seconds, row)
     if "battery" in names:
         level = v.wanted(v.messages.battery).unsqueeze(-1)
-        found["battery"] = (level - gather_rows(tables.drain, rows)).clamp(0, 100) / 100
+        found["battery"] = (level - gather_rows(tables.drain, row)).clamp(0, 100) / 100
     taken = {"new": own, "in turn": own | v.wanted(v(claimed))}
     if "new to all" in names:
         everyone = torch.zeros_like(v(covered)[..., :1, :])
