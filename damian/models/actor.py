@@ -91,8 +91,7 @@ class Prior(nn.Module):
             self.columns = [layout["actions"].columns_of(name) for name in FIRST_WEIGHTS]
             first = [*FIRST_WEIGHTS.values()]
         self.weight = nn.Parameter(torch.tensor(first))
-        last = [each for each in network.modules() if isinstance(each, nn.Linear)][-1]
-        for parameter in last.parameters():
+        for parameter in [*network.parameters()][-2:]:  # of the last layer
             nn.init.zeros_(parameter)
 
     def forward(self, *read: Tensor) -> Tensor:

@@ -57,10 +57,10 @@ def test_order_and_number_of_rows_change_nothing(n_out):
 
 
 @pytest.mark.parametrize("model", [SETS, MlpConfig(hidden=[8])])
-@pytest.mark.parametrize("rnn", ["none", "gru"])
-def test_with_a_prior_an_actor_begins_as_the_script(model, rnn):
+@pytest.mark.parametrize("changed", [{}, {"rnn": "gru"}, {"shared": False}], ids=str)
+def test_with_a_prior_an_actor_begins_as_the_script(model, changed):
     env = make_env(compose_scenario(*CROWDED, "region.initial_conditions=16"), 3, seed=0)
-    actor = make_actor(env, type(model)(hidden=model.hidden, rnn=rnn, prior=True))
+    actor = make_actor(env, type(model)(hidden=model.hidden, prior=True, **changed))
     steps = env.rollout(3)
     entries = steps.select(keys.OBSERVATION, keys.ACTION_MASK).clone()
     hidden = torch.randn(3, 3, 4, model.hidden[-1])
