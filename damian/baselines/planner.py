@@ -59,23 +59,21 @@ class Planner:
 
     @torch.no_grad()
     def __call__(self, message: Tensor) -> Tensor:
-        """Actions, [B, N], from messages [B, N, M]; these are read from the worlds' states."""
+        """Actions, [B, N], from the messages [B, N, M] of the worlds' present states."""
         begin = time.perf_counter()
         state = self.worlds.state
         legal = self.worlds.simulation.action_mask(state)
-        joint = self.choice(state)
+        joint = self.script(message, mask=legal)
         for uav in range(joint.shape[1]):
-            value = self.values(state, joint, uav)
-            best = value.where(legal[:, uav], -torch.inf).amax(-1)
+            value = self.values(state, joint, uav).where(legal[:, uav], -torch.inf)
             usual = value.gather(-1, joint[:, uav : uav + 1]).squeeze(-1)
-            found = value.where(legal[:, uav], -torch.inf).argmax(-1)
-            better = best > usual + 1e-6
-            joint[:, uav] = torch.where(better, found, joint[:, uav])
+            better = value.amax(-1) > usual + 1e-6
+            joint[:, uav] = torch.where(better, value.argmax(-1), joint[:, uav])
         self.milliseconds.append(1000 * (time.perf_counter() - begin))
         return joint
 
     def choice(self, state: State) -> Tensor:
-        """What the script does in a state, [B, N]."""
+        """The actions that the script chooses in a state, [B, N]."""
         mask = self.worlds.simulation.action_mask(state)
         return self.script(state.sent.pack(), mask=mask)
 

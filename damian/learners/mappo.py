@@ -26,7 +26,8 @@ from damian.models.memory import RECURRENT_KEYS
 from damian.replay.backupdate import BackupdateStorage
 
 LOSSES = ("loss_objective", "loss_entropy", "loss_critic", "loss_start")
-"""Names of the terms of the loss (``mappo_losses``), the last of which needs ``START``."""
+"""Names of the terms of the loss (``mappo_losses``); the last one is computed only from entries with
+``START``."""
 NUMBERS = ("kl", "clip_fraction", "entropy")
 """Names of the further numbers that ``mappo_losses`` returns."""
 LOSS_KEYS: list[NestedKey] = [

@@ -55,8 +55,8 @@ def _module(
     layout: Layout,
     out_keys: tuple[NestedKey, ...],
 ) -> TensorDictModule:
-    """A network from entries, of which the observation is the last, to the parameters of the
-    actions' distribution."""
+    """A module that computes the parameters of the actions' distribution from entries; the
+    observation is the last of them."""
     if len(out_keys) == 2:
         checks.require(not model.prior, "model.prior", True, "needs discrete actions")
         network = NormalParameters(network, NormalParamExtractor())
@@ -75,8 +75,8 @@ class NormalParameters(nn.Sequential):
 
 
 class Prior(nn.Module):
-    """A network's outputs, zero at first, plus what the script would gain by each action, times a
-    weight."""
+    """Adds to a network's outputs, which are zero at first, the script's gain of each action times a
+    learnt weight."""
 
     def __init__(self, network: nn.Module, layout: Layout) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class Prior(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, *read: Tensor) -> Tensor:
-        """Logits [*, A] from what the network reads, of which observations [*, F] are the last."""
+        """Logits [*, A] from the inputs of the network; the last input is observations [*, F]."""
         logits = self.network(*read)
         for columns, weight in zip(self.columns, self.weight, strict=True):
             gain = read[-1][..., columns]

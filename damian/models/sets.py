@@ -8,7 +8,7 @@ from damian.models.mlp import ACTIVATIONS, hidden_layers
 from damian.server.layout import Block, Layout
 
 ACTIONS = "actions"
-"""What the rows list of which each gives the logit of an action."""
+"""``Block.rows`` of the block with a row for each action."""
 
 
 def lists_of(layout: Layout) -> list[list[Block]]:
@@ -16,18 +16,23 @@ def lists_of(layout: Layout) -> list[list[Block]]:
 
     A block of a name that its list has already, as of a second observation, begins another one.
     """
-    found: dict[tuple[str, int], list[Block]] = {}
+    found: list[list[Block]] = []
     for block in layout:
-        if block.rows and block.rows != ACTIONS:
-            number = 0
-            while any(b.name == block.name for b in found.get((block.rows, number), [])):
-                number += 1
-            found.setdefault((block.rows, number), []).append(block)
-    return [*found.values()]
+        if block.rows in ("", ACTIONS):
+            continue
+        for blocks in found:
+            same = blocks[0].rows == block.rows
+            if same and all(block.name != other.name for other in blocks):
+                blocks.append(block)
+                break
+        else:
+            found.append([block])
+    return found
 
 
 def rows_of(blocks: list[Block], observation: Tensor) -> Tensor:
-    """What blocks tell of each thing, beside each other, [*, R, C], from observations [*, F]."""
+    """The columns of several blocks for each thing that they list, [*, R, C], from observations
+    [*, F]."""
     n_rows = blocks[0].shape[0]
     parts = [observation[..., b.columns].unflatten(-1, (n_rows, -1)) for b in blocks]
     return torch.cat(parts, -1)

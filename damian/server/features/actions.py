@@ -1,5 +1,6 @@
 """What each discrete action offers: where it leads, and what is there, from the known messages."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature, footprint_radii
 from damian.server.features.belief import belief_gain
 from damian.server.features.requests import assignments, known_requests
-from damian.server.features.search import Seeking, search_weights, seeking_of
+from damian.server.features.search import Seeking, radius_of, search_weights, seeking_of
 from damian.server.features.source import known_sources
 from damian.world.battery import battery_of, charge_gain, cruise_range, flight_drain, vertical_drain
 from damian.world.coverage import bit_count, packed_bits
@@ -242,7 +243,7 @@ def _closeness(v: FeatureCache, places: Tensor, exists: Tensor) -> tuple[Tensor,
     """exp(-distance/radius) from where actions lead to places [*, K, 2] that ``exists`` [*, K]
     marks, [*, n, A, K]; and whether each wanted UAV is assigned to it, [*, n, 1, K]."""
     away = _from_goals(v, places)
-    close = (-away / _radius(v)).exp() * exists[..., None, None, :]
+    close = (-away / radius_of(v.radius)).exp() * exists[..., None, None, :]
     goal = assignments(v.messages.target, places, exists)
     place = torch.arange(places.shape[-2], device=places.device)
     return close, v.wanted(goal.unsqueeze(-1) == place).unsqueeze(-2)
@@ -252,11 +253,6 @@ def _from_goals(v: FeatureCache, places: Tensor) -> Tensor:
     """Distances from where actions lead to places [*, K, 2] [m], [*, n, A, K]."""
     ways = v(goal_places).unsqueeze(-2) - places[..., None, None, :, :]
     return ways.square().sum(-1).sqrt()
-
-
-def _radius(v: FeatureCache) -> float | Tensor:
-    radius = v.radius
-    return radius.unsqueeze(-1) if isinstance(radius, Tensor) else radius
 
 
 def itself(v: FeatureCache) -> Tensor:
@@ -269,13 +265,6 @@ def goal_places(v: FeatureCache) -> Tensor:
     """Where the actions of the wanted UAVs lead [m], [*, n, A, 2]."""
     goal = gather_rows(v.table(action_tables).goal, v.wanted(v(stands)))
     return gather_rows(v.context.points, goal)
-
-
-def _best_places(v: FeatureCache, places: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
-    """Closeness of where actions lead to the nearest of places, as in ``_closeness``, and to the
-    one to which the UAV is assigned, [*, n, A] each."""
-    close, is_assigned = _closeness(v, places, exists)
-    return close.amax(-1), (close * is_assigned).amax(-1)
 
 
 def source_gain(v: FeatureCache) -> Tensor:
@@ -303,7 +292,7 @@ def _near_others(v: FeatureCache) -> Tensor:
     away = _from_goals(v, targets)
     uav = torch.arange(targets.shape[-2], device=targets.device)
     own = uav == v(itself)[..., None, None]
-    return (-away.masked_fill(own, torch.inf) / _radius(v)).exp().amax(-1)
+    return (-away.masked_fill(own, torch.inf) / radius_of(v.radius)).exp().amax(-1)
 
 
 @feature(
@@ -355,14 +344,17 @@ def _actions(v: FeatureCache) -> Tensor:
         found[name] = _number(ground & ~known.unsqueeze(-2)) / full
     gain = found["in turn"]
     if "source" in names:
-        found["source"], found["own source"] = _best_places(v, *known_sources(v))
+        close, is_assigned = _closeness(v, *known_sources(v))
+        found["source"] = close.amax(-1)
+        found["own source"] = (close * is_assigned).amax(-1)
         gain = v(source_gain) / full if len(tables.inside) else _if_any(found["own source"], gain)
     if "request" in names:
         requests, unserved = known_requests(v.messages)
         place, appeared = requests.split([2, 1], -1)
-        found["request"], found["own request"] = _best_places(v, place, unserved)
-        close, _ = _closeness(v, place, unserved)
-        inside = close >= torch.exp(torch.tensor(-1.0))
+        close, is_assigned = _closeness(v, place, unserved)
+        found["request"] = close.amax(-1)
+        found["own request"] = (close * is_assigned).amax(-1)
+        inside = close >= math.exp(-1)  # the footprint ends where the closeness is this
         age = (v.context.now[..., None] - appeared.squeeze(-1)) / v.context.time_scale
         age = age.clamp(0, 1)[..., None, None, :]
         found["request age"] = (age * inside).amax(-1)

@@ -30,7 +30,7 @@ class Seeking(NamedTuple):
 
 
 def seeking_of(source: SourceConfig, dt: float) -> Seeking:
-    """What the settings tell of a source."""
+    """The properties of a source by its settings."""
     moves = source.motion == "dynamic"
     return Seeking(max(source.speed, source.local_speed) if moves else 0.0, source.emits, dt)
 
