@@ -32,6 +32,18 @@ GOLDEN = {case: json.loads((DATA / f"usecase{case}.json").read_text()) for case 
 SCALE, TIME_SCALE = 250.0, 60.0
 """In random worlds, distances [m] and times [s] are divided by these."""
 
+SMALLEST_TRAINING = [
+    "frames=64",
+    "worlds=2",
+    "learner.steps=16",
+    "eval_episodes=2",
+    "model.hidden=[4]",
+    "region.lattice_step=90",
+    "episode.max_steps=8",
+    "learner.minibatches=1",
+]
+"""Words of the smallest training that makes two updates."""
+
 SQUARE = [[0.0, 0.0], [200.0, 0.0], [200.0, 200.0], [0.0, 200.0]]
 """Corners of a square region of 200 m by 200 m, [x, y] in metres."""
 

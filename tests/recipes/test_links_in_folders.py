@@ -12,21 +12,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from helpers import SMALLEST_TRAINING
 from stopped_runs import SAC
 
 from damian.common.errors import InputError
 from damian.recipes.command import main
 
-TINY = [
-    "frames=64",
-    "worlds=2",
-    "learner.steps=16",
-    "eval_episodes=2",
-    "model.hidden=[4]",
-    "region.lattice_step=90",
-    "episode.max_steps=8",
-    "learner.minibatches=1",
-]
+TINY = SMALLEST_TRAINING
 OFF_POLICY = [word for word in TINY if "minibatches" not in word] + SAC
 HERE = "hydra.run.dir=named"
 COMPARE = ["compare", "--config-dir=conf", "experiment=x", "seeds=1", HERE, f"overrides={TINY}"]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from helpers import SMALLEST_TRAINING
 from stopped_runs import counted_updates, killed_after
 
 import damian
@@ -20,18 +21,7 @@ from damian.recipes.command import main
 from damian.recipes.shared.runs import Run
 from damian.recipes.shared.sweeps import perform_all
 
-TINY = [
-    "frames=64",
-    "worlds=2",
-    "learner.steps=16",
-    "eval_episodes=2",
-    "model.hidden=[4]",
-    "logger=csv",
-    "region.lattice_step=90",
-    "episode.max_steps=8",
-    "learner.minibatches=1",
-    "agents=1",
-]
+TINY = [*SMALLEST_TRAINING, "logger=csv", "agents=1"]
 
 
 @pytest.fixture

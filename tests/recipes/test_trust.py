@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers import SMALLEST_TRAINING
 
 import damian
 from damian.common.errors import InputError
@@ -16,17 +17,7 @@ from damian.recipes.command import main
 from damian.recipes.shared.runs import stored_config
 from damian.runs.metrics_log import LOGGERS
 
-TINY = [
-    "frames=64",
-    "worlds=2",
-    "learner.steps=16",
-    "eval_episodes=2",
-    "model.hidden=[4]",
-    "logger=csv",
-    "region.lattice_step=90",
-    "episode.max_steps=8",
-    "learner.minibatches=1",
-]
+TINY = [*SMALLEST_TRAINING, "logger=csv"]
 MODULE = """
 from pathlib import Path
 Path(r'{}').touch()
