@@ -66,8 +66,7 @@ class BackupdateStorage(TimeStorage):
         corrections: for what transforms after the receiver do to these entries, in order
             (``corrections_of``).
         message_key, received_key, delay_key, age_key: the message sent in each step, that which the
-        receiver
-            held after it, the delay of the first [steps], -1 if it never arrives, and the age of
+            receiver held after it, the delay of the first [steps], -1 if it never arrives, and the age of
             the second [steps], all under ``"next"``, as ``ObservationDelay`` writes them.
         step_count_key: earlier steps of the episode, [T, B, 1] (``StepCounter``); 0 where it
             begins.

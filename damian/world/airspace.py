@@ -64,7 +64,7 @@ class Airspace(NamedTuple):
         cells: those that may be nearest to a place.
         n_points: number of real landing points, [R].
         edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres, double
-        precision.
+            precision.
         scale: largest distance between two vertices, [R] metres; features divide distances by it.
         offset: place of the local origin in the coordinates of the settings, [R, 2] metres.
         detours: ways between landing points that are not straight; None if all are.

@@ -33,7 +33,7 @@ class Walk(NamedTuple):
     Attributes:
         stop: places, [W, K, 2] metres.
         arrive, depart: times, [W, K] seconds; the first arrival is 0, and a static source never
-        departs.
+            departs.
         speed, acceleration: largest ones on the leg that leaves the stop, [W, K] m/s and m/s^2.
         emits: whether the source emits until it arrives at the next stop, [W, K] bool.
     """
@@ -52,7 +52,7 @@ class Located(NamedTuple):
     Attributes:
         position: [B, 2] metres.
         stop, tour: index of the latest stop, and number of walks finished before this one, [B]
-        int64.
+            int64.
         finished: whether the source has stopped for good, [B] bool.
     """
 
