@@ -192,9 +192,8 @@ def remembering_transforms(
         )
         transforms.append(history)
     delay_key = keys.DELAY if delayed else None
-    transforms += timeline_transforms(scenario, server, keys.STOPS, delay_key)
-    if own:
-        transforms += timeline_transforms(scenario, server, keys.OWN_STOPS, None)
+    own_key = keys.OWN_STOPS if own else None
+    transforms += timeline_transforms(scenario, server, keys.STOPS, delay_key, own_key=own_key)
     return transforms
 
 
@@ -205,6 +204,7 @@ def timeline_transforms(
     delay_key: NestedKey | None,
     *,
     group: bool = False,
+    own_key: NestedKey | None = None,
 ) -> list[Transform]:
     """What is known of the stops of the latest steps, for the feature ``timeline``, if it is
     observed."""
@@ -219,6 +219,7 @@ def timeline_transforms(
         encode=server.stop_facts,
         ages=server.stop_ages,
         group=group,
+        own_key=own_key,
     )
     return [timeline]
 

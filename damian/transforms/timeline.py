@@ -71,6 +71,8 @@ class ObservationTimeline(StatefulTransform):
         group: every agent gets the messages of all agents: its own first, then those of the agents
             after it.
         own: whether an agent knows its own messages as soon as they are sent.
+        own_key: key of a second timeline of the same shape, which holds what was sent, arrived or
+            not: what each sender knows itself. Not with ``group`` or ``position_key``.
 
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), "observation", "received", delay_key="delay")
@@ -92,21 +94,26 @@ class ObservationTimeline(StatefulTransform):
         ages: Callable[[Tensor], Tensor] | None = None,
         group: bool = False,
         own: bool = False,
+        own_key: NestedKey | None = None,
     ) -> None:
         checks.whole("slots", slots, 1)
         should = "goes with messages of the observer alone: leave out group and ages"
         alone = not group and ages is None
         checks.require(position_key is None or alone, "position_key", position_key, should)
+        shared = not group and position_key is None
+        should = "goes with messages in one frame: leave out group and position_key"
+        checks.require(own_key is None or shared, "own_key", own_key, should)
         super().__init__(message_key)
         self.slots = slots
         self.encode = encode
         self.ages = ages
         self.group = group
         self.own = own
-        written, self.delay_key, self.sent_key, self.position_key = (
-            sibling_key(self.row_key, key) for key in (out_key, delay_key, sent_key, position_key)
+        written, own, self.delay_key, self.sent_key, self.position_key = (
+            sibling_key(self.row_key, key)
+            for key in (out_key, own_key, delay_key, sent_key, position_key)
         )
-        self.out_keys = [written]
+        self.out_keys = existing([written, own])
         self.step_keys = existing([self.row_key, self.delay_key, self.sent_key, self.position_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
@@ -202,9 +209,15 @@ class ObservationTimeline(StatefulTransform):
 
     def _written(self, memory: Memory) -> Entries:
         """The timeline, from the memory."""
-        found = self._timeline(memory, memory["due"] <= 0)
-        found = found.view(*self.rows, *found.shape[1:])
-        return {self.out_keys[0]: found}
+        arrived = memory["due"] <= 0
+        found = [self._timeline(memory, arrived)]
+        if len(self.out_keys) > 1:
+            sent = memory["sent"].unsqueeze(-1)
+            found.append(torch.cat([memory["kept"] * sent, sent.to(memory["kept"].dtype)], -1))
+        return {
+            key: each.view(*self.rows, *each.shape[1:])
+            for key, each in zip(self.out_keys, found, strict=True)
+        }
 
     def _timeline(self, slots: Memory, arrived: Tensor) -> Tensor:
         """The timelines of M rows, [M, K, D + 1] or, with those of N agents each, [M, N, K, D + 1].
@@ -305,5 +318,6 @@ class ObservationTimeline(StatefulTransform):
         senders = rows[-1:] if self.group else ()
         shape = (*rows, *senders, self.slots, width)
         dtype = torch.promote_types(encoded.dtype, torch.float32)
-        add_spec(observation_spec, self.out_keys[0], shape, dtype)
+        for key in self.out_keys:
+            add_spec(observation_spec, key, shape, dtype)
         return observation_spec

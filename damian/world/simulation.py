@@ -291,9 +291,10 @@ class Simulation:
 
     def _events(self, detected: Tensor, serves: Tensor) -> Tensor:
         """What happens at a stop that begins now, as in ``Messages``, [B, N, E]."""
+        if not self.widths.events:
+            return serves[..., :0]
         heard = detected if self.config.seeks_source else detected[..., :0]
-        happens = torch.cat([heard.to(serves.dtype), serves], -1)
-        return happens[..., : self.widths.events]
+        return torch.cat([heard.to(serves.dtype), serves], -1)
 
     def _stops(
         self, state: State, now: Tensor, events: Tensor, added: Tensor | None
@@ -303,7 +304,9 @@ class Simulation:
         sent = state.sent
         trail = _prepended(state.goal, sent.trail)
         landed = _prepended(now, sent.landed)
-        happened = torch.cat([events.unsqueeze(-2), sent.events[..., :-1, :]], -2)
+        happened = sent.events
+        if self.widths.events:
+            happened = torch.cat([events.unsqueeze(-2), happened[..., :-1, :]], -2)
         if added is not None:
             added = added.unsqueeze(-1)
             trail = torch.where(added, trail, sent.trail)

@@ -111,6 +111,16 @@ def test_the_timeline_holds_what_has_arrived_of_the_latest_steps(group, own, lin
             assert found.reshape(expected.shape).equal(expected)
 
 
+def test_what_a_sender_knows_itself_stands_in_a_timeline_of_its_own():
+    env = late_uavs(own_key="own_timeline")
+    steps = env.rollout(20, break_when_any_done=False)
+    for world in range(WORLDS):
+        for sender in range(AGENTS):
+            expected = torch.stack(twin(steps, world, sender, False, True))
+            found = steps[world]["next", "agents", "own_timeline"][:, sender]
+            assert found.reshape(expected.shape).equal(expected)
+
+
 @pytest.mark.parametrize(("group", "own"), ALL)
 def test_stored_timelines_are_corrected_by_what_has_arrived_since(group, own):
     env = late_uavs(group=group, own=own)

@@ -16,6 +16,8 @@ def stop_facts(messages: Messages, context: ServerContext) -> Tensor:
     """Where the latest stops of which messages tell have been [m], and what happened there,
     [*, S, 2 + E]."""
     places = gather_rows(context.points, messages.trail)
+    if not messages.events.shape[-1]:
+        return places
     return torch.cat([places, messages.events], -1)
 
 
@@ -64,7 +66,8 @@ def _timeline(v: FeatureCache) -> Tensor:
     """
     messages = v.messages
     known = v(known_stops)
-    known = torch.cat([known[..., :2], known[..., -1:]], -1)
+    if known.shape[-1] > 3:  # events stand between place and mark
+        known = torch.cat([known[..., :2], known[..., -1:]], -1)
     flies = messages.in_flight.to(known.dtype).unsqueeze(-1)
     destination = torch.cat([messages.target, flies], -1).unsqueeze(-2)
     ways = ways_to_nearest(v, torch.cat([known, destination], -2))
