@@ -68,6 +68,14 @@ STOPS, OWN_STOPS = (AGENTS, "stops"), (AGENTS, "own_stops")
 has sent itself, [B, N, slots, 3 + E]."""
 HEARD_STOPS = (AGENTS, "heard_stops")
 """The same by what has reached a UAV directly, [B, N, N, slots, 3 + E] (receiver, sender)."""
+RECALLED, OWN_RECALLED = (AGENTS, "recalled"), (AGENTS, "own_recalled")
+"""The messages of the latest steps, the latest one first, each followed by 1 if it is known, else
+zeros: by what has arrived, and by all that a UAV has sent itself, [B, N, steps + 1, M + 1]."""
+FORWARD = (AGENTS, "forward")
+"""The messages that each UAV expects to be sent now, by a model of the world, [B, N, N, M]
+(receiver, sender)."""
+FORWARD_MASK = (AGENTS, "forward_mask")
+"""The actions that are legal by these messages, [B, N, N, A]."""
 LINK_DELAY = (AGENTS, "link_delay")
 """Delays of the messages sent directly in this step, [B, N, N] (receiver, sender); -1 for lost
 ones."""

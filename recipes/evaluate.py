@@ -12,7 +12,7 @@ from typing import NamedTuple, cast
 
 import torch
 from omegaconf import DictConfig
-from tensordict.nn import InteractionType
+from tensordict.nn import InteractionType, TensorDictModuleBase
 from torchrl.modules import ProbabilisticActor
 
 from damian.baselines.planner import Planner, planner_policy
@@ -36,7 +36,7 @@ from damian.runs.training_state import load_networks
 
 from . import cli
 from .config import EvaluateConfig, TrainConfig
-from .shared.learning import own_code
+from .shared.learning import assume, own_code
 from .shared.runs import run_settings, save_config, start
 
 MEANING = """untrained: the same network before any training; its results are not learnt. script: a rule
@@ -105,6 +105,7 @@ def load(
         eval_seed = config.eval_seed if seed is None else seed
         env = make_env(config, worlds, eval_seed, config.device, ["message"])
         policy = stored_actor(config, env).eval().requires_grad_(False)
+        assume(config, env, policy)
     add_recurrent_state(env, policy)
     kind = InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
     setattr(policy[-1], "default_interaction_type", kind)  # noqa: B010 (a module declares no such attribute)
@@ -118,19 +119,21 @@ def make_eval_env(config: TrainConfig) -> DelayedEnv:
 
 
 def report(
-    config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module | None = None
+    config: TrainConfig, folder: Path, env: DelayedEnv, actor: TensorDictModuleBase | None = None
 ) -> dict[str, Evaluation]:
     """Evaluate an actor beside others, write, print and return the results, by policy."""
 
-    def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
+    def fly(policy: TensorDictModuleBase, sample: bool = True, learnt: bool = False) -> Evaluation:
         env.set_seed(config.eval_seed)  # the same episodes for every policy
+        assume(config, env, policy if learnt else None)
         return evaluate(env, policy, config.horizon, sample, config.metrics)
 
     random = fly(random_policy(env))
     rows = {}
     for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():
         if policy is not None:
-            rows = {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)} | rows
+            most_likely = fly(policy, sample=False, learnt=True)
+            rows = {name: fly(policy, learnt=True), name + DETERMINISTIC: most_likely} | rows
     try:
         rows[SCRIPT] = fly(script_policy(env))
     except InputError as error:  # the region is too large for the script, but not for the networks
@@ -147,7 +150,7 @@ def report(
     return rows
 
 
-def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
+def untrained_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
     """The actor, with its prior, as a training of the same seed begins with it."""
     with torch.random.fork_rng(devices=[]), own_code(config.learner):
         torch.manual_seed(config.seed)

@@ -29,6 +29,7 @@ from damian.show.replay_page import save_page
 from . import cli
 from .config import FlyConfig
 from .evaluate import stored_actor
+from .shared.learning import assume
 from .shared.runs import save_config, start
 
 
@@ -41,6 +42,7 @@ def fly(config: FlyConfig) -> list[Episode]:
         add_recurrent_state(env, policy)
     else:
         policy = unlearnt_policy(config, env)
+    assume(config, env, policy if config.learnt else None)
     with set_exploration_type(ExplorationType.DETERMINISTIC if likely else ExplorationType.RANDOM):
         rollout = env.rollout(config.horizon, policy, break_when_any_done=False)
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "seed": config.seed}

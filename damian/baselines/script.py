@@ -14,6 +14,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.tensors import distances, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.forward import Assumed
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import any_of, chance_of_staying, detection_chance, places, report_rows
 from damian.server.features.actions import FLIGHT_COST, LEAST_GAIN, footprint_bits
@@ -21,6 +22,7 @@ from damian.server.features.requests import assignments, known_requests
 from damian.server.features.search import search_weights, seeking_of
 from damian.world.coverage import bit_count
 from damian.world.messages import Messages
+from damian.world.state import State
 
 PROBABLE = 0.1
 """If a UAV detects the source with this probability somewhere in the next step, it leaves its own
@@ -41,6 +43,10 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
     """Build the stateless scripted policy, for an environment with ``message`` among its extras."""
     worlds = env.uav_env
     available = env.observation_spec.keys(True, True)
+    if keys.FORWARD in available:
+        script = ForwardScript(script_without_belief(worlds))
+        forward_keys = [key for key in (keys.FORWARD, keys.FORWARD_MASK) if key in available]
+        return TensorDictModule(script, forward_keys, [keys.ACTION])
     believes = worlds.scenario.seeks_source and keys.BELIEF in available
     own_messages = worlds.scenario.observation.own
     if believes:
@@ -63,6 +69,35 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
 def script_without_belief(worlds: UavEnv) -> "Seeker":
     """The script as a function of packed messages and legal actions alone."""
     return _script_of(worlds, believes=False)(worlds)
+
+
+def assumed_script(env: DelayedEnv) -> Assumed:
+    """For ``DelayedEnv.assume``: everybody is assumed to follow the script."""
+    worlds = env.uav_env
+    script = script_without_belief(worlds)
+    masked = keys.ACTION_MASK in worlds.observation_spec.keys(True, True)
+
+    def choose(state: State) -> Tensor:
+        mask = worlds.simulation.action_mask(state) if masked else None
+        return script(state.sent.pack(), mask=mask)
+
+    return choose
+
+
+class ForwardScript:
+    """Each UAV applies the script to the messages that it expects to be sent now."""
+
+    def __init__(self, script: "Seeker") -> None:
+        self.script = script
+
+    def __call__(self, forward: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, N, M] (receiver, sender)."""
+        if mask is not None:
+            mask = mask.flatten(0, 1)
+        chosen = self.script(forward.flatten(0, 1), mask=mask)
+        everyone = chosen.unflatten(0, forward.shape[:2])
+        uav = torch.arange(forward.shape[1], device=forward.device)
+        return everyone[:, uav, uav]
 
 
 def _script_of(worlds: UavEnv, believes: bool) -> "type[Seeker]":

@@ -104,6 +104,15 @@ class ScenarioConfig(WorldConfig):
             "does not go with links=matrix: no UAV computes a belief from what it hears directly"
         )
         self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
+        forward = observation.forward
+        problem = "needs observation.own=true: a UAV that flies forward knows what it did itself"
+        self.refuse(forward and not observation.own, "observation.forward", problem)
+        problem = "does not go with links=matrix: what UAVs hear directly is not flown forward"
+        self.refuse(forward and links == "matrix", "observation.forward", problem)
+        problem = "does not go with observation.belief: no belief is flown forward"
+        self.refuse(forward and observation.belief, "observation.forward", problem)
+        problem = "=policy does not go with delay.history: the copies tell no past actions"
+        self.refuse(forward == "policy" and self.delay.history, "observation.forward", problem)
         drawn = {"source.miss", "source.false_alarm"} & {*self.randomise}
         problem = (
             "does not go with randomise of source.miss or source.false_alarm, which the filter "

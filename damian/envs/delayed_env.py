@@ -15,6 +15,7 @@ from damian.common import devices
 from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask
 from damian.delays.scenario import ScenarioDelays
+from damian.envs.forward import Assumed, Forward
 from damian.envs.nodes import Drop
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.layout import Layout
@@ -67,6 +68,13 @@ class DelayedEnv(TransformedEnv):
                     spec = self.observation_spec[key]
                     layouts[name] = _with_past_actions(layouts[name], transform.steps, spec)
         return layouts
+
+    def assume(self, policy: Assumed) -> None:
+        """Say what every UAV is assumed to choose, where ``observation.forward`` flies late
+        messages forward; nothing, if nothing is flown."""
+        for transform in self.transform.modules():
+            if isinstance(transform, Forward):
+                transform.assumed = policy
 
     # Seeds, checkpoints and compiling.
 

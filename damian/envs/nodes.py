@@ -19,7 +19,7 @@ from damian.server.belief import (
     places,
     report_rows,
 )
-from damian.server.server import Server
+from damian.server.server import Server, own_or_others
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.entries import Entries, add_spec, existing
 from damian.world.coverage import KnownCoverage
@@ -147,7 +147,11 @@ class ServerNode(WorldTransform):
         if self.heard_key:
             rows = self.server.with_own_knowledge(entries[self.heard_key], sent.unsqueeze(-3))
             heard = self.server.messages(rows)
-            heard_timeline = _by_sender(entries[keys.HEARD_STOPS]) if timeline is not None else None
+            heard_timeline = None
+            if keys.HEARD_STOPS in entries:
+                heard_timeline = _by_sender(entries[keys.HEARD_STOPS])
+            elif timeline is not None:
+                heard_timeline = own_or_others(entries[keys.OWN_STOPS], timeline, 2)
             written[keys.OBSERVATION] = self.server.observe_each(
                 heard, steps, timeline=heard_timeline
             )

@@ -25,6 +25,7 @@ from damian.common import checks
 from damian.delays.scenario import ScenarioDelays
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.forward import Forward, longest_flight
 from damian.envs.nodes import Belief, Drop, ServerNode
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
@@ -44,8 +45,10 @@ from damian.world.vehicles import MOTION_MODELS
 _STOPS = [keys.STOPS, keys.OWN_STOPS]
 """Entries that only back-updating reads behind the server node."""
 _REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LOSS]
-_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS]
+_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS, keys.FORWARD, keys.FORWARD_MASK]
 """Entries that only the extra ``message`` outputs."""
+_RECALLED = [keys.RECALLED, keys.OWN_RECALLED]
+"""Entries that nothing reads behind the server node."""
 _LINKED = [keys.LINKED, keys.LINK_DELAY, keys.HEARD_STOPS]
 """Entries from which UAVs that hear each other directly compute what they observe."""
 
@@ -69,7 +72,7 @@ def make_env(
     remote = has_server_node(scenario, delays)
     needed = {*["message"] * remote, *["position"] * delays.reads_positions}
     env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
-    pipeline = DelayedEnv(env, make_transforms(scenario, delays, env.server, extras))
+    pipeline = DelayedEnv(env, make_transforms(scenario, delays, env, extras))
     pipeline.delays = delays
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
@@ -78,14 +81,14 @@ def make_env(
 
 
 def make_transforms(
-    scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
+    scenario: ScenarioConfig, delays: ScenarioDelays, env: UavEnv, extras: Collection[str]
 ) -> Compose:
     """All transforms of a scenario in order: outputs pass them forwards, a policy's actions
     backwards."""
     remote = has_server_node(scenario, delays)
     transforms = [
         *action_transforms(scenario, delays),
-        *(server_transforms(scenario, delays, server, extras) if remote else []),
+        *(server_transforms(scenario, delays, env, extras) if remote else []),
         *reward_transforms(scenario, delays, extras),
         *observation_transforms(scenario, delays),
     ]
@@ -93,6 +96,7 @@ def make_transforms(
         *_LINKED * (scenario.links.kind == "matrix"),
         *_REPORTED * ("message" not in extras),
         *_STOPS * (not delays.obs.late),
+        *_RECALLED,
     ]
     if remote and dropped:
         transforms.append(Drop(dropped))
@@ -118,15 +122,20 @@ def action_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[
 
 
 def server_transforms(
-    scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
+    scenario: ScenarioConfig, delays: ScenarioDelays, env: UavEnv, extras: Collection[str]
 ) -> list[Transform]:
     """The message delay (paper, section 3.4), links, and the server node, which uses arrived
     messages."""
+    server = env.server
     output_messages = "message" in extras
     delayed = delays.obs.late
     links = scenario.links
+    forward = delayed and scenario.observation.forward
     remembers = (
-        server.grid is not None or scenario.delay.messages > 0 or scenario.observation.timeline > 0
+        server.grid is not None
+        or scenario.delay.messages > 0
+        or scenario.observation.timeline > 0
+        or forward
     )
     transforms: list[Transform] = []
     if delayed:
@@ -167,8 +176,30 @@ def server_transforms(
         transforms += timeline_transforms(
             scenario, server, keys.HEARD_STOPS, keys.LINK_DELAY, group=True
         )
+    if forward:
+        transforms += forward_transforms(scenario, delays, env, masks=output_messages)
+        heard = keys.FORWARD
     node = ServerNode(server, held, heard_key=heard, reward_terms="reward_terms" in extras)
     return [*transforms, node]
+
+
+def forward_transforms(
+    scenario: ScenarioConfig, delays: ScenarioDelays, env: UavEnv, *, masks: bool
+) -> list[Transform]:
+    """What flies late messages forward, and before it what keeps those of the latest steps."""
+    steps = scenario.observation.forward_steps
+    if not delays.obs.loses:  # what has been sent before has arrived
+        steps = min(steps, delays.obs.longest + longest_flight(env.simulation))
+    recalled = ObservationTimeline(
+        steps + 1,
+        keys.MESSAGE,
+        keys.RECALLED,
+        delay_key=keys.DELAY,
+        sent_key=keys.MESSAGE_SENT,
+        own_key=keys.OWN_RECALLED,
+    )
+    masks = masks and scenario.actions.kind == "discrete" and scenario.actions.mask
+    return [recalled, Forward(env.simulation, steps, masks=masks)]
 
 
 def remembering_transforms(

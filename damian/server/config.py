@@ -87,6 +87,16 @@ class ObservationConfig(Settings):
         high=100,
     )
 
+    forward: str | None = setting(
+        None,
+        "What late messages are flown forward by: by the script, or by the policy itself, which "
+        "everybody is then assumed to follow.",
+        choices=("script", "policy"),
+    )
+    forward_steps: int = setting(
+        20, "Most steps that are flown forward.", unit="steps", low=1, high=100
+    )
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("local_features", "global_features", "belief"):

@@ -269,10 +269,10 @@ class Server:
         from those that have
         arrived, and from all sent. ``belief``: that of each UAV, [*, N, K, C].
         """
-        known = self.messages(_own_or_others(sent, received, 1))
+        known = self.messages(own_or_others(sent, received, 1))
         both = None
         if timeline is not None and own_timeline is not None:
-            both = _own_or_others(own_timeline, timeline, 2)
+            both = own_or_others(own_timeline, timeline, 2)
         return self.observe_each(known, steps, belief, both)
 
     def observe_each(
@@ -335,7 +335,7 @@ class Server:
         return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)
 
 
-def _own_or_others(own: Tensor, others: Tensor, inner: int) -> Tensor:
+def own_or_others(own: Tensor, others: Tensor, inner: int) -> Tensor:
     """What each receiver knows of each sender, [*, N, N, ...]: of itself ``own``, of others
     ``others``.
 

@@ -320,8 +320,7 @@ class Simulation:
         serves = state.sent.serves
         if not self.widths.requests:
             return state, served, serves
-        counters = state.seed, state.episode, state.steps, state.region
-        requests = appear(state.requests, served, self.arrivals, counters, now)
+        requests = self._appear(state, now)
         radius = self.radius
         drawn = self.radii(state)
         if drawn is not None:
@@ -330,6 +329,11 @@ class Simulation:
         served, serves = serve(requests, served, place, lands, radius)
         serves = serves.unsqueeze(-1).to(now.dtype)
         return state._replace(requests=requests), served, serves
+
+    def _appear(self, state: State, now: Tensor) -> Tensor:
+        """The requests of each slot after some may have appeared, [B, M, 3]."""
+        counters = state.seed, state.episode, state.steps, state.region
+        return appear(state.requests, state.sent.served, self.arrivals, counters, now)
 
     def _heard(self, state: State, on_ground: Tensor) -> Tensor:
         """The latest request of each slot that each UAV knows, [B, N, M, 3]."""

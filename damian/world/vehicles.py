@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from damian.common import checks, counter_rng
+from damian.common.errors import InputError
 from damian.common.registry import Registry
-from damian.common.tensors import expand_mask, gather_rows, tree_where
+from damian.common.tensors import distances, expand_mask, gather_rows, tree_where
 from damian.world.airspace import Airspace
 from damian.world.battery import (
     battery_of,
@@ -100,6 +101,15 @@ class MotionModel(ABC):
         """Whether each UAV adds its landing point to its trail, [B, N] bool; None if all UAVs
         do."""
 
+    def resumed(self, state: State, since: Tensor) -> State:
+        """The state with the flights that ``state.sent`` tell of, sent ``since`` [B, N] steps.
+
+        Raises:
+            InputError: a model of a user's own does not say it.
+        """
+        should = "does not say how flights follow from messages (resumed): leave out forward"
+        raise InputError(f"motion.kind={self.motion.kind}: it {should}")
+
     def reach(self, state: State) -> Tensor:
         """Longest cruise of each UAV now [m], [B, N]; 0: it can only hold; negative: it may not
         choose."""
@@ -181,6 +191,10 @@ class InstantMotion(MotionModel):
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
         return state._replace(origin=state.goal, goal=goal)
 
+    def resumed(self, state: State, since: Tensor) -> State:
+        goal = state.sent.trail[..., 0]
+        return state._replace(origin=goal, goal=goal)
+
     def move(self, state: State) -> State:
         place = gather_rows(self.points, state.goal)
         height = torch.zeros_like(place[..., :1])
@@ -232,6 +246,35 @@ class PolynomialFlight(MotionModel):
             air=torch.where(ready, air, state.air),
             battery_before=torch.where(ready, state.battery, state.battery_before),
         )
+
+    def resumed(self, state: State, since: Tensor) -> State:
+        """Gusts are drawn anew, and batteries are those of the messages up to rounding."""
+        sent = state.sent
+        flies = sent.in_flight
+        stop = sent.trail[..., 0]
+        stop_before = sent.trail[..., min(1, sent.trail.shape[-1] - 1)]
+        origin = torch.where(flies, stop, stop_before)
+        goal = torch.where(flies, self._point_at(sent.target, state.region), stop)
+        at_reset = state.elapsed
+        ready = torch.ones_like(flies)
+        state = self.take_off(state._replace(goal=origin), goal, ready, goal != origin)
+        landed = sent.landed[..., 0]
+        landing = torch.where(landed > 0, self.steps(state).clamp(min=1), at_reset)
+        stood = ((sent.time - landed) / self.dt).round().long()
+        elapsed = torch.where(flies, 1, landing + stood)
+        battery_before = state.battery
+        if self.battery.enabled:
+            level = self.move(state._replace(elapsed=elapsed - 1)).battery
+            battery_before = battery_before + (sent.battery - level)
+        earlier = elapsed + since - 1  # the last of these steps is moved
+        return self.move(state._replace(elapsed=earlier, battery_before=battery_before))
+
+    def _point_at(self, places: Tensor, region: Tensor) -> Tensor:
+        """Flat ids of the landing points at places [B, N, 2], [B, N]."""
+        n_points = self.airspace.max_points
+        points = self.airspace.points[region]
+        nearest = distances(places, points).nan_to_num(nan=torch.inf).argmin(-1)
+        return nearest + region.unsqueeze(-1) * n_points
 
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)

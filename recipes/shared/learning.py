@@ -7,17 +7,20 @@ from typing import cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
 from torchrl.envs import TransformedEnv
 
 from damian import keys
+from damian.baselines.script import assumed_script
 from damian.common import checks
 from damian.common.compiling import COMPILE_OPTIONS
 from damian.common.devices import free_memory
 from damian.common.errors import naming_errors
 from damian.delays.scenario import ScenarioDelays
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.forward import assumed_policy
 from damian.envs.nodes import EpisodeTotals
 from damian.envs.pipeline import make_env
 from damian.envs.recompute import CORRECTED, server_recompute
@@ -49,10 +52,23 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     }  # from the storage, and delay.messages
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config, config.worlds, config.seed, config.device, extras)
+    assume(config, env)
     if config.compiles:
         env.compile()
     env.append_transform(EpisodeTotals())
     return env
+
+
+def assume(
+    config: TrainConfig, env: DelayedEnv, policy: TensorDictModuleBase | None = None
+) -> None:
+    """Say what everybody is assumed to do where late messages are flown forward: what the policy
+    does, if there is one and the settings ask for it, or else what the script does."""
+    forward = config.observation.forward
+    if forward == "policy" and policy is not None:
+        env.assume(assumed_policy(env.uav_env.simulation, env.server, policy))
+    elif forward:
+        env.assume(assumed_script(env))
 
 
 def own_code(learner: LearnerConfig) -> AbstractContextManager[None]:
@@ -70,6 +86,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
         has_actor = "actor" in learner.components()
     should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
     checks.require(has_actor, f"{name}: components", [*learner.components()], should)
+    assume(config, env, cast(TensorDictModuleBase, learner.components()["actor"]))
     return learner
 
 

@@ -13,6 +13,9 @@ from damian.world.config import MotionConfig
 OWN = ObservationConfig(own=True)
 BELIEF = ObservationConfig(belief=["belief_gain"])
 REFUSED = {
+    "observation.forward: script needs observation.own=true": lambda: square(
+        observation=ObservationConfig(forward="script")
+    ),
     "observation.own: True does not go with clock.server": lambda: square(
         observation=OWN, clock=ClockConfig(server="2s")
     ),

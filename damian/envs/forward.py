@@ -1,0 +1,235 @@
+"""What is late, flown forward: copies of the world, made of messages, that step until now."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from damian import keys
+from damian.common import checks, counter_rng
+from damian.common.errors import InputError
+from damian.common.tensors import expand_mask, tree_map, tree_where
+from damian.envs.nodes import WorldTransform
+from damian.server.features.base import stack
+from damian.server.server import Server, own_or_others
+from damian.transforms.base import Change, Memory
+from damian.transforms.entries import Entries, add_spec
+from damian.world.messages import Messages
+from damian.world.simulation import Simulation
+from damian.world.state import State
+
+Assumed = Callable[[State], Tensor]
+"""The actions [C, N] or [C, N, 2] that all UAVs are assumed to choose in the state of C worlds."""
+
+_STREAM = counter_rng.number_of("forward")
+
+
+class ToldWorlds(Simulation):
+    """The worlds of a simulation as messages tell of them.
+
+    Nobody knows where sources are, so that nothing is heard there, and no request appears that is
+    not known. What is random is drawn from streams of its own.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.__dict__ = simulation.__dict__  # the same tables, also on another device
+
+    def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
+        nowhere = torch.full_like(state.source, torch.inf)
+        silent = torch.zeros_like(nowhere[..., 0], dtype=torch.bool)
+        return nowhere, silent, silent
+
+    def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
+        return in_reach
+
+    def _appear(self, state: State, now: Tensor) -> Tensor:
+        return state.requests
+
+    def state_of(self, messages: Messages, region: Tensor, steps: Tensor) -> State:
+        """The state, ``steps`` [C] after the reset, that follows from each UAV's latest message,
+        [C, N].
+
+        A UAV on the ground has stood there since. ``region``: the index of that of each copy, [C].
+        """
+        copy = torch.arange(len(steps), device=steps.device)
+        state = tree_map(lambda row: row[:1].expand(len(copy), *row.shape[1:]), self.initial)
+        seed = counter_rng.bits64(torch.full_like(copy, _STREAM), copy)
+        height = torch.zeros_like(messages.track).unsqueeze(-1)
+        state = state._replace(
+            seed=seed,
+            region=region,
+            steps=steps,
+            position=torch.cat([messages.position, height], -1),
+            track=messages.track,
+            battery=messages.battery,
+            motions=messages.motions.masked_fill(messages.spotted, 0),
+            drawn=self.vehicles.values.draw(seed, torch.zeros_like(seed)),
+            sent=messages,
+        )
+        since = steps.unsqueeze(-1) - (messages.time / self.dt).round().long()
+        state = state._replace(message_sent=since == 0)
+        return self.vehicles.resumed(state, since)
+
+
+def longest_flight(simulation: Simulation) -> int:
+    """Steps of the longest flight in still air, during which a UAV sends nothing; 0 if flights
+    take no time."""
+    vehicles = simulation.vehicles
+    if vehicles.instant:
+        return 0
+    start = simulation.initial
+    length = start.track.new_full(start.track.shape, max(simulation.config.actions.distances))
+    seconds = 2 * vehicles.vertical(start) + vehicles.shortest_time(length, start.drawn)
+    return math.ceil(seconds.amax().item() / simulation.dt)
+
+
+class Forward(WorldTransform):
+    """Writes the messages that each UAV expects to be sent now, by a model of the world.
+
+    For each UAV a copy of the world begins with what it knows was true ``steps`` steps ago, and
+    steps until now. In each step every UAV does what the messages of that step tell, as far as they
+    have arrived, and else what ``assumed`` chooses in the copy. Where nothing is random and
+    everybody follows what is assumed, the messages are those that an undelayed server holds.
+
+    Args:
+        simulation: of the worlds.
+        steps: number of steps that are flown at most.
+        masks: also write which actions are legal in the copies.
+    """
+
+    stage = "server"
+
+    def __init__(self, simulation: Simulation, steps: int, *, masks: bool = False) -> None:
+        written = [keys.FORWARD, *[keys.FORWARD_MASK] * masks]
+        super().__init__([keys.MESSAGE], written)
+        self.worlds = ToldWorlds(simulation)
+        self.steps = steps
+        self.masks = masks
+        self.assumed: Assumed | None = None
+        """What everybody is assumed to choose; ``DelayedEnv.assume`` hands it in."""
+        self.step_keys = [keys.MESSAGE, keys.RECEIVED, keys.RECALLED, keys.OWN_RECALLED]
+        self.step_keys += [keys.ACTION_MASK] * masks
+
+    def init_memory(self, tensordict: object) -> Memory:
+        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long)}
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        n = entries[keys.MESSAGE].shape[1]
+        everyone = {keys.FORWARD: entries[keys.MESSAGE]}
+        if self.masks:
+            everyone[keys.FORWARD_MASK] = entries[keys.ACTION_MASK]
+        written: Entries = {
+            key: value.unsqueeze(1).expand(-1, n, *value.shape[1:]).clone()
+            for key, value in everyone.items()
+        }
+        return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, written
+
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
+        now = memory["elapsed"] + 1
+        sent = entries[keys.MESSAGE]
+        n_worlds, n = sent.shape[:2]
+        recalled = own_or_others(entries[keys.OWN_RECALLED], entries[keys.RECALLED], 2)
+        newest = own_or_others(sent, entries[keys.RECEIVED], 1)
+        state = self.flown(
+            recalled.flatten(0, 1), newest.flatten(0, 1), now.repeat_interleave(n, 0)
+        )
+        flown = state.sent.pack().view(n_worlds, n, n, -1)
+        itself = torch.eye(n, dtype=torch.bool, device=sent.device).unsqueeze(-1)
+        written: Entries = {keys.FORWARD: torch.where(itself, sent.unsqueeze(1), flown)}
+        if self.masks:
+            mask = self.worlds.action_mask(state)
+            written[keys.FORWARD_MASK] = mask.view(n_worlds, n, n, -1)
+        return {"elapsed": now}, written
+
+    def flown(self, recalled: Tensor, newest: Tensor, now: Tensor) -> State:
+        """The state of C copies ``now`` [C] steps after the reset.
+
+        ``recalled`` [C, N, steps + 1, M + 1] are the messages of the latest steps, the latest one
+        first, each followed by whether it is known; ``newest`` [C, N, M] the newest known of each
+        UAV.
+        """
+        worlds = self.worlds
+        assumed = self.assumed
+        if assumed is None:
+            raise InputError("observation.forward: hand in what to assume by env.assume(policy)")
+        rows = recalled[..., :-1]
+        known = recalled[..., -1] > 0
+        age = torch.arange(self.steps + 1, device=now.device)
+        earliest = torch.where(known, age, -1).argmax(-1)
+        at = earliest[..., None, None].expand(*earliest.shape, 1, rows.shape[-1])
+        first = rows.gather(2, at).squeeze(2)
+        first = torch.where(known.any(-1, keepdim=True), first, newest)
+        begin = (now - self.steps).clamp(min=0)
+        latest = self._messages(newest)
+        region = latest.region(worlds.airspace.max_points)
+        requests = latest.requests[:, 0]
+        state = worlds.state_of(self._messages(first), region, begin)
+        for back in range(self.steps, 0, -1):
+            after = now - back + 1
+            appeared = requests[..., 2:] <= (after * worlds.dt).view(-1, 1, 1)
+            state = state._replace(requests=torch.where(appeared, requests, -1.0))
+            following = worlds.step(state, assumed(state))
+            told = worlds.state_of(self._messages(rows[:, :, back - 1]), region, after)
+            following = _where_told(known[:, :, back - 1], told, following)
+            state = tree_where(after > 0, following, state)
+        return state
+
+    def _messages(self, rows: Tensor) -> Messages:
+        return Messages.unpack(rows, self.worlds.widths)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        message = observation_spec[keys.MESSAGE].shape
+        n = message[-2]
+        add_spec(observation_spec, keys.FORWARD, (*message[:-1], *message[-2:]))
+        if self.masks:
+            mask = observation_spec[keys.ACTION_MASK].shape
+            shape = (*mask[:-1], n, mask[-1])
+            add_spec(observation_spec, keys.FORWARD_MASK, shape, torch.bool)
+        return observation_spec
+
+
+_OF_UAVS = ("origin", "goal", "elapsed", "vertical", "cruise", "air", "battery_before")
+_OF_UAVS += ("position", "track", "battery", "motions", "message_sent", "sent")
+"""Fields of a state that have a row for each UAV, and follow from its messages."""
+
+
+def _where_told(known: Tensor, told: State, flown: State) -> State:
+    """The state of copies, with the UAVs of which messages are ``known`` [C, N] as these tell."""
+    replaced = {}
+    for name in _OF_UAVS:
+        new, old = getattr(told, name), getattr(flown, name)
+        if name == "sent":
+            replaced[name] = tree_where(known, new, old)
+        else:
+            replaced[name] = torch.where(expand_mask(known, new), new, old)
+    return flown._replace(**replaced)
+
+
+def assumed_policy(simulation: Simulation, server: Server, policy: TensorDictModuleBase) -> Assumed:
+    """For ``DelayedEnv.assume``: everybody is assumed to take the most likely action of a policy,
+    who observes the copies without any delay.
+
+    Raises:
+        InputError: the policy remembers, or reads more than observation and mask.
+    """
+    read = {*policy.in_keys} - {keys.OBSERVATION, keys.ACTION_MASK}
+    should = "reads no more than the observation: leave out model.rnn, or observation.forward"
+    checks.require(not read, "observation.forward", "policy", should)
+    names = server.observation.actor
+
+    def choose(state: State) -> Tensor:
+        observation = stack(server.features(state.sent, state.steps, names), names)
+        entries = {"observation": observation}
+        if keys.ACTION_MASK in policy.in_keys:
+            entries["action_mask"] = simulation.action_mask(state)
+        agents = TensorDict(entries, observation.shape[:2])
+        seen = TensorDict({keys.AGENTS: agents}, observation.shape[:1])
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return policy(seen)[keys.ACTION]
+
+    return choose
