@@ -41,6 +41,13 @@ def test_without_news_the_late_script_flies_as_the_undelayed_one(scenario, delay
     expected = flown(undelayed, script_policy(undelayed))
     found = flown(late, script_policy(late))
     same(expected, found, keys.ACTION, keys.MESSAGE)
+    rows = (found["next", *key] for key in (keys.FORWARD, keys.MESSAGE))
+    forward, truth = map(late.server.messages, rows)
+    for name in ("time", "position", "target", "trail", "landed"):
+        told, sent = getattr(forward, name), getattr(truth, name).unsqueeze(2)
+        assert told.equal(sent.expand_as(told)), name
+    # The battery at takeoff is known up to rounding.
+    assert (forward.battery - truth.battery.unsqueeze(2)).abs().max() < 1e-4
     place = undelayed.layout["observation"]["place"].columns
     others = undelayed.layout["observation"]["others"].columns
     for columns in (place, others):
