@@ -124,8 +124,8 @@ def _seeds(
     method = config.experiment.methods[name]
     methods = config.experiment.methods
     away = task != trained_in  # a held-out task, where nothing is trained
-    flown = method.policy_of or (name if away and not method.untrained else None)
-    trains = not (method.untrained or flown)
+    flown = method.policy_of or (name if away and not method.flies else None)
+    trains = not (method.flies or flown)
     words = ["logger=csv", *overrides, *method.overrides, *config.overrides]
     with named(_place(folder)):
         unseeded = composed(*words)

@@ -77,7 +77,7 @@ def assumed_script(env: DelayedEnv) -> Assumed:
     script = script_without_belief(worlds)
     masked = keys.ACTION_MASK in worlds.observation_spec.keys(True, True)
 
-    def choose(state: State) -> Tensor:
+    def choose(state: State, _: int) -> Tensor:
         mask = worlds.simulation.action_mask(state) if masked else None
         return script(state.sent.pack(), mask=mask)
 

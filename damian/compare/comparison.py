@@ -20,7 +20,15 @@ from damian.compare.statistics import (
     recovery,
 )
 from damian.runs.measures import declared
-from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, measured_in
+from damian.runs.run_folder import (
+    DETERMINISTIC,
+    PLANNER,
+    RANDOM,
+    SCRIPT,
+    TRAINED,
+    UNTRAINED,
+    measured_in,
+)
 
 SCRIPTED = (RANDOM, SCRIPT)
 """Policies that fly the same episodes beside each method, and learn nothing."""
@@ -37,6 +45,7 @@ COMPARED = ("J_norm", "recovery", "improvement")
 ``probability_of_improvement``). The
 naive method in them is the strongest of the same track: late data only, or simulator allowed."""
 LATE_DATA, SIMULATOR, NO_DELAY = "late data", "simulator", "no delay"
+WORLD_MODEL = "world model"
 """Regimes: the information that a method may use (docs/protocol.md)."""
 RUN = ["task", "delay", "method", "seed"]
 """Columns of results that name a run."""
@@ -47,10 +56,12 @@ LABELLED = ["task", "delay", "method", "regime", "policy", "seeds", "compared_se
 
 
 def regime(methods: Mapping[str, Method], name: str) -> str:
-    """The regime of a method: ``LATE_DATA``, ``SIMULATOR`` or ``NO_DELAY``."""
+    """The regime of a method: ``LATE_DATA``, ``SIMULATOR``, ``WORLD_MODEL`` or ``NO_DELAY``."""
     method = methods[name]
     if not method.delayed:
         return NO_DELAY
+    if method.has_model:
+        return WORLD_MODEL
     simulated = bool(method.simulator)
     if method.simulator is None and method.source:
         simulated = regime(methods, method.source) != LATE_DATA
@@ -155,9 +166,8 @@ class Comparison:
         return found
 
     def policy_of(self, method: str) -> str:
-        """The policy with which a method is compared: an untrained one has only its untrained
-        network."""
-        return UNTRAINED if self.methods[method].untrained else TRAINED
+        """The policy with which a method is compared: the trained one, if it trains any."""
+        return self.methods[method].flies or TRAINED
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -178,7 +188,9 @@ class Comparison:
     def _lines_of(self, task: str, delay: str) -> Iterator[dict[str, Any]]:
         scores = self.scores(task, delay)
         methods = self._present(task, delay)
-        flown = [*product(methods, OF_METHOD), *product(methods[:1], SCRIPTED)]
+        others = [(name, self.policy_of(name)) for name in methods]
+        others = [pair for pair in others if pair[1] in (SCRIPT, PLANNER)]
+        flown = [*product(methods, OF_METHOD), *others, *product(methods[:1], SCRIPTED)]
         for method, policy in flown:
             runs = self._runs.get((task, delay, method, policy))
             if runs is None:
@@ -192,9 +204,10 @@ class Comparison:
                 "seeds": len(runs),
                 "compared_seeds": 0,
             }
-            if policy in SCRIPTED:
+            own = policy == self.policy_of(method)
+            if policy in SCRIPTED and not own:
                 line |= {"method": policy, "regime": ""}
-            elif policy == self.policy_of(method) and delay != NOT_LATE:
+            elif own and delay != NOT_LATE:
                 line |= self._compared(scores, method)
             yield line | means_over_seeds(runs[self.measured])
 

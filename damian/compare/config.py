@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 from damian.common import checks
 from damian.common.fields import Settings, setting
 from damian.runs.measures import check_score
+from damian.runs.run_folder import PLANNER, SCRIPT, UNTRAINED
 
 MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
@@ -41,8 +42,11 @@ class Method(Settings):
     teacher: str | None = setting(
         None, "Method whose policies its learner imitates: ``learner.teacher``."
     )
-    untrained: bool = setting(
-        False, "Whether the networks fly as they are before the first update."
+    flies: str | None = setting(
+        None,
+        "What flies in the place of a trained policy: the network before the first update, the "
+        "script, or the planner.",
+        choices=(UNTRAINED, SCRIPT, PLANNER),
     )
     tasks: list[str] | None = setting(None, "Tasks that the method does; all of them if not given.")
     simulator: bool | None = setting(
@@ -55,6 +59,12 @@ class Method(Settings):
     def source(self) -> str | None:
         """Method whose policies it flies, starts from, or imitates."""
         return self.policy_of or self.starts_from or self.teacher
+
+    @property
+    def has_model(self) -> bool:
+        """Whether it flies with a model of the world, which tells what is not known yet."""
+        flown_forward = any(word.startswith("observation.forward=") for word in self.overrides)
+        return flown_forward or self.flies == PLANNER
 
 
 @dataclass
@@ -116,7 +126,7 @@ class Experiment(Settings):
             key = f"experiment.methods.{name}"
             good = method.delayed and method.policy_of is None
             should = "goes with neither policy_of nor delayed=false"
-            checks.require(good or not method.untrained, key, "untrained", should)
+            checks.require(good or not method.flies, f"{key}.flies", method.flies, should)
             source = self.methods.get(method.source or "", method)
             for task in self.tasks if method.tasks is None else method.tasks:
                 options = self.tasks if source.tasks is None else source.tasks
@@ -161,7 +171,7 @@ class CompareConfig(Settings):
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))
         methods = self.chosen("methods")
-        trained = [n for n, a in methods.items() if not (a.policy_of or a.untrained)]
+        trained = [n for n, a in methods.items() if not (a.policy_of or a.flies)]
         for name, method in methods.items():
             for kind in ("policy_of", "starts_from", "teacher"):
                 if getattr(method, kind) is not None:

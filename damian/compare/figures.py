@@ -156,7 +156,7 @@ def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
 def look(methods: Mapping[str, Method], method: str) -> dict[str, Any]:
     """Style of a method by its place among all; dotted lines are of methods that train nothing."""
     again, colour = divmod([*methods].index(method), len(METHOD_COLOURS))
-    trains = methods[method].policy_of is None and not methods[method].untrained
+    trains = methods[method].policy_of is None and not methods[method].flies
     return {
         "color": METHOD_COLOURS[colour],
         "marker": "os^D"[again % 4],

@@ -23,8 +23,9 @@ from damian.world.messages import Messages
 from damian.world.simulation import Simulation
 from damian.world.state import State
 
-Assumed = Callable[[State], Tensor]
-"""The actions [C, N] or [C, N, 2] that all UAVs are assumed to choose in the state of C worlds."""
+Assumed = Callable[[State, int], Tensor]
+"""The actions [C, N] or [C, N, 2] that all UAVs are assumed to have chosen in the state of C
+worlds, so many steps ago."""
 
 _STREAM = counter_rng.number_of("forward")
 
@@ -75,6 +76,39 @@ class ToldWorlds(Simulation):
         state = state._replace(message_sent=since == 0)
         return self.vehicles.resumed(state, since)
 
+    def flown(self, recalled: Tensor, newest: Tensor, now: Tensor, assumed: Assumed) -> State:
+        """The state of C copies ``now`` [C] steps after the reset.
+
+        ``recalled`` [C, N, S + 1, M + 1] are the messages of the latest steps, the latest one
+        first, each followed by whether it is known; ``newest`` [C, N, M] the newest known of each
+        UAV. The copies begin S steps ago.
+        """
+        rows = recalled[..., :-1]
+        known = recalled[..., -1] > 0
+        steps = rows.shape[2] - 1
+        age = torch.arange(steps + 1, device=now.device)
+        earliest = torch.where(known, age, -1).argmax(-1)
+        at = earliest[..., None, None].expand(*earliest.shape, 1, rows.shape[-1])
+        first = rows.gather(2, at).squeeze(2)
+        first = torch.where(known.any(-1, keepdim=True), first, newest)
+        begin = (now - steps).clamp(min=0)
+        latest = self._messages(newest)
+        region = latest.region(self.airspace.max_points)
+        requests = latest.requests[:, 0]
+        state = self.state_of(self._messages(first), region, begin)
+        for back in range(steps, 0, -1):
+            after = now - back + 1
+            appeared = requests[..., 2:] <= (after * self.dt).view(-1, 1, 1)
+            state = state._replace(requests=torch.where(appeared, requests, -1.0))
+            following = self.step(state, assumed(state, back))
+            told = self.state_of(self._messages(rows[:, :, back - 1]), region, after)
+            following = _where_told(known[:, :, back - 1], told, following)
+            state = tree_where(after > 0, following, state)
+        return state
+
+    def _messages(self, rows: Tensor) -> Messages:
+        return Messages.unpack(rows, self.widths)
+
 
 def longest_flight(simulation: Simulation) -> int:
     """Steps of the longest flight in still air, during which a UAV sends nothing; 0 if flights
@@ -91,24 +125,22 @@ def longest_flight(simulation: Simulation) -> int:
 class Forward(WorldTransform):
     """Writes the messages that each UAV expects to be sent now, by a model of the world.
 
-    For each UAV a copy of the world begins with what it knows was true ``steps`` steps ago, and
-    steps until now. In each step every UAV does what the messages of that step tell, as far as they
+    For each UAV a copy of the world begins with what it knows was true as long ago as the messages
+    that it recalls reach, and steps until now. In each step every UAV does what the messages of that step tell, as far as they
     have arrived, and else what ``assumed`` chooses in the copy. Where nothing is random and
     everybody follows what is assumed, the messages are those that an undelayed server holds.
 
     Args:
         simulation: of the worlds.
-        steps: number of steps that are flown at most.
         masks: also write which actions are legal in the copies.
     """
 
     stage = "server"
 
-    def __init__(self, simulation: Simulation, steps: int, *, masks: bool = False) -> None:
+    def __init__(self, simulation: Simulation, *, masks: bool = False) -> None:
         written = [keys.FORWARD, *[keys.FORWARD_MASK] * masks]
         super().__init__([keys.MESSAGE], written)
         self.worlds = ToldWorlds(simulation)
-        self.steps = steps
         self.masks = masks
         self.assumed: Assumed | None = None
         """What everybody is assumed to choose; ``DelayedEnv.assume`` hands it in."""
@@ -130,14 +162,15 @@ class Forward(WorldTransform):
         return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, written
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
+        if self.assumed is None:
+            raise InputError("observation.forward: hand in what to assume by env.assume(policy)")
         now = memory["elapsed"] + 1
         sent = entries[keys.MESSAGE]
         n_worlds, n = sent.shape[:2]
         recalled = own_or_others(entries[keys.OWN_RECALLED], entries[keys.RECALLED], 2)
         newest = own_or_others(sent, entries[keys.RECEIVED], 1)
-        state = self.flown(
-            recalled.flatten(0, 1), newest.flatten(0, 1), now.repeat_interleave(n, 0)
-        )
+        copies = recalled.flatten(0, 1), newest.flatten(0, 1), now.repeat_interleave(n, 0)
+        state = self.worlds.flown(*copies, self.assumed)
         flown = state.sent.pack().view(n_worlds, n, n, -1)
         itself = torch.eye(n, dtype=torch.bool, device=sent.device).unsqueeze(-1)
         written: Entries = {keys.FORWARD: torch.where(itself, sent.unsqueeze(1), flown)}
@@ -145,42 +178,6 @@ class Forward(WorldTransform):
             mask = self.worlds.action_mask(state)
             written[keys.FORWARD_MASK] = mask.view(n_worlds, n, n, -1)
         return {"elapsed": now}, written
-
-    def flown(self, recalled: Tensor, newest: Tensor, now: Tensor) -> State:
-        """The state of C copies ``now`` [C] steps after the reset.
-
-        ``recalled`` [C, N, steps + 1, M + 1] are the messages of the latest steps, the latest one
-        first, each followed by whether it is known; ``newest`` [C, N, M] the newest known of each
-        UAV.
-        """
-        worlds = self.worlds
-        assumed = self.assumed
-        if assumed is None:
-            raise InputError("observation.forward: hand in what to assume by env.assume(policy)")
-        rows = recalled[..., :-1]
-        known = recalled[..., -1] > 0
-        age = torch.arange(self.steps + 1, device=now.device)
-        earliest = torch.where(known, age, -1).argmax(-1)
-        at = earliest[..., None, None].expand(*earliest.shape, 1, rows.shape[-1])
-        first = rows.gather(2, at).squeeze(2)
-        first = torch.where(known.any(-1, keepdim=True), first, newest)
-        begin = (now - self.steps).clamp(min=0)
-        latest = self._messages(newest)
-        region = latest.region(worlds.airspace.max_points)
-        requests = latest.requests[:, 0]
-        state = worlds.state_of(self._messages(first), region, begin)
-        for back in range(self.steps, 0, -1):
-            after = now - back + 1
-            appeared = requests[..., 2:] <= (after * worlds.dt).view(-1, 1, 1)
-            state = state._replace(requests=torch.where(appeared, requests, -1.0))
-            following = worlds.step(state, assumed(state))
-            told = worlds.state_of(self._messages(rows[:, :, back - 1]), region, after)
-            following = _where_told(known[:, :, back - 1], told, following)
-            state = tree_where(after > 0, following, state)
-        return state
-
-    def _messages(self, rows: Tensor) -> Messages:
-        return Messages.unpack(rows, self.worlds.widths)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         message = observation_spec[keys.MESSAGE].shape
@@ -222,7 +219,7 @@ def assumed_policy(simulation: Simulation, server: Server, policy: TensorDictMod
     checks.require(not read, "observation.forward", "policy", should)
     names = server.observation.actor
 
-    def choose(state: State) -> Tensor:
+    def choose(state: State, _: int) -> Tensor:
         observation = stack(server.features(state.sent, state.steps, names), names)
         entries = {"observation": observation}
         if keys.ACTION_MASK in policy.in_keys:

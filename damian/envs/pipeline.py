@@ -45,10 +45,9 @@ from damian.world.vehicles import MOTION_MODELS
 _STOPS = [keys.STOPS, keys.OWN_STOPS]
 """Entries that only back-updating reads behind the server node."""
 _REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LOSS]
-_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS, keys.FORWARD, keys.FORWARD_MASK]
+_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS]
+_REPORTED += [keys.RECALLED, keys.OWN_RECALLED, keys.FORWARD, keys.FORWARD_MASK]
 """Entries that only the extra ``message`` outputs."""
-_RECALLED = [keys.RECALLED, keys.OWN_RECALLED]
-"""Entries that nothing reads behind the server node."""
 _LINKED = [keys.LINKED, keys.LINK_DELAY, keys.HEARD_STOPS]
 """Entries from which UAVs that hear each other directly compute what they observe."""
 
@@ -96,7 +95,6 @@ def make_transforms(
         *_LINKED * (scenario.links.kind == "matrix"),
         *_REPORTED * ("message" not in extras),
         *_STOPS * (not delays.obs.late),
-        *_RECALLED,
     ]
     if remote and dropped:
         transforms.append(Drop(dropped))
@@ -199,7 +197,7 @@ def forward_transforms(
         own_key=keys.OWN_RECALLED,
     )
     masks = masks and scenario.actions.kind == "discrete" and scenario.actions.mask
-    return [recalled, Forward(env.simulation, steps, masks=masks)]
+    return [recalled, Forward(env.simulation, masks=masks)]
 
 
 def remembering_transforms(

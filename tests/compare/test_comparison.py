@@ -143,7 +143,7 @@ def test_a_recovery_is_from_the_naive_method_of_the_same_track_if_the_delay_cost
 
 
 def test_an_untrained_network_stands_beside_the_trained_one_and_as_a_method_of_its_own():
-    methods = METHODS | {"prior": Method(untrained=True)}
+    methods = METHODS | {"prior": Method(flies="untrained")}
     rows = rows_of("t", "late", SCORES)
     prior = itertools.product(("aware", "prior"), (0, 1))
     rows += [row("t", "late", method, seed, 2.0 + seed, UNTRAINED) for method, seed in prior]
