@@ -4,22 +4,25 @@ script flies on (one-at-a-time rollout; Bertsekas 2021)."""
 import time
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from damian import keys
 from damian.baselines.script import script_without_belief
 from damian.common import checks, counter_rng
-from damian.common.tensors import tree_map
+from damian.common.tensors import gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.forward import ToldWorlds
 from damian.envs.uav_env import UavEnv
+from damian.world.simulation import Simulation
 from damian.world.state import State
 
 _STREAM = counter_rng.number_of("planner")
 
 
 def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> TensorDictModule:
-    """Build a policy that plans in copies of the worlds of an environment without late messages.
+    """Build a policy that plans in copies of the worlds of an environment.
 
     For each UAV in turn, in index order, every legal action is tried, with what the UAVs before it
     have chosen, while the later ones, and all of them in later steps, follow the script. The action
@@ -28,29 +31,44 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     reports. Where sources are and how they will move they know, so that with sources the planner is
     clairvoyant.
 
+    Where messages are late (with ``observation.forward``), all UAVs share one plan. It is made
+    from the messages that the server holds, in a copy of the world that has flown until now by the
+    plans of the steps between, and each UAV flies to its planned place.
+
     Args:
         env: environment whose worlds the policy flies, [B]; with ``message`` among its extras.
         horizon: steps to look ahead.
         samples: copies of a world for each action.
 
     Raises:
-        InputError: actions are continuous, or messages are late.
+        InputError: actions are continuous, or late messages are not flown forward.
     """
     actions = env.uav_env.scenario.actions
     checks.require(actions.kind == "discrete", "policy", "planner", "needs discrete actions")
-    should = "plans on the present state: leave out delay.obs, or fly an undelayed environment"
-    checks.require(not env.delays.obs.late, "policy", "planner", should)
-    planner = Planner(env.uav_env, horizon, samples)
-    return TensorDictModule(planner, [keys.MESSAGE], [keys.ACTION])
+    if not env.delays.obs.late:
+        planner = Planner(env.uav_env, env.uav_env.simulation, horizon, samples)
+        return TensorDictModule(planner, [keys.MESSAGE], [keys.ACTION])
+    should = "plans from late messages with observation.own=true observation.forward=script"
+    told = keys.RECALLED in env.observation_spec.keys(True, True)
+    checks.require(told, "policy", "planner", should)
+    late = LatePlanner(env.uav_env, ToldWorlds(env.uav_env.simulation), horizon, samples)
+    read: list[NestedKey] = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
+    if keys.ACTION_MASK in env.observation_spec.keys(True, True):
+        read.append(keys.ACTION_MASK)
+    return TensorDictModule(late, read, [keys.ACTION])
 
 
 class Planner:
-    """Function from the messages of B worlds, whose states it reads, to actions."""
+    """Function from the messages of B worlds, whose states it reads, to actions.
 
-    def __init__(self, worlds: UavEnv, horizon: int, samples: int) -> None:
+    It plans in copies that ``simulation`` steps.
+    """
+
+    def __init__(self, worlds: UavEnv, simulation: Simulation, horizon: int, samples: int) -> None:
         checks.whole("planner.horizon", horizon, 1, 1000)
         checks.whole("planner.samples", samples, 1, 1000)
         self.worlds = worlds
+        self.simulation = simulation
         self.horizon = horizon
         self.samples = samples
         self.script = script_without_belief(worlds)
@@ -61,20 +79,24 @@ class Planner:
     def __call__(self, message: Tensor) -> Tensor:
         """Actions, [B, N], from the messages [B, N, M] of the worlds' present states."""
         begin = time.perf_counter()
-        state = self.worlds.state
-        legal = self.worlds.simulation.action_mask(state)
-        joint = self.script(message, mask=legal)
+        joint = self.plan(self.worlds.state)
+        self.milliseconds.append(1000 * (time.perf_counter() - begin))
+        return joint
+
+    def plan(self, state: State) -> Tensor:
+        """The actions of all UAVs, [B, N], from a state."""
+        legal = self.simulation.action_mask(state)
+        joint = self.script(state.sent.pack(), mask=legal)
         for uav in range(joint.shape[1]):
             value = self.values(state, joint, uav).where(legal[:, uav], -torch.inf)
             usual = value.gather(-1, joint[:, uav : uav + 1]).squeeze(-1)
             better = value.amax(-1) > usual + 1e-6
             joint[:, uav] = torch.where(better, value.argmax(-1), joint[:, uav])
-        self.milliseconds.append(1000 * (time.perf_counter() - begin))
         return joint
 
     def choice(self, state: State) -> Tensor:
         """The actions that the script chooses in a state, [B, N]."""
-        mask = self.worlds.simulation.action_mask(state)
+        mask = self.simulation.action_mask(state)
         return self.script(state.sent.pack(), mask=mask)
 
     def values(self, state: State, joint: Tensor, uav: int) -> Tensor:
@@ -96,8 +118,68 @@ class Planner:
         for step in range(self.horizon):
             if step:
                 actions = self.choice(copies)
-            copies = self.worlds.simulation.step(copies, actions)
+            copies = self.simulation.step(copies, actions)
             served = self.worlds.server(copies.sent, copies.steps, copies.source_over, observers=())
             total += served.reward.sum(-1) * alive
             alive *= ~(served.status.terminated | served.status.truncated)
         return total.view(len(joint), n_actions, self.samples).mean(-1)
+
+
+class LatePlanner(Planner):
+    """Function from late messages of B worlds to actions, which remembers its latest plans."""
+
+    simulation: ToldWorlds
+
+    def __init__(self, worlds: UavEnv, simulation: ToldWorlds, horizon: int, samples: int) -> None:
+        super().__init__(worlds, simulation, horizon, samples)
+        self.steps: Tensor | None = None
+        """Steps of each world since its reset, [B]."""
+        self.plans: Tensor | None = None
+        """Flat ids of the landing points planned in the latest steps, the latest first,
+        [B, S, N]."""
+
+    @torch.no_grad()
+    def __call__(  # type: ignore[override]
+        self, recalled: Tensor, received: Tensor, message: Tensor, mask: Tensor | None = None
+    ) -> Tensor:
+        """Actions, [B, N], from what the server has received in the latest steps, and last.
+
+        Where it stands, [B, N, M], and what it may do, [B, N, A], each UAV knows itself.
+        """
+        begin = time.perf_counter()
+        sent = self.worlds.server.messages(message)
+        if self.steps is None or self.plans is None:
+            n_worlds, n, n_slots = recalled.shape[:3]
+            self.steps = recalled.new_zeros(n_worlds, dtype=torch.long)
+            self.plans = self.steps.new_zeros(n_worlds, n_slots - 1, n)
+        begins = (sent.time == 0).all(-1)
+        now = torch.where(begins, 0, self.steps + 1)
+        plans = self.plans
+
+        def as_planned(state: State, back: int) -> Tensor:
+            return self.towards(state.goal, plans[:, back - 1], self.simulation.action_mask(state))
+
+        state = self.simulation.flown(recalled, received, now, as_planned)
+        goals = self.planned(state, self.plan(state))
+        self.steps = now
+        self.plans = torch.cat([goals.unsqueeze(1), plans[:, :-1]], 1)
+        standing = self.simulation.airspace.point_at(sent.target, state.region)
+        action = self.towards(standing, goals, mask)
+        self.milliseconds.append(1000 * (time.perf_counter() - begin))
+        return action
+
+    def planned(self, state: State, joint: Tensor) -> Tensor:
+        """The flat ids of the landing points to which actions [B, N] lead, [B, N]."""
+        nearest = gather_rows(self.simulation.candidates.nearest, state.goal)
+        return nearest.gather(-1, joint.unsqueeze(-1)).squeeze(-1)
+
+    def towards(self, standing: Tensor, goals: Tensor, mask: Tensor | None) -> Tensor:
+        """The actions that lead nearest to the landing points ``goals`` from others, flat ids
+        [B, N] each."""
+        nearest = gather_rows(self.simulation.candidates.nearest, standing)
+        points = self.simulation.points
+        ways = gather_rows(points, nearest) - gather_rows(points, goals).unsqueeze(-2)
+        left = ways.square().sum(-1)
+        if mask is not None:
+            left = left.where(mask, torch.inf)
+        return left.argmin(-1)

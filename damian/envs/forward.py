@@ -126,9 +126,10 @@ class Forward(WorldTransform):
     """Writes the messages that each UAV expects to be sent now, by a model of the world.
 
     For each UAV a copy of the world begins with what it knows was true as long ago as the messages
-    that it recalls reach, and steps until now. In each step every UAV does what the messages of that step tell, as far as they
-    have arrived, and else what ``assumed`` chooses in the copy. Where nothing is random and
-    everybody follows what is assumed, the messages are those that an undelayed server holds.
+    that it recalls reach, and steps until now. In each step every UAV does what the messages of
+    that step tell, as far as they have arrived, and else what ``assumed`` chooses in the copy.
+    Where nothing is random and everybody follows what is assumed, the messages are those that an
+    undelayed server holds.
 
     Args:
         simulation: of the worlds.

@@ -10,7 +10,7 @@ from torch import Tensor
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
 from damian.common.registry import Registry
-from damian.common.tensors import distances, expand_mask, gather_rows, tree_where
+from damian.common.tensors import expand_mask, gather_rows, tree_where
 from damian.world.airspace import Airspace
 from damian.world.battery import (
     battery_of,
@@ -254,7 +254,7 @@ class PolynomialFlight(MotionModel):
         stop = sent.trail[..., 0]
         stop_before = sent.trail[..., min(1, sent.trail.shape[-1] - 1)]
         origin = torch.where(flies, stop, stop_before)
-        goal = torch.where(flies, self._point_at(sent.target, state.region), stop)
+        goal = torch.where(flies, self.airspace.point_at(sent.target, state.region), stop)
         at_reset = state.elapsed
         ready = torch.ones_like(flies)
         state = self.take_off(state._replace(goal=origin), goal, ready, goal != origin)
@@ -268,13 +268,6 @@ class PolynomialFlight(MotionModel):
             battery_before = battery_before + (sent.battery - level)
         earlier = elapsed + since - 1  # the last of these steps is moved
         return self.move(state._replace(elapsed=earlier, battery_before=battery_before))
-
-    def _point_at(self, places: Tensor, region: Tensor) -> Tensor:
-        """Flat ids of the landing points at places [B, N, 2], [B, N]."""
-        n_points = self.airspace.max_points
-        points = self.airspace.points[region]
-        nearest = distances(places, points).nan_to_num(nan=torch.inf).argmin(-1)
-        return nearest + region.unsqueeze(-1) * n_points
 
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)

@@ -4,7 +4,7 @@ import pytest
 
 from damian import keys, make_env
 from damian.baselines.planner import Planner, planner_policy
-from damian.baselines.script import script_policy
+from damian.baselines.script import assumed_script, script_policy
 from damian.common.errors import InputError
 from damian.recipes.shared.environments import compose_scenario
 
@@ -70,9 +70,20 @@ def test_the_planner_returns_more_than_the_script_and_tells_its_time():
     assert len(planner.module.milliseconds) == 15
 
 
+@pytest.mark.parametrize("delay", ["delay.obs=2", "delay.obs=1..3"])
+def test_without_news_a_late_plan_is_the_undelayed_one(delay):
+    chosen = []
+    for words in ([], [delay, "observation.own=true", "observation.forward=script"]):
+        env = made(*words, worlds=3)
+        env.assume(assumed_script(env))
+        rollout = env.rollout(8, planner_policy(env, 2), break_when_any_done=False)
+        chosen.append(rollout[keys.ACTION])
+    assert chosen[0].equal(chosen[1])
+
+
 def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same():
     env = make_env(compose_scenario("scenario=requests"), 2, seed=5, extras=["message"])
-    planner = Planner(env.uav_env, 6, 2)
+    planner = Planner(env.uav_env, env.uav_env.simulation, 6, 2)
     env.rollout(5, break_when_any_done=False)
     state = env.uav_env.state
     joint = planner.choice(state)
@@ -90,7 +101,7 @@ def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same(
 
 @pytest.mark.parametrize(
     ("word", "error"),
-    [("delay.obs=2", "plans on the present state"), ("actions=continuous", "needs discrete")],
+    [("delay.obs=2", "observation.forward=script"), ("actions=continuous", "needs discrete")],
 )
 def test_what_it_cannot_plan_is_refused(word, error):
     scenario = compose_scenario("scenario=delaybench/crowded", word)
