@@ -35,7 +35,7 @@ from damian.runs.run_folder import (
 from damian.runs.training_state import load_networks
 
 from . import cli
-from .config import EvaluateConfig, TrainConfig
+from .config import EvaluateConfig, PlannerConfig, TrainConfig
 from .shared.learning import assume, own_code
 from .shared.runs import run_settings, save_config, start
 
@@ -51,7 +51,14 @@ def fly(config: TrainConfig, folder: Path) -> None:
     env = make_eval_env(config)
     actor = stored_actor(config, env) if config.checkpoint else None
     save_config(config, folder)
-    report(config, folder, env, actor)
+    asked = isinstance(config, EvaluateConfig) and config.policy == PLANNER
+    report(config, folder, env, actor, config.planner if asked else None)
+
+
+def fly_planner(config: TrainConfig, folder: Path) -> None:
+    """Evaluate the planner, with its default settings, beside the untrained networks."""
+    save_config(config, folder)
+    report(config, folder, make_eval_env(config), planner=PlannerConfig())
 
 
 def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
@@ -119,7 +126,11 @@ def make_eval_env(config: TrainConfig) -> DelayedEnv:
 
 
 def report(
-    config: TrainConfig, folder: Path, env: DelayedEnv, actor: TensorDictModuleBase | None = None
+    config: TrainConfig,
+    folder: Path,
+    env: DelayedEnv,
+    actor: TensorDictModuleBase | None = None,
+    planner: PlannerConfig | None = None,
 ) -> dict[str, Evaluation]:
     """Evaluate an actor beside others, write, print and return the results, by policy."""
 
@@ -139,10 +150,10 @@ def report(
     except InputError as error:  # the region is too large for the script, but not for the networks
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
-    if isinstance(config, EvaluateConfig) and config.policy == PLANNER:
-        planner = planner_policy(env, config.planner.horizon, config.planner.samples)
-        rows[PLANNER] = fly(planner)
-        spent = cast(Planner, planner.module).milliseconds
+    if planner is not None:
+        policy = planner_policy(env, planner.horizon, planner.samples)
+        rows[PLANNER] = fly(policy)
+        spent = cast(Planner, policy.module).milliseconds
         print(f"planner: {statistics.median(spent):.0f} ms for a decision in all worlds at once")
     succeeds = config.episode.can_succeed
     table = save_results(rows, folder, succeeds, env.delays.obs.late, MEANING)
