@@ -51,8 +51,10 @@ def fly(config: TrainConfig, folder: Path) -> None:
     env = make_eval_env(config)
     actor = stored_actor(config, env) if config.checkpoint else None
     save_config(config, folder)
-    asked = isinstance(config, EvaluateConfig) and config.policy == PLANNER
-    report(config, folder, env, actor, config.planner if asked else None)
+    planner = None
+    if isinstance(config, EvaluateConfig) and config.policy == PLANNER:
+        planner = config.planner
+    report(config, folder, env, actor, planner)
 
 
 def fly_planner(config: TrainConfig, folder: Path) -> None:

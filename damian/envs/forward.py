@@ -153,7 +153,7 @@ class Forward(WorldTransform):
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         n = entries[keys.MESSAGE].shape[1]
-        everyone = {keys.FORWARD: entries[keys.MESSAGE]}
+        everyone: Entries = {keys.FORWARD: entries[keys.MESSAGE]}
         if self.masks:
             everyone[keys.FORWARD_MASK] = entries[keys.ACTION_MASK]
         written: Entries = {

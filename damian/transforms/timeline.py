@@ -109,11 +109,11 @@ class ObservationTimeline(StatefulTransform):
         self.ages = ages
         self.group = group
         self.own = own
-        written, own, self.delay_key, self.sent_key, self.position_key = (
+        written, of_sender, self.delay_key, self.sent_key, self.position_key = (
             sibling_key(self.row_key, key)
             for key in (out_key, own_key, delay_key, sent_key, position_key)
         )
-        self.out_keys = existing([written, own])
+        self.out_keys = existing([written, of_sender])
         self.step_keys = existing([self.row_key, self.delay_key, self.sent_key, self.position_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
