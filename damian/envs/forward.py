@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 import torch
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
@@ -139,7 +139,7 @@ class Forward(WorldTransform):
     stage = "server"
 
     def __init__(self, simulation: Simulation, *, masks: bool = False) -> None:
-        written = [keys.FORWARD, *[keys.FORWARD_MASK] * masks]
+        written: list[NestedKey] = [keys.FORWARD, *[keys.FORWARD_MASK] * masks]
         super().__init__([keys.MESSAGE], written)
         self.worlds = ToldWorlds(simulation)
         self.masks = masks

@@ -1,16 +1,19 @@
 """Apply the delay transforms to other environments: SAC on a control task of Gymnasium, observed
 late.
 
+Pendulum-v1; an hour, two free cores::
+
     python examples/studies/control.py --jobs 2
-    (Pendulum-v1; an hour, two free cores) python examples/studies/control.py --methods history bpql
-    (these methods only) python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out
-    runs/control_random
-                                                    (delays are drawn from 1 to 7 steps: two hours)
-    python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9
-    --hidden 256 \\
-        --lr 3e-4 --episodes 10 --out runs/cheetah
-        (pip install "gymnasium[mujoco]"; 50 minutes)
-    ... --shortest 1 --out runs/cheetah_random                   (delays are drawn from 1 to 9 steps)
+    python examples/studies/control.py --methods history bpql
+
+Delays that are drawn from 1 to 7 steps; two hours::
+
+    python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out runs/control_random
+
+HalfCheetah (``pip install "gymnasium[mujoco]"``); 50 minutes, with ``--shortest 1`` drawn delays::
+
+    python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 \\
+        --hidden 256 --lr 3e-4 --episodes 10 --out runs/cheetah
 
 These methods are trained for each seed: undelayed; naive, whose observations are late; history,
 which also observes the agent's latest actions, with the age of the observation if that varies
@@ -18,8 +21,9 @@ which also observes the agent's latest actions, with the age of the observation 
 it is known once it has arrived (``BackupdateStorage``). Where delays vary, there are two more ways
 to observe for each of the last two: timeline, all that has arrived, by when it was true
 (``ObservationTimeline``); and hold, a jitter buffer, in which observations wait until they are as
-old as the oldest may be. The undelayed policy is also evaluated under the delay. The folder gets
-the mean returns as results.md and results.csv, and a JSON file for each method and seed.
+old as the oldest may be. The undelayed policy is also evaluated under the delay, and in Pendulum
+flown forward, by a copy of the environment (``forward_pendulum.py``). The folder gets the mean
+returns as results.md and results.csv, and a JSON file for each method and seed.
 """
 
 import csv
@@ -29,6 +33,7 @@ from typing import NamedTuple, cast
 
 import gymnasium
 import torch
+from forward_pendulum import FlownForward
 from study import Results, carried_out, parser
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
@@ -88,6 +93,8 @@ class Task(NamedTuple):
     timeline: bool = False
     """Does the actor observe all that has arrived of the latest steps, instead of the newest
     message?"""
+    forward: bool = False
+    """Does a copy of the environment fly the newest message forward?"""
 
     @property
     def horizon(self) -> int:
@@ -125,6 +132,9 @@ def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
         transforms.append(ObservationTimeline(task.longest + 1, delay_key="delay"))
         transforms.append(FlattenObservation(-2, -1, ["timeline"]))
         read = ["timeline"]
+    if task.forward:
+        transforms.append(FlownForward(task.longest))
+        read = ["predicted"]
     transforms.append(CatTensors(read, "observed", del_keys=False))
     if task.history:
         transforms.append(ActionHistory(task.history, append_to="observed"))
@@ -222,7 +232,11 @@ def run_method(method: str, seed: int, args: Namespace) -> dict[str, float]:
     with tqdm(total=args.steps, desc=f"seed {seed} {method}") as bar:
         train(env, learner, args.steps, bar)
     name = f"{shortest} to {args.delay}" if shortest < args.delay else str(args.delay)
-    flown = {"0": task, name: late} if method == "undelayed" else {name: late}
+    flown = {name: late}
+    if method == "undelayed":
+        flown = {"0": task, name: late}
+        if args.env == Task().name:
+            flown[f"{name}, flown forward"] = late._replace(forward=True)
     return {
         name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()
     }

@@ -37,3 +37,12 @@ def test_critics_read_what_was_true_and_actors_what_had_arrived():
     late = torch.cat([steps["age"], steps["received"]], -1)
     assert steps[keys.OBSERVATION][:, :4].equal(late)
     assert not late[:, 1:].equal(steps["observation"])
+
+
+def test_a_copy_of_pendulum_flies_what_is_late_forward():
+    env = make_env(Task(shortest=1, longest=DELAY, forward=True), worlds=2)
+    set_seed(env, 0)
+    after = env.rollout(20)["next"]
+    env.close()
+    torch.testing.assert_close(after[keys.OBSERVATION], after["observation"], atol=1e-5, rtol=0)
+    assert not after["received"].allclose(after["observation"], atol=0.01)
