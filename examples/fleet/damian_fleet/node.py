@@ -205,6 +205,8 @@ def scenario_of_reports(scenario: ScenarioConfig) -> ScenarioConfig:
             "is not server: reports are what the server node knows, not what links bring to a UAV"
         )
         raise InputError(f"links: {scenario.links.kind} {problem}")
+    if scenario.observation.forward:
+        raise InputError("observation.forward: reports are not flown forward: leave it out")
     return replace(scenario, observation=replace(scenario.observation, own=False))
 
 
