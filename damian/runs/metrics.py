@@ -21,8 +21,12 @@ from damian.runs.checkpoint import to_tensordict
 from damian.runs.measures import BUILT_IN, METRICS
 from damian.server.server import Server
 
-Evaluation = dict[str, float]
-"""Metrics by name, and the number of ``episodes``."""
+
+class Evaluation(dict[str, float]):
+    """Metrics by name, and the number of ``episodes``."""
+
+    returns: Tensor
+    """The true return of each episode, [B]."""
 
 
 class Episodes(NamedTuple):
@@ -81,6 +85,7 @@ def evaluation(rollout: TensorDictBase, server: Server, metrics: Sequence[str] =
     """Metrics of the first episode of each world in a rollout [B, T]."""
     flights = flights_of(rollout, server)
     found = Evaluation(episodes=len(rollout))
+    found.returns = flights.true.returns.cpu()
     for name in dict.fromkeys((*BUILT_IN, *metrics)):
         with naming_errors(f"metric {name}"):
             metric = METRICS.get(name, "metrics")

@@ -1,11 +1,15 @@
 """Files of a run folder: their names, its lock, and the table of results."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 from filelock import FileLock, Timeout
+from scipy.special import stdtrit
+from torch import Tensor
 
 from damian.common import checks
 from damian.common.atomic_files import not_linked, write_atomically, writing
@@ -51,12 +55,51 @@ def save_results(
 ) -> str:
     """Write evaluations by policy to ``result.csv`` and, as the returned table, to
     ``result.md``."""
-    below = "\n".join(filter(None, [note, LATE if late else ""]))
+    below = "\n".join(filter(None, [differences(rows), note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
     cells = pd.DataFrame([{"policy": name, **each} for name, each in rows.items()])
     write_csv(folder / RESULTS, cells)  # last: with it, a run counts as finished
     return table
+
+
+class Interval(NamedTuple):
+    """The mean of independent values, and its 95 % interval (Student's)."""
+
+    mean: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Tensor) -> "Interval":
+        """From values [n]; a single one has no interval, nan."""
+        mean = values.mean().item()
+        student = float(stdtrit(len(values) - 1, 0.975)) if len(values) > 1 else math.nan
+        half = student * values.std(correction=min(1, len(values) - 1)).item()
+        half /= math.sqrt(len(values))
+        return cls(mean, mean - half, mean + half)
+
+    def __str__(self) -> str:
+        return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+
+def differences(rows: Mapping[str, Evaluation]) -> str:
+    """A sentence for each policy on its returns beside those of the script, in the same
+    episodes."""
+    others = {name: row for name, row in rows.items() if name not in (SCRIPT, RANDOM)}
+    if SCRIPT not in rows:
+        return ""
+    sentences = []
+    for name, evaluation in others.items():
+        gain = evaluation.returns - rows[SCRIPT].returns
+        more, less = Interval.of(gain), Interval.of(-gain)
+        if more.low > 0:
+            sentences.append(f"{name}: better than the script by {more}.")
+        elif less.low > 0:
+            sentences.append(f"{name}: the script is better by {less}.")
+        else:
+            sentences.append(f"{name}: no difference to the script can be seen, {more}.")
+    return "\n".join([*sentences, ""])
 
 
 def read_results(path: Path) -> pd.DataFrame:
@@ -90,9 +133,11 @@ def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = F
         if not name.endswith(DETERMINISTIC):
             other = rows.get(name + DETERMINISTIC)
             numbers = [f"{evaluation[measure]:.2f}" for measure in measures]
+            numbers[measures.index("return")] = str(Interval.of(evaluation.returns))
             numbers += [f"{other[measure]:.2f}" if other else "" for measure in likely]
             lines.append([name, *numbers])
-    head = ["policy", *measures, *(f"{measure}, deterministic" for measure in likely)]
+    shown = [f"{name} [95 %]" if name == "return" else name for name in measures]
+    head = ["policy", *shown, *(f"{measure}, deterministic" for measure in likely)]
     return markdown_table([title.replace("_", " ") for title in head], lines)
 
 
