@@ -45,7 +45,8 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
     available = env.observation_spec.keys(True, True)
     if keys.FORWARD in available:
         script = ForwardScript(script_without_belief(worlds))
-        forward_keys = [key for key in (keys.FORWARD, keys.FORWARD_MASK) if key in available]
+        forward_keys: list[NestedKey] = [keys.FORWARD, keys.FORWARD_MASK]
+        forward_keys = [key for key in forward_keys if key in available]
         return TensorDictModule(script, forward_keys, [keys.ACTION])
     believes = worlds.scenario.seeks_source and keys.BELIEF in available
     own_messages = worlds.scenario.observation.own
