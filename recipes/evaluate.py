@@ -80,7 +80,7 @@ class Loaded(NamedTuple):
 def load(
     run: str | Path,
     *overrides: str,
-    worlds: int = 1,
+    num_worlds: int = 1,
     seed: int | None = None,
     deterministic: bool = False,
     trust: bool = False,
@@ -92,7 +92,7 @@ def load(
         run: run folder, the ``best.pt`` in it, or ``damian:NAME``, one of the package
             (docs/policies.md).
         *overrides: changes to the settings of the run, such as ``delay.obs=6`` or ``agents=5``.
-        worlds: number of parallel worlds of the environment, B.
+        num_worlds: number of parallel environments, B.
         seed: of the environment; that of ``damian evaluate`` if not given.
         deterministic: take the most likely actions; if not, they are drawn from the policy's
             distribution.
@@ -106,13 +106,13 @@ def load(
         InputError: there is no run, or its policy does not fit the changed settings.
 
     Examples:
-        >>> policy, env = damian.load("runs/first", "delay.obs=6", worlds=64, deterministic=True)
+        >>> policy, env = damian.load("runs/first", "delay.obs=6", num_worlds=64, deterministic=True)
         >>> rollout = env.rollout(50, policy, break_when_any_done=False)
     """
     words = [f"checkpoint='{run}'", *overrides, *["trust=true"] * trust]
     with run_settings(cli.composed(*words), words) as config:
         eval_seed = config.eval_seed if seed is None else seed
-        env = make_env(config, worlds, eval_seed, config.device, ["message"])
+        env = make_env(config, num_worlds, eval_seed, config.device, ["message"])
         policy = stored_actor(config, env).eval().requires_grad_(False)
         assume(config, env, policy)
     add_recurrent_state(env, policy)

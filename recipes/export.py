@@ -45,7 +45,7 @@ def export(run: Path, trust: bool = False) -> Path:
         import_module("onnxscript")
     except ImportError as error:
         raise InputError(f"export needs {error.name}: pip install 'damian[export]'") from None
-    actor, env = load(run, worlds=2, deterministic=True, trust=trust)
+    actor, env = load(run, num_worlds=2, deterministic=True, trust=trust)
     config = stored_config(run_folder(run), "checkpoint")
     shipped = str(run).startswith("damian:")
     named = Path("runs") if shipped else run_folder(run)

@@ -81,7 +81,7 @@ def returns(name: str, law: tuple[str, ...]) -> dict[str, list[float]]:
     trained."""
     found: dict[str, list[float]] = {}
     for seed in range(SEED, SEED + BATCHES):
-        policy, env = damian.load(f"damian:{name}", *law, worlds=WORLDS, seed=seed)
+        policy, env = damian.load(f"damian:{name}", *law, num_worlds=WORLDS, seed=seed)
         others = {"most likely": policy, "script": script_policy(env), "random": random_policy(env)}
         for kind, flown in {"sampled": policy, **({} if law else others)}.items():
             env.set_seed(seed)

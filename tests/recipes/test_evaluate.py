@@ -97,7 +97,7 @@ def test_a_run_that_was_resumed_is_flown_and_begun_with_as_any_other(fly, traine
 
 
 def test_a_loaded_policy_flies_as_it_was_evaluated(trained):
-    policy, env = damian.load(trained, worlds=8, deterministic=True)
+    policy, env = damian.load(trained, num_worlds=8, deterministic=True)
     rollout = env.rollout(10, policy, break_when_any_done=False)
     perceived = rollout["next", *keys.REWARD].sum(1).mean().item()
     rows = damian.results(trained).set_index("policy")
@@ -153,7 +153,7 @@ def test_the_policies_of_the_package_are_a_megabyte_of_plain_data():
 @pytest.mark.sample(5)
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
 def test_a_policy_of_the_package_returns_what_its_card_says(folder):
-    policy, env = damian.load(f"damian:{folder.name}", worlds=50, seed=1)
+    policy, env = damian.load(f"damian:{folder.name}", num_worlds=50, seed=1)
     told = read_csv(folder / "result.csv", ["law", "policy"]).iloc[0]
     assert (told["law"], told["policy"]) == ("as trained", "sampled")
     assert f"{told['return']:.1f} ± {told['interval']:.1f}" in (folder / "README.md").read_text(
