@@ -39,7 +39,7 @@ from damian.common.text_files import one_line
 from damian.learners.config import LEARNERS
 from damian.runs.processes import end_interrupted
 
-from .known import CONF, SCHEMAS, described, key_of, known_settings, no_such_key
+from .known import CONF, MAPS, SCHEMAS, described, key_of, known_settings, no_such_key
 
 Work = Callable[[Any, Path], None]
 """The work of a program: takes checked settings and the run folder to fill."""
@@ -77,12 +77,19 @@ OWN = {"learner": "name", "model": "name", "region": "kind", "motion": "kind"}
 
 
 def _register_own(words: Sequence[str]) -> None:
-    """Make each ``learner=package.module:Name`` of a command line an option of its group."""
+    """Make each ``learner=package.module:Name`` and ``region=map.kml`` of a command line an option
+    of its group."""
+    store = ConfigStore.instance()
     for word in words:
         group, _, names = word.partition("=")
         for name in names.split(",") if group in OWN else ():
-            if ":" in name:
-                ConfigStore.instance().store(group=group, name=name, node={OWN[group]: name})
+            if group == "region" and name.endswith(MAPS):
+                folder, _, file = name.rpartition("/")
+                node = {"kind": "geojson", "path": name}
+                place = f"{group}/{folder.strip('/')}".strip("/")  # Hydra joins what stands between
+                store.store(group=place, name=file, node=node, package=group)
+            elif ":" in name:
+                store.store(group=group, name=name, node={OWN[group]: name})
 
 
 def settings(*words: str, program: str = "train") -> Any:

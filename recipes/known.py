@@ -129,6 +129,10 @@ def key_of(word: str) -> str:
     return word.lstrip("+~").partition("=")[0]
 
 
+MAPS = (".geojson", ".json", ".kml", ".kmz", ".gpkg", ".shp", ".plan")
+"""Endings of files that ``region`` may name, in the place of an option."""
+
+
 def check_words(program: str, words: Iterable[str]) -> None:
     """Refuse unknown keys and options, as far as the words alone can tell, without any slow
     import."""
@@ -137,6 +141,8 @@ def check_words(program: str, words: Iterable[str]) -> None:
         key, _, value = word.partition("=")
         if key in options:
             names = [name for name in value.split(",") if re.fullmatch(r"[\w/.-]+", name)]
+            if key == "region":
+                names = [name for name in names if not name.endswith(MAPS)]
             if key == "delay" and re.match(r"-?\d", value):
                 raise InputError(
                     f"delay: {value} is not an option of this group; write delay.obs={value}"

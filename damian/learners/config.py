@@ -179,7 +179,7 @@ class MappoConfig(LearnerConfig):
         high=checks.STEPS,
     )
     near_start_coeff: float = setting(1.0, "Weight of this penalty at first.", low=0)
-    anneal: bool = setting(False, "The learning rate falls to zero over the run.")
+    anneal: bool = setting(False, "The learning rate and the entropy bonus fall to zero over the run.")
 
     learner: ClassVar[str] = "damian.learners.mappo:Mappo"
 

@@ -146,19 +146,20 @@ class Mappo:
         moves = float(self.progress.updates >= self.config.warm_up)
         share = self.progress.frames / max(self.config.near_start, 1)
         near = self.config.near_start_coeff * max(1 - share, 0.0)
-        return [moves, moves, 1.0, moves * near]
+        return [moves, moves * self._left(), 1.0, moves * near]
 
-    def _anneal(self) -> None:
-        left = 1 - self.progress.frames / self.setup.frames
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.lr * max(left, 0.0)
+    def _left(self) -> float:
+        """What is left of the learning rate and of the entropy bonus, a share."""
+        if not self.config.anneal:
+            return 1.0
+        return max(1 - self.progress.frames / self.setup.frames, 0.0)
 
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
         """Make ``epochs`` passes over a batch [B, T]; means of ``LOSSES``, ``NUMBERS``,
         ``gradient_norm``."""
         terms = []
-        if self.config.anneal:
-            self._anneal()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.lr * self._left()
         weights = torch.tensor(self._weights_of_losses(), device=batch.device)
         for entries in self._minibatches(batch):
             losses, numbers = self.losses(entries)

@@ -55,13 +55,13 @@ def test_the_critic_learns_first():
     assert not weights(learner.actor).equal(before[0])
 
 
-def test_the_learning_rate_falls_to_zero_at_the_end_of_the_run():
+def test_the_learning_rate_and_the_entropy_bonus_fall_to_zero_at_the_end_of_the_run():
     env, learner = made(anneal=True)
-    rates = []
-    for _ in range(5):
+    for share in (1.0, 0.75, 0.5, 0.25, 0.0):
+        _, of_entropy, *_ = learner._weights_of_losses()
         updates(env, learner, 1)
-        rates.append(learner.optimizer.param_groups[0]["lr"])
-    assert rates == pytest.approx([0.1, 0.075, 0.05, 0.025, 0.0])
+        assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * share)
+        assert of_entropy == pytest.approx(share)
 
 
 def test_a_penalty_that_fades_holds_the_policy_near_its_start():
