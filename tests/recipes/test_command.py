@@ -18,7 +18,7 @@ from damian.learners.config import LEARNERS, MappoConfig
 from damian.recipes import cli
 from damian.recipes.cli import settings
 from damian.recipes.command import PROGRAMS, main
-from damian.recipes.known import CONF, groups, known_settings
+from damian.recipes.known import CONF, check_words, groups, known_settings
 from damian.recipes.shared.settings import check_learning
 
 
@@ -270,6 +270,13 @@ def test_a_belief_by_which_nothing_is_won_is_left_out_and_said():
     ):
         config = settings("scenario=patrol", "aware=belief")
     assert (config.observation.belief, config.model.prior) == ([], False)
+
+
+@pytest.mark.parametrize("path", ["park.kml", "maps/park.geojson", "/maps/park.gpkg"])
+def test_a_region_may_be_a_map(path):
+    check_words("train", [f"region={path}"])
+    region = settings("scenario=patrol", f"region={path}").region
+    assert (region.kind, region.path) == ("geojson", path)
 
 
 def test_a_learner_is_judged_by_what_it_reads_not_by_the_shape_of_its_name():
