@@ -171,15 +171,9 @@ class MappoConfig(LearnerConfig):
         "The critic learns values of mean 0 and deviation 1, whatever the scale of the rewards.",
     )
     warm_up: int = setting(0, "Updates in which only the critic learns.", low=0, high=checks.STEPS)
-    near_start: int = setting(
-        0,
-        "Environment steps over which a penalty of the divergence from the first policy fades; for "
-        "one that begins well.",
-        low=0,
-        high=checks.STEPS,
+    anneal: bool = setting(
+        False, "The learning rate and the entropy bonus fall to zero over the run."
     )
-    near_start_coeff: float = setting(1.0, "Weight of this penalty at first.", low=0)
-    anneal: bool = setting(False, "The learning rate and the entropy bonus fall to zero over the run.")
 
     learner: ClassVar[str] = "damian.learners.mappo:Mappo"
 

@@ -1,6 +1,5 @@
 """MAPPO, from batches that late messages may have corrected (paper, section 4.3)."""
 
-import copy
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
@@ -10,24 +9,21 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.distributions import Distribution
 from torch.nn.functional import pad, smooth_l1_loss
-from torchrl.data import Categorical, ReplayBuffer
+from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, set_recurrent_mode
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
-from damian.common import checks
 from damian.common.compiling import COMPILE_OPTIONS, compiled
 from damian.learners.base import UNREAD, LearningSetup
 from damian.learners.config import MappoConfig
 from damian.models.critic import NormalizedValue, make_critic
-from damian.models.distribution import LegalCategorical
 from damian.models.memory import RECURRENT_KEYS
 from damian.replay.backupdate import BackupdateStorage
 
-LOSSES = ("loss_objective", "loss_entropy", "loss_critic", "loss_start")
-"""Names of the terms of the loss (``mappo_losses``); the last one is computed only from entries with
-``START``."""
+LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
+"""Names of the terms of the loss (``mappo_losses``)."""
 NUMBERS = ("kl", "clip_fraction", "entropy")
 """Names of the further numbers that ``mappo_losses`` returns."""
 LOSS_KEYS: list[NestedKey] = [
@@ -40,8 +36,6 @@ LOSS_KEYS: list[NestedKey] = [
     keys.READY,
 ]
 """Entries of a step that the loss reads, besides the critic's observation."""
-START: NestedKey = (keys.AGENTS, "start_logits")
-"""Logits of the policy with which the training began, [B, T, N, A]."""
 
 
 class Progress:
@@ -79,10 +73,6 @@ class Mappo:
         self.progress = Progress()
         self.actor = config.make_actor(env, setup.model)
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
-        discrete = isinstance(env.full_action_spec_unbatched[keys.ACTION], Categorical)
-        near = config.near_start
-        checks.require(discrete or not near, "learner.near_start", near, "needs discrete actions")
-        self.start = copy.deepcopy(self.actor).requires_grad_(False) if near else None
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
         observed = setup.recompute_actor or setup.critic_key == keys.OBSERVATION
         unread = [keys.ACTION_MASK] if observed else [keys.ACTION_MASK, keys.OBSERVATION]
@@ -95,7 +85,6 @@ class Mappo:
     def components(self) -> dict[str, Any]:
         """What a checkpoint stores: networks, optimiser and progress."""
         found = {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
-        found |= {"start": self.start} if self.start else {}
         return found | {"progress": self.progress}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
@@ -103,7 +92,6 @@ class Mappo:
         ``backupdated``."""
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
-        self._add_start(corrected)
         numbers = self.optimize(corrected)
         self.progress.updates += 1
         self.progress.frames += batch.numel()
@@ -135,18 +123,10 @@ class Mappo:
             batch[keys.ACTION_LOG_PROB] = policy.log_prob(batch[keys.ACTION])
         return batch
 
-    def _add_start(self, batch: TensorDictBase) -> None:
-        """Write the logits of the first policy into a batch, while it is to stay near that."""
-        if self.start and self.progress.frames < self.config.near_start:
-            with torch.no_grad(), set_recurrent_mode(True):
-                batch[START] = cast(LegalCategorical, self.start.get_dist(batch)).logits
-
     def _weights_of_losses(self) -> list[float]:
         """Factors of ``LOSSES`` in this update."""
         moves = float(self.progress.updates >= self.config.warm_up)
-        share = self.progress.frames / max(self.config.near_start, 1)
-        near = self.config.near_start_coeff * max(1 - share, 0.0)
-        return [moves, moves * self._left(), 1.0, moves * near]
+        return [moves, moves * self._left(), 1.0]
 
     def _left(self) -> float:
         """What is left of the learning rate and of the entropy bonus, a share."""
@@ -164,21 +144,20 @@ class Mappo:
         for entries in self._minibatches(batch):
             losses, numbers = self.losses(entries)
             self.optimizer.zero_grad()
-            losses = losses * weights[: len(losses)]
+            losses = losses * weights
             losses.sum().backward()
             norm = torch.nn.utils.clip_grad_norm_(self.weights, self.config.max_grad_norm)
             self.optimizer.step()
             terms.append(torch.cat([losses.detach(), numbers, norm.view(1)]))
         # A number that is read at once would make the device wait at every minibatch.
         means = torch.stack(terms).double().mean(0)
-        n_losses = len(means) - len(NUMBERS) - 1
-        names = (*LOSSES[:n_losses], *NUMBERS, "gradient_norm")
+        names = (*LOSSES, *NUMBERS, "gradient_norm")
         return dict(zip(names, means.tolist(), strict=True))
 
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
         """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
         recurrent = self.setup.model.recurrent
-        read = [*self.loss_keys, *self.critic.in_keys, START]
+        read = [*self.loss_keys, *self.critic.in_keys]
         if recurrent:
             read += RECURRENT_KEYS
         samples = {}
@@ -240,10 +219,6 @@ def mappo_losses(
         -config.entropy_coeff * mean_entropy,
         config.critic_coeff * error,
     ]
-    if START in entries:
-        log = cast(LegalCategorical, policy).logits
-        divergence = (log.exp() * (log - entries[START])).sum(-1)
-        losses.append((divergence * ready).sum() / n_decisions)
     with torch.no_grad():
         divergence = (ratio - 1 - log_ratio) * ready
         beyond = ((ratio - 1).abs() > epsilon) * ready

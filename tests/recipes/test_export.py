@@ -46,7 +46,9 @@ def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path):
     folder = tmp_path / "run" / "export"
     described = json.loads((folder / "policy.json").read_text())
     n_uavs = 5 if described["uavs"] == "any number" else 3
-    policy, env = damian.load(tmp_path / "run", f"agents={n_uavs}", num_worlds=7, deterministic=True)
+    policy, env = damian.load(
+        tmp_path / "run", f"agents={n_uavs}", num_worlds=7, deterministic=True
+    )
     rollout = env.rollout(4, policy, break_when_any_done=False)[:, -1]
     key_of = {"hidden": keys.HIDDEN_BEFORE}
     inputs = {name: rollout[key_of.get(name, ("agents", name))] for name in described["inputs"]}

@@ -34,7 +34,7 @@ SLOW_CLOCKS = [
     "clock.system=16s",
 ]
 SETS = ["model=sets", "observation.actions=true", "model.prior=true", "reward=coverage"]
-SETS += ["learner.warm_up=2", "learner.near_start=200", "learner.anneal=true", "learner.team=0.5"]
+SETS += ["learner.warm_up=2", "learner.anneal=true", "learner.team=0.5"]
 CASES = {
     "recurrent": [
         "delay.obs=2",

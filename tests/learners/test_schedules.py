@@ -1,5 +1,4 @@
-"""MAPPO from a policy that begins well: a critic that learns first, a penalty that fades, rewards of
-the team, and a learning rate that falls."""
+"""MAPPO: a critic that learns first, rewards of the team, and a learning rate that falls."""
 
 import pytest
 import torch
@@ -7,10 +6,9 @@ from helpers import learning
 from tensordict import TensorDictBase
 
 from damian import keys, make_env
-from damian.common.errors import InputError
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.learners.mappo import START, Mappo, MappoConfig, add_advantages
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.models.config import MlpConfig
 from damian.recipes.shared.learning import make_collector
 from damian.server.rewards import RewardConfig
@@ -62,35 +60,6 @@ def test_the_learning_rate_and_the_entropy_bonus_fall_to_zero_at_the_end_of_the_
         updates(env, learner, 1)
         assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * share)
         assert of_entropy == pytest.approx(share)
-
-
-def test_a_penalty_that_fades_holds_the_policy_near_its_start():
-    away = []
-    for coefficient in (0.0, 100.0):
-        torch.manual_seed(0)
-        env, learner = made(near_start=4 * 2 * STEPS, near_start_coeff=coefficient)
-        start = learner.start
-        (batch, *_) = updates(env, learner, 3)
-        q, p = (policy.get_dist(batch).logits.exp() for policy in (start, learner.actor))
-        mask = batch[keys.ACTION_MASK]
-        divergence = (p[mask] * (p[mask] / q[mask]).log()).sum() / mask[..., 0].numel()
-        learner._add_start(batch)
-        add_advantages(batch, learner.critic, learner.config)
-        entries = next(iter(learner._minibatches(batch)))
-        losses, _ = learner.losses(entries)
-        torch.testing.assert_close(losses[3], divergence)
-        share = learner._weights_of_losses()[3]
-        assert share == pytest.approx(coefficient / 4), "three quarters have passed"
-        away.append(divergence.item())
-    assert away[1] < away[0] / 4
-    updates(env, learner, 1)
-    learner._add_start(batch.exclude(START, inplace=True))
-    assert START not in batch.keys(True), "it has faded"
-
-
-def test_a_penalty_needs_discrete_actions():
-    with pytest.raises(InputError, match=r"learner\.near_start: 10 needs discrete actions"):
-        made("continuous", near_start=10)
 
 
 def test_what_all_earn_is_what_each_learns_from():
