@@ -7,7 +7,6 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torch.distributions import Distribution
 from torch.nn.functional import pad, smooth_l1_loss
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
@@ -202,7 +201,7 @@ def mappo_losses(
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
-    policy, log_ratio, entropy = policy_terms(steps, actor)
+    log_ratio, entropy = policy_terms(steps, actor)
     ratio = log_ratio.exp()
     advantage = entries[keys.ADVANTAGE].squeeze(-1)
     epsilon = config.clip_epsilon
@@ -228,18 +227,16 @@ def mappo_losses(
     return torch.stack(losses), numbers
 
 
-def policy_terms(
-    steps: TensorDictBase, actor: ProbabilisticActor
-) -> tuple[Distribution, Tensor, Tensor]:
-    """Policies on steps [*], log-ratios of importance, and entropies (estimated by one draw if
-    continuous), [*, N]."""
+def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
+    """Log-ratios of importance on steps [*], and entropies of the policies (estimated by one draw
+    if continuous), [*, N]."""
     with set_recurrent_mode(True):
         policy = actor.get_dist(steps)
     log_ratio = policy.log_prob(steps[keys.ACTION]) - steps[keys.ACTION_LOG_PROB]
     if isinstance(policy, TanhNormal):
         _, log_prob = policy.rsample_and_log_prob()
-        return policy, log_ratio, -log_prob
-    return policy, log_ratio, policy.entropy()
+        return log_ratio, -log_prob
+    return log_ratio, policy.entropy()
 
 
 @torch.no_grad()
