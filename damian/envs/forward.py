@@ -33,12 +33,16 @@ _STREAM = counter_rng.number_of("forward")
 class ToldWorlds(Simulation):
     """The worlds of a simulation as messages tell of them.
 
-    Nobody knows where sources are, so that nothing is heard there, and no request appears that is
-    not known. What is random is drawn from streams of its own.
+    Nobody knows where sources are, so that nothing is heard there; no request appears that is not
+    known, no flight is aborted and no UAV fails. Gusts are drawn from streams of their own.
     """
 
     def __init__(self, simulation: Simulation) -> None:
         self.__dict__ = simulation.__dict__  # the same tables, also on another device
+
+    def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
+        state = self.vehicles.move(self.decide(state, action, action_valid))
+        return self._sense(state._replace(steps=state.steps + 1), action_valid)
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         nowhere = torch.full_like(state.source, torch.inf)
@@ -191,7 +195,8 @@ class Forward(WorldTransform):
         return observation_spec
 
 
-_OF_UAVS = ("origin", "goal", "elapsed", "vertical", "cruise", "air", "battery_before")
+_OF_UAVS = ("origin", "goal", "elapsed", "vertical", "cruise", "cruise_before", "air")
+_OF_UAVS += ("battery_before", "failed")
 _OF_UAVS += ("position", "track", "battery", "motions", "message_sent", "sent")
 """Fields of a state that have a row for each UAV, and follow from its messages."""
 

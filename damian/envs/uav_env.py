@@ -249,7 +249,7 @@ class UavEnv(EnvBase):
         """The outputs that depend on a state alone; the critic's observation [B, N, G] saves
         time."""
         vehicles = self.simulation.vehicles
-        outputs: Outputs = {keys.READY: vehicles.ready(state)}
+        outputs: Outputs = {keys.READY: vehicles.may_choose(state)}
         actions = self.scenario.actions
         if actions.kind == "discrete" and actions.mask:
             outputs[keys.ACTION_MASK] = self.simulation.action_mask(state)

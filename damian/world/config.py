@@ -16,7 +16,7 @@ POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 FOOTPRINT = "footprint"
 """The sensor that tells the radius of a UAV's footprint, if it is drawn."""
 RANDOMISED = ("motion.max_speed", "motion.max_acceleration", "battery.capacity_kwh")
-RANDOMISED += ("wind.speed", "wind.direction", "wind.gusts")
+RANDOMISED += ("motion.abort", "wind.speed", "wind.direction", "wind.gusts")
 RANDOMISED += ("source.level_db", "source.miss", "source.false_alarm", "delay.loss")
 """Settings that may be drawn for each world and episode."""
 
@@ -185,6 +185,14 @@ class MotionConfig(Settings):
     level_separation: float = setting(
         0.5, "Vertical distance between two flight levels.", unit="m", above=0
     )
+    abort: float = setting(
+        0.0,
+        "Probability that a flight ends at another legal landing point than commanded; holding "
+        "included.",
+        low=0,
+        high=1,
+        each=True,
+    )
     options: Any = setting(
         None, "Settings of a motion model of your own, as a mapping.", kinds=POLYNOMIAL
     )
@@ -194,6 +202,20 @@ class MotionConfig(Settings):
         unread = self.options is not None and ":" not in self.kind
         self.refuse(unread, "options", f"means nothing with motion.kind={self.kind}")
         checks.in_range("motion.max_level", self.max_level, self.min_level, unit="m")
+
+
+@dataclass
+class FailureConfig(Settings):
+    """UAVs that fall silent for a while and stay where they are."""
+
+    section: ClassVar[str] = "failure"
+
+    probability: float = setting(
+        0.0, "Probability that a UAV fails in a simulation step.", low=0, high=1
+    )
+    duration: float = setting(
+        60.0, "Mean time after which it joins again; each step is as likely.", unit="s", above=0
+    )
 
 
 @dataclass
@@ -456,6 +478,7 @@ class WorldConfig(Settings):
     agents: int = setting(3, "Number of UAVs.", low=1, high=1000)
     region: RegionConfig = setting(RegionConfig)
     motion: MotionConfig = setting(MotionConfig)
+    failure: FailureConfig = setting(FailureConfig)
     wind: WindConfig = setting(WindConfig)
     source: SourceConfig = setting(SourceConfig)
     requests: RequestConfig = setting(RequestConfig)
@@ -489,6 +512,9 @@ class WorldConfig(Settings):
         self._check_randomise()
         problem = "needs motion=polynomial: instant flights feel no wind"
         self.refuse(self.is_windy and self.motion.kind == "instant", "wind", problem)
+        continuous = self.actions.kind == "continuous"
+        problem = "needs discrete actions, whose mask says where a flight may end"
+        self.refuse(self.may_abort and continuous, "motion.abort", problem)
 
     @property
     def tells_truth(self) -> bool:
@@ -510,6 +536,11 @@ class WorldConfig(Settings):
         """Whether there may be wind."""
         drawn = {"wind.speed", "wind.gusts"} & {*self.randomise}
         return bool(self.wind.speed or self.wind.gusts or drawn)
+
+    @property
+    def may_abort(self) -> bool:
+        """Whether a flight may end elsewhere than commanded."""
+        return self.motion.abort not in (0, [0] * self.agents) or "motion.abort" in self.randomise
 
     def _check_randomise(self) -> None:
         """Refuse what cannot be drawn; each value must be one that the setting may have."""

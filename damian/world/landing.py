@@ -46,6 +46,13 @@ class Ranking(NamedTuple):
     distance: Tensor
     """Length of the way from the point where the UAV stands [m], [M, K]."""
 
+    @classmethod
+    def of_each(cls, point: Tensor, distance: Tensor) -> tuple["Ranking", Tensor]:
+        """The ranking of own lists of the UAVs, [B, N, K] each, and the row of each UAV, [B, N]."""
+        ranking = cls(point.flatten(0, 1), distance.flatten(0, 1))
+        row = torch.arange(len(ranking.point), device=point.device)
+        return ranking, row.view(point.shape[:2])
+
 
 class Candidates:
     """Landing points to which an action of one of N UAVs may lead, nearest its target first.

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import gather_rows, move_attributes, tree_map
+from damian.common.tensors import gather_rows, move_attributes, tree_map, tree_where
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
 from damian.world.landing import Candidates, Ranking, assign_landing_points
 from damian.world.messages import Messages, Widths
+from damian.world.news import News, draw
 from damian.world.regions.region import local_places
 from damian.world.regions.sources import regions_of
 from damian.world.requests import appear, poisson_arrivals, serve
@@ -53,6 +54,7 @@ class Simulation:
         longest = max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
+        self.news = News(config, self.candidates, dt)
         region, start, self.walks = _draw_initial_conditions(config, self.airspace, rng)
         model = MOTION_MODELS.get(config.motion.kind, "motion.kind")
         self.vehicles = model(config, self.airspace, dt)
@@ -91,7 +93,7 @@ class Simulation:
 
     def to(self, device: torch.device) -> "Simulation":
         """Move all tensors to a device, in place."""
-        for owner in (self, self.candidates, self.vehicles):
+        for owner in (self, self.candidates, self.vehicles, self.news):
             move_attributes(owner, device)
         return self
 
@@ -127,10 +129,16 @@ class Simulation:
         Actions are discrete [B, N], or continuous [B, N, 2] in [0, 1]; only those of
         ``action_valid`` [B, N] count.
         """
-        state = self.decide(state, action, action_valid)
-        state = self.vehicles.move(state)
-        state = state._replace(steps=state.steps + 1)
-        return self._sense(state, action_valid)
+        decided = self.decide(state, action, action_valid)
+        if self.news.aborts:
+            decided = self._abort(state, decided)
+        moved = self.vehicles.move(decided)
+        moved = moved._replace(steps=state.steps + 1)
+        if not self.news.fails:
+            return self._sense(moved, action_valid)
+        moved = self.news.fail(moved)
+        joins = state.failed & ~moved.failed
+        return self._sense(moved, action_valid, joins)
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
@@ -139,7 +147,7 @@ class Simulation:
         if not self.candidates.can_hold:
             stuck = ~valid.any(-1, keepdim=True)
             valid = valid | stuck
-        if self.vehicles.instant:
+        if self.vehicles.instant and not self.news.fails:
             return valid
         return torch.where(reach >= 0, valid, self.candidates.hold)
 
@@ -176,10 +184,7 @@ class Simulation:
         assigned = assign_landing_points(ranking, row, standing, reach, n_points)
         goal = assigned + base
         departs = goal != state.goal
-        way = gather_rows(self.points, goal) - gather_rows(self.points, state.goal)
-        east, north = way.unbind(-1)
-        heading = torch.remainder(torch.atan2(east, north), 2 * math.pi)
-        track = torch.where(departs, heading, state.track)
+        track = torch.where(departs, self._heading(state.goal, goal), state.track)
         motions = state.motions + ready
         state = state._replace(track=track, motions=motions)
         return self.vehicles.take_off(state, goal, ready, departs)
@@ -190,20 +195,48 @@ class Simulation:
         base = state.region * self.airspace.max_points
         flat = point + base.view(-1, 1, 1)
         distance = self._distance_to(state, flat)
-        ranking = Ranking(point.flatten(0, 1), distance.flatten(0, 1))
-        own = torch.arange(row.numel(), device=row.device)
-        return ranking, own.view_as(row)
+        return Ranking.of_each(point, distance)
 
-    def _sense(self, state: State, action_valid: Tensor | None = None) -> State:
-        """Move the source, let UAVs on the ground detect it, and send messages."""
+    def _heading(self, origin: Tensor, goal: Tensor) -> Tensor:
+        """Heading from landing points to others, flat ids, clockwise from north [rad], [B, N]."""
+        east, north = (gather_rows(self.points, goal) - gather_rows(self.points, origin)).unbind(-1)
+        return torch.remainder(torch.atan2(east, north), 2 * math.pi)
+
+    def _abort(self, before: State, state: State) -> State:
+        """Let some of the flights that may turn in this step end elsewhere.
+
+        Each takes one of the landing points to which a legal action leads and no other UAV stands
+        or flies, nor was commanded in this step, all of them as likely; its own, if there is none.
+        """
+        start, reach = self.vehicles.approach(state, state.motions > before.motions)
+        chance = self.vehicles.values.get("motion.abort", state.drawn)
+        reach = torch.where(self.news.abort(state, chance), reach, -1.0)
+        distance = self._action_distances(state._replace(goal=start))
+        distance = distance.where(distance <= reach.unsqueeze(-1), torch.inf)
+        ranking, row = self.news.elsewhere(state, start, distance)
+        base = state.region.unsqueeze(-1) * self.airspace.max_points
+        standing = state.goal - base
+        assigned = assign_landing_points(ranking, row, standing, reach, self.airspace.max_points)
+        goal = assigned + base
+        turns = goal != state.goal
+        track = torch.where(turns, self._heading(start, goal), state.track)
+        return self.vehicles.divert(state._replace(track=track), goal, turns)
+
+    def _sense(
+        self, state: State, action_valid: Tensor | None = None, joins: Tensor | None = None
+    ) -> State:
+        """Move the source, let UAVs on the ground detect it, and send messages; ``joins`` [B, N]:
+        UAVs that have failed before."""
         now = (state.steps * self.dt).to(state.track.dtype)
         place, emits, over = self.source_now(state)
         state = state._replace(source=place, source_over=over.all(-1))
-        on_ground = self.vehicles.on_ground(state)
+        on_ground = self.vehicles.on_ground(state) & ~state.failed
         in_reach = self.in_reach(state, emits, on_ground)
         detected = self._reported(state, in_reach, on_ground.unsqueeze(-1))
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         stops = self.vehicles.new_stop(state, on_ground, action_valid)
+        if stops is not None and joins is not None:
+            stops = (stops | joins) & on_ground
         lands = on_ground if stops is None else stops
         state, served, serves = self._serve(state, now, lands)
         happens = self._events(detected, serves)
@@ -240,6 +273,9 @@ class Simulation:
             readings=self._readings(state),
         )
         sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
+        if self.news.fails:
+            sends = sends & ~state.failed
+            sent = tree_where(state.failed, state.sent, sent)
         if self.config.requests.known_at_once:
             sent = sent._replace(requests=messages.requests)
         return state._replace(message_sent=sends, motions=motions, sent=sent)
@@ -282,10 +318,7 @@ class Simulation:
             alarm = self.false_alarms
         if not unsure:
             return in_reach
-        report = torch.full_like(state.episode, _REPORT)
-        counters = state.seed, report, state.episode, state.steps
-        seed, *counters = (each.view(-1, 1, 1) for each in counters)
-        share = counter_rng.uniform(seed, *counters, self.pairs)
+        share = draw(state, _REPORT, self.pairs)
         false_alarm = listens & (share < alarm)
         return torch.where(in_reach, share >= miss, false_alarm)
 
@@ -465,11 +498,13 @@ class Simulation:
             elapsed=torch.full_like(goal, sensing_steps + 1),
             vertical=zeros,
             cruise=zeros,
+            cruise_before=zeros,
             air=zeros,
             battery_before=zeros + 100,
             position=torch.cat([place, zeros.unsqueeze(-1)], -1),
             track=zeros,
             battery=zeros + 100,
+            failed=torch.zeros_like(goal, dtype=torch.bool),
             motions=torch.zeros_like(goal),
             source=torch.stack([walk.stop[:, 0] for walk in self.walks], 1),
             source_over=torch.zeros_like(number, dtype=torch.bool),

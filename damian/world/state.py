@@ -32,6 +32,9 @@ class State(NamedTuple):
     """Duration of takeoff, and of landing [s]; 0 if the UAV holds, [B, N]."""
     cruise: Tensor
     """Duration of the cruise [s]; 0 if the UAV holds, [B, N]."""
+    cruise_before: Tensor
+    """Duration of the cruise to where it was commanded [s], of a flight that then ends elsewhere;
+    else 0, [B, N]."""
     air: Tensor
     """Way of the cruise through the air [m]; its length if there is no wind, [B, N]."""
     battery_before: Tensor
@@ -42,6 +45,8 @@ class State(NamedTuple):
     """Heading of the latest flight, clockwise from north [rad], [B, N]."""
     battery: Tensor
     """Battery level, not rounded [%], [B, N]."""
+    failed: Tensor
+    """Whether the UAV has failed, [B, N]."""
     motions: Tensor
     """Motions (holding included) since the UAV last spotted the source, [B, N]."""
     source: Tensor

@@ -15,6 +15,7 @@ from damian.world.airspace import Airspace
 from damian.world.battery import (
     battery_of,
     charge_gain,
+    cruise_drain,
     cruise_range,
     flight_drain,
     used_so_far,
@@ -84,6 +85,19 @@ class MotionModel(ABC):
     def move(self, state: State) -> State:
         """State with the positions and batteries after a step of ``dt``."""
 
+    def approach(self, state: State, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Where each UAV may still turn to another landing point in the step that begins.
+
+        Returns the landing points from which it would fly on, flat ids [B, N], and its longest
+        cruise from there [m], [B, N]; negative if it may not. ``chosen`` [B, N] UAVs have just
+        taken off, or hold.
+        """
+        return state.origin, torch.where(chosen, self.battery_reach(state), -1.0)
+
+    def divert(self, state: State, goal: Tensor, turns: Tensor) -> State:
+        """Let UAVs (``turns``) fly on from where they may, to ``goal``, [B, N]."""
+        return self.take_off(state._replace(goal=state.origin), goal, turns, turns)
+
     @abstractmethod
     def latest_messages(
         self, state: State, on_ground: Tensor, messages: Messages
@@ -113,7 +127,11 @@ class MotionModel(ABC):
     def reach(self, state: State) -> Tensor:
         """Longest cruise of each UAV now [m], [B, N]; 0: it can only hold; negative: it may not
         choose."""
-        return torch.where(self.ready(state), self.battery_reach(state), -1.0)
+        return torch.where(self.may_choose(state), self.battery_reach(state), -1.0)
+
+    def may_choose(self, state: State) -> Tensor:
+        """Whether each UAV is ready and has not failed, [B, N] bool."""
+        return self.ready(state) & ~state.failed
 
     def battery_reach(self, state: State) -> Tensor:
         """Longest cruise that each battery allows [m], [B, N]; 0: it allows only holding."""
@@ -243,6 +261,7 @@ class PolynomialFlight(MotionModel):
             elapsed=torch.where(ready, 0, state.elapsed),
             vertical=torch.where(ready, vertical, state.vertical),
             cruise=torch.where(ready, cruise, state.cruise),
+            cruise_before=torch.where(ready, 0.0, state.cruise_before),
             air=torch.where(ready, air, state.air),
             battery_before=torch.where(ready, state.battery, state.battery_before),
         )
@@ -269,9 +288,32 @@ class PolynomialFlight(MotionModel):
         earlier = elapsed + since - 1  # the last of these steps is moved
         return self.move(state._replace(elapsed=earlier, battery_before=battery_before))
 
+    def approach(self, state: State, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """UAVs turn once in a flight, above where they would land, or where they would hold."""
+        begin = state.elapsed.double() * self.dt
+        descent = state.vertical + state.cruise
+        descends = (begin < descent) & (descent <= begin + self.dt) & (state.cruise_before == 0)
+        holds = chosen & (state.goal == state.origin)
+        arrived = state._replace(battery=self._after_cruise(state))
+        return state.goal, torch.where(descends | holds, self.battery_reach(arrived), -1.0)
+
+    def divert(self, state: State, goal: Tensor, turns: Tensor) -> State:
+        after = self.take_off(state, goal, turns, turns)
+        battery = torch.where(turns, self._after_cruise(state), state.battery_before)
+        cruise_before = torch.where(turns, state.cruise, state.cruise_before)
+        return after._replace(
+            elapsed=state.elapsed, cruise_before=cruise_before, battery_before=battery
+        )
+
+    def _after_cruise(self, state: State) -> Tensor:
+        """Battery levels [%] after the cruises alone, [B, N]."""
+        if not self.battery.enabled:
+            return state.battery_before
+        return state.battery_before - cruise_drain(state.air, battery_of(self.values, state.drawn))
+
     def move(self, state: State) -> State:
         state = state._replace(elapsed=state.elapsed + 1)
-        elapsed = state.elapsed.double() * self.dt
+        elapsed = state.elapsed.double() * self.dt - state.cruise_before
         vertical = state.vertical
         cruise = state.cruise
         way = self.airspace.way(state.origin, state.goal)
@@ -359,7 +401,7 @@ class PolynomialFlight(MotionModel):
     def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
         """Least number of steps after which the latest flight, and a time [s] after it, are over,
         [B, N]."""
-        flight = 2 * state.vertical + state.cruise
+        flight = 2 * state.vertical + state.cruise + state.cruise_before
         seconds = flight.double() * (1 - _FLIGHT_ERROR) + sensing_time
         steps_per_second = (1 - _ROUNDING) / self.dt
         return (seconds * steps_per_second).ceil().long()

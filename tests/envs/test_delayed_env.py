@@ -24,7 +24,7 @@ from damian.keys import (
     RECEIVED,
     REWARD,
 )
-from damian.world.config import ActionConfig
+from damian.world.config import ActionConfig, FailureConfig
 
 # Without delays.
 
@@ -206,7 +206,8 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, kin
     "route", [pytest.param(r, marks=[pytest.mark.slow] * (r != "everything")) for r in ROUTES]
 )
 def test_a_compiled_step_equals_torchrls_too(route):
-    scenario = everything("polynomial", **ROUTES[route])
+    scenario = everything("polynomial", **ROUTES[route], failure=FailureConfig(0.1))
+    scenario.motion.abort = 0.5
     check_equals_torchrls_way(scenario, delayed(scenario).compile(backend="eager"))
 
 

@@ -15,6 +15,7 @@ from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import (
     ActionConfig,
     BatteryConfig,
+    FailureConfig,
     MotionConfig,
     RegionConfig,
     RequestConfig,
@@ -106,9 +107,10 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
         "motion.max_acceleration": [1, 2, 3],
         "source.miss": [0.0, 0.5],
     }
-    flying = MotionConfig(kind="polynomial")
+    flying = MotionConfig(kind="polynomial", abort=[0.2, 0.5, 1.0])
     gusty = WindConfig(gusts=2.0)
-    scenario = replace(WORLD, motion=flying, wind=gusty, randomise=drawn)
+    fails = FailureConfig(0.05, 10.0)
+    scenario = replace(WORLD, motion=flying, wind=gusty, failure=fails, randomise=drawn)
     together = UavEnv(scenario, 5, seed=0)
     alone = UavEnv(scenario, 1, seed=0)
     seeds = torch.arange(5) * 17
