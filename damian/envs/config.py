@@ -141,6 +141,17 @@ class ScenarioConfig(WorldConfig):
         self.refuse(wrong, "observation.global_features", problem)
         never = episode.discharged_share is not None and not self.battery.enabled
         self.refuse(never, "episode.discharged_share", "needs battery.enabled=true")
+        absolute = self.actions.command == "absolute"
+        problem = (
+            f"does not go with links={links}: the server, which computes what a UAV observes, would "
+            "not know what it has sent"
+        )
+        self.refuse(absolute and links != "server", "actions.command", problem)
+        problem = "does not go with clock.server: between two broadcasts no observation changes"
+        self.refuse(absolute and self.clock.steps("server") > 1, "actions.command", problem)
+        holds = continuous or 0.0 in self.actions.distances
+        problem = "needs 0 among actions.distances: a UAV holds until its first command arrives"
+        self.refuse(absolute and not holds, "actions.command", problem)
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
         problem = "needs source.motion=dynamic and source.after_walk=stop"
         self.refuse(episode.end_with_source and not stops, "episode.end_with_source", problem)
@@ -158,6 +169,10 @@ class ScenarioConfig(WorldConfig):
     @property
     def tells_events(self) -> bool:
         return EVENTS in self.observation.global_features
+
+    @property
+    def tells_commands(self) -> bool:
+        return self.actions.command == "absolute" and self.make_delays().act.late
 
     @property
     def seeks_source(self) -> bool:

@@ -14,6 +14,7 @@ What a step passes, in this order (a transform is there only if the scenario ask
 
 from collections.abc import Collection
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -23,6 +24,7 @@ from torchrl.envs import Compose, Transform
 from damian import keys
 from damian.common import checks
 from damian.delays.scenario import ScenarioDelays
+from damian.envs.commands import CommandDelay
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.nodes import Belief, Drop, ServerNode
@@ -39,6 +41,7 @@ from damian.transforms import (
     SampleAndHold,
 )
 from damian.world.landing import ActionConfig, action_table, displacement
+from damian.world.simulation import Simulation
 from damian.world.vehicles import MOTION_MODELS
 
 _STOPS = [keys.STOPS, keys.OWN_STOPS]
@@ -46,6 +49,8 @@ _STOPS = [keys.STOPS, keys.OWN_STOPS]
 _REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LOSS]
 _REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS]
 """Entries that only the extra ``message`` outputs."""
+_OF_COMMANDS = [keys.REACH]
+"""Entries of which the server node makes the action masks of late commands."""
 _LINKED = [keys.LINKED, keys.LINK_DELAY, keys.HEARD_STOPS]
 """Entries from which UAVs that hear each other directly compute what they observe."""
 
@@ -69,7 +74,7 @@ def make_env(
     remote = has_server_node(scenario, delays)
     needed = {*["message"] * remote, *["position"] * delays.reads_positions}
     env = UavEnv(scenario, num_worlds, seed, device, {*extras, *needed}, messages_only=remote)
-    pipeline = DelayedEnv(env, make_transforms(scenario, delays, env.server, extras))
+    pipeline = DelayedEnv(env, make_transforms(scenario, delays, env, extras))
     pipeline.delays = delays
     pipeline.set_seed(seed)
     pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
@@ -78,14 +83,14 @@ def make_env(
 
 
 def make_transforms(
-    scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
+    scenario: ScenarioConfig, delays: ScenarioDelays, env: UavEnv, extras: Collection[str]
 ) -> Compose:
     """All transforms of a scenario in order: outputs pass them forwards, a policy's actions
     backwards."""
     remote = has_server_node(scenario, delays)
     transforms = [
-        *action_transforms(scenario, delays),
-        *(server_transforms(scenario, delays, server, extras) if remote else []),
+        *action_transforms(scenario, delays, env.simulation),
+        *(server_transforms(scenario, delays, env, extras) if remote else []),
         *reward_transforms(scenario, delays, extras),
         *observation_transforms(scenario, delays),
     ]
@@ -93,35 +98,43 @@ def make_transforms(
         *_LINKED * (scenario.links.kind == "matrix"),
         *_REPORTED * ("message" not in extras),
         *_STOPS * (not delays.obs.late),
+        *_OF_COMMANDS * scenario.tells_commands,
     ]
     if remote and dropped:
         transforms.append(Drop(dropped))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
-def action_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
+def action_transforms(
+    scenario: ScenarioConfig, delays: ScenarioDelays, simulation: Simulation
+) -> list[Transform]:
     """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not
     sent."""
     clock = scenario.clock
     act = delays.act
     if not act.late and clock.steps("agents") == 1:
         return []
-    late = ActionDelay(
-        act,
-        keys.ACTION,
-        default=hold_action(scenario.actions),
-        sent_key="ready",
-        valid_key=keys.ACTION_VALID,
+    options: dict[str, Any] = {
+        "default": hold_action(scenario.actions),
+        "sent_key": "ready",
+        "valid_key": keys.ACTION_VALID,
         **delays.told,
-    )
-    return [late]
+    }
+    if not scenario.tells_commands:
+        return [ActionDelay(act, keys.ACTION, **options)]
+    # At most so many are under way, or have been executed since the message that is known.
+    longest = act.longest + (0 if scenario.observation.own else delays.obs.longest)
+    n_commands = min(longest, scenario.observation.carried_stops)
+    instant = simulation.vehicles.instant
+    return [CommandDelay(act, simulation.candidates, n_commands, waits=not instant, **options)]
 
 
 def server_transforms(
-    scenario: ScenarioConfig, delays: ScenarioDelays, server: Server, extras: Collection[str]
+    scenario: ScenarioConfig, delays: ScenarioDelays, env: UavEnv, extras: Collection[str]
 ) -> list[Transform]:
     """The message delay (paper, section 3.4), links, and the server node, which uses arrived
     messages."""
+    server = env.server
     output_messages = "message" in extras
     delayed = delays.obs.late
     links = scenario.links
@@ -167,7 +180,13 @@ def server_transforms(
         transforms += timeline_transforms(
             scenario, server, keys.HEARD_STOPS, keys.LINK_DELAY, group=True
         )
-    node = ServerNode(server, held, heard_key=heard, reward_terms="reward_terms" in extras)
+    node = ServerNode(
+        server,
+        held,
+        heard_key=heard,
+        reward_terms="reward_terms" in extras,
+        simulation=env.simulation if scenario.tells_commands else None,
+    )
     return [*transforms, node]
 
 
@@ -316,7 +335,8 @@ def has_server_node(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
     observation = scenario.observation
     forgets = observation.timeline > observation.carried_stops  # one message does not tell it all
     remembers = bool(observation.belief) or scenario.delay.messages > 0 or forgets
-    return delays.obs.late or remembers or scenario.links.kind == "matrix"
+    sees_commands = scenario.tells_commands
+    return delays.obs.late or remembers or sees_commands or scenario.links.kind == "matrix"
 
 
 def hold_action(actions: ActionConfig) -> int:

@@ -435,6 +435,12 @@ class ActionConfig(Settings):
         high=360,
     )
     mask: bool = setting(True, "Mask actions without effect: outside, battery too low, in flight.")
+    command: str = setting(
+        "relative",
+        "What a late action says: a way from wherever the UAV is by then (relative), or the place "
+        "to which it led from where the UAV chose it (absolute).",
+        choices=("relative", "absolute"),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -498,6 +504,11 @@ class WorldConfig(Settings):
     @property
     def tells_events(self) -> bool:
         """Whether messages tell what was heard and served at each stop."""
+        return False
+
+    @property
+    def tells_commands(self) -> bool:
+        """Whether messages tell which absolute command was executed last."""
         return False
 
     @property

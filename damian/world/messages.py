@@ -33,6 +33,8 @@ class Widths(NamedTuple):
     them."""
     events: int = 0
     """Number of events that messages tell of each stop."""
+    commands: int = 0
+    """1 if messages tell which command was executed last."""
 
 
 ONE_SOURCE = Widths()
@@ -81,6 +83,9 @@ class Messages(NamedTuple):
     none."""
     serves: Annotated[Tensor, Column(None)]
     """Whether it serves one now, 0 or 1, [*, N, 1]; [*, N, 0] if there are no requests."""
+    executed: Annotated[Tensor, Column(None)]
+    """Number of the command that the UAV has executed last, 0 before the first one, [*, N, 1];
+    [*, N, 0] if commands are not absolute, or not late."""
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a
     stop."""
@@ -187,4 +192,4 @@ def _variable(widths: Widths) -> list[int]:
     n = widths.sources
     m = widths.requests
     t = widths.truths
-    return [n, 2 * n, t, 2 * t, 3 * m, m, min(m, 1), widths.readings]
+    return [n, 2 * n, t, 2 * t, 3 * m, m, min(m, 1), widths.commands, widths.readings]

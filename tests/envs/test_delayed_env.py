@@ -230,9 +230,7 @@ def test_a_scenario_compiles_to_kernels(name):
 def check_equals_torchrls_way(scenario, env):
     base = env.base_env
     uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
-    one_by_one = TransformedEnv(
-        uav_env, make_transforms(scenario, env.delays, uav_env.server, EXTRAS)
-    )
+    one_by_one = TransformedEnv(uav_env, make_transforms(scenario, env.delays, uav_env, EXTRAS))
     for transform in one_by_one.transform:
         transform.set_seed(0)
     one_by_one.append_transform(RewardSum([REWARD], [EPISODE_REWARD]))
