@@ -1,19 +1,20 @@
 """Absolute commands: they lead to the same place wherever they arrive, and agents know what they
 have sent."""
 
+import math
 from dataclasses import replace
 
 import pytest
+import shapely
 import torch
 from helpers import both_kinds, both_motions, everything, play, random_actions, square
 from torchrl.envs.utils import check_env_specs
 
-from damian import UavEnv, make_env
+from damian import ClockConfig, UavEnv, make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.samplers import Sampler
 from damian.envs.commands import destination
-from damian.envs.config import ClockConfig
 from damian.keys import ACTION, ACTION_MASK, COMMANDS, FRAME, GLOBAL_OBSERVATION, OBSERVATION
 from damian.server.config import EpisodeConfig, ObservationConfig
 from damian.world.config import (
@@ -23,6 +24,7 @@ from damian.world.config import (
     RegionConfig,
     WindConfig,
 )
+from damian.world.landing import action_table
 
 ABSOLUTE = ActionConfig(command="absolute")
 LONG = EpisodeConfig(max_steps=1000)
@@ -95,7 +97,7 @@ def test_with_commands_that_arrive_at_once_agents_see_what_they_saw_without(moti
 def free_actions(env, frame, generator):
     """Random actions [B, N] of which none leads to where another UAV is or will be."""
     candidates = env.uav_env.simulation.candidates
-    n_worlds, n = frame.shape
+    n = frame.shape[1]
     while True:
         action = random_actions(env.uav_env, generator)
         goal = destination(candidates, frame, action)
@@ -125,8 +127,12 @@ def test_a_delay_of_held_commands_is_a_longer_delay_of_what_is_observed(obs, act
     for _ in range(act):
         second = watched.step(second.set(ACTION, hold))["next"]
     for t in range(20):
-        one = {block.name: block.of(first[OBSERVATION]) for block in commanded.layout["observation"]}
-        other = {block.name: block.of(second[OBSERVATION]) for block in watched.layout["observation"]}
+        one = {
+            block.name: block.of(first[OBSERVATION]) for block in commanded.layout["observation"]
+        }
+        other = {
+            block.name: block.of(second[OBSERVATION]) for block in watched.layout["observation"]
+        }
         assert first[FRAME].equal(watched.uav_env.state.goal)
         for name in ["place", "number", *names]:
             assert one[name].equal(other[name]), (t, name)
@@ -136,3 +142,152 @@ def test_a_delay_of_held_commands_is_a_longer_delay_of_what_is_observed(obs, act
         action = free_actions(commanded, first[FRAME], generator)
         first = commanded.step(first.set(ACTION, action))["next"]
         second = watched.step(second.set(ACTION, action))["next"]
+
+
+class Twin:
+    """UAVs in one convex world, in plain Python: where commands take them, and where they decide
+    from."""
+
+    def __init__(self, env, world, longest):
+        simulation = env.uav_env.simulation
+        self.points = simulation.airspace.exact_points[0].tolist()
+        self.polygon = simulation.airspace.regions[0].polygon
+        self.table = action_table(env.uav_env.scenario.actions, torch.float64).tolist()
+        self.goal = env.uav_env.state.goal[world].tolist()
+        self.longest = longest
+        self.sent = [[] for _ in self.goal]
+        self.executed = [0 for _ in self.goal]
+
+    def frame(self, uav, now):
+        """Where the newest command that may still be executed leads; else where the UAV stands."""
+        number, _, wishes = self.sent[uav][-1] if self.sent[uav] else (0, None, None)
+        if number > self.executed[uav] and number + self.longest > now:
+            return wishes[0]
+        return self.goal[uav]
+
+    def nearest(self, target):
+        """All points, those at the smallest distance in centimetres first, by their number."""
+        ways = [math.floor(100 * math.dist(point, target) + 0.500001) for point in self.points]
+        return sorted(range(len(ways)), key=lambda point: (ways[point], point))
+
+    def step(self, now, actions, delays):
+        """Send commands, of which a delay of None is lost, and fly where those lead that arrive."""
+        for uav, (action, delay) in enumerate(zip(actions, delays, strict=True)):
+            frame = self.frame(uav, now - 1)
+            east, north = self.points[frame]
+            distance, heading = self.table[action]
+            target = [east + distance * math.sin(heading), north + distance * math.cos(heading)]
+            inside = self.polygon.contains(shapely.Point(target))
+            wishes = self.nearest(target) if inside else [frame]
+            self.sent[uav].append((now, None if delay is None else now + delay, wishes))
+        standing = list(self.goal)
+        for uav, sent in enumerate(self.sent):
+            arrived = [each for each in sent if each[1] == now and each[0] > self.executed[uav]]
+            if arrived:
+                self.executed[uav], _, wishes = arrived[-1]
+                taken = {*self.goal[:uav], *standing[:uav], *standing[uav + 1 :]}
+                free = (point for point in wishes if point not in taken)
+                self.goal[uav] = next(free, self.goal[uav])
+
+
+@pytest.mark.parametrize("hold", ["none", "max"])
+@pytest.mark.parametrize("delays", [[0, 2, 1, 2, 0], [1, 2, 3, 0, 2, 3, 3, 1]])
+def test_uavs_fly_where_commands_lead_that_come_late_or_overtake_or_are_lost(delays, hold):
+    law = Scripted(delays)
+    late = DelayConfig(act=law, act_hold=hold)
+    observation = ObservationConfig(["place"], own=True, stops=4)
+    common = {"delay": late, "observation": observation, "actions": ABSOLUTE, "episode": LONG}
+    env = make_env(square(**common), 3)
+    generator = torch.Generator().manual_seed(2)
+    td = env.reset()
+    twins = [Twin(env, world, law.longest) for world in range(3)]
+    for now in range(1, 25):
+        action = random_actions(env.uav_env, generator)
+        td = env.step(td.set(ACTION, action))["next"]
+        drawn = delays[now % len(delays)]
+        delay = None if drawn == 3 else law.longest if hold == "max" else drawn
+        for world, twin in enumerate(twins):
+            twin.step(now, action[world].tolist(), [delay] * 3)
+            assert env.uav_env.state.goal[world].tolist() == twin.goal
+            assert td[FRAME][world].tolist() == [twin.frame(uav, now) for uav in range(3)]
+    assert len({tuple(twin.goal) for twin in twins}) > 1
+
+
+def test_a_command_whose_place_is_out_of_reach_holds():
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.05)
+    scenario = square(region=WIDE, battery=battery)
+    env = UavEnv(scenario, 1)
+    env.reset()
+    simulation = env.simulation
+    state = env.state._replace(goal=torch.tensor([[0, 1, 2]]))
+    distance = simulation.candidates.distance[:, 0]
+    far = int(simulation.points.square().sum(-1).argmax())
+    command = torch.tensor([[[far, 1], [far, 1], [1, 0]]])
+    action = torch.zeros(1, 3, dtype=torch.long)
+    flown = simulation.decide(state, action, None, command)
+    assert flown.goal[0, 0] == far
+    assert distance[far] == 0
+    weak = state._replace(battery=torch.full((1, 3), 3.0))
+    assert simulation.vehicles.reach(weak).amax() < simulation.airspace.length(*command[0, 0])
+    held = simulation.decide(weak, action, None, command)
+    assert held.goal.equal(state.goal)
+    assert held.sent.executed.shape[-1] == 0
+
+
+@pytest.mark.sample(2)
+@both_kinds
+@both_motions
+def test_the_specs_are_right_with_absolute_commands(motion, kind):
+    late = DelayConfig(obs="0..2", act="1..3", act_loss=0.2, loss=0.1)
+    scenario = everything(motion, kind, delay=late, actions=ActionConfig(kind, command="absolute"))
+    check_env_specs(make_env(scenario, 2, extras=["message"]), seed=0, break_when_any_done="both")
+
+
+@pytest.mark.parametrize(("motion", "step"), [("instant", 4), ("polynomial", 0)])
+def test_nobody_sees_what_another_uav_has_sent_before_a_message_tells_of_it(motion, step):
+    late = DelayConfig(obs=1, act=2)
+    near = replace(ABSOLUTE, distances=[0.0, 40.0])
+    scenario = everything(motion, delay=late, actions=near, episode=LONG)
+    scenario.observation.own = True
+    shown = []
+    for changed in (False, True):
+        env = make_env(scenario, 4)
+        generator = torch.Generator().manual_seed(3)
+        actions = [random_actions(env.uav_env, generator) for _ in range(8)]
+        if changed:
+            actions[step][:, 0] = (actions[step][:, 0] + 9) % 16
+        shown.append(torch.stack(play(env, actions)[1::2]))
+    one, other = (steps[:, :, 1:] for steps in (td["agents"] for td in shown))
+    for key in (OBSERVATION[1], ACTION_MASK[1], FRAME[1]):
+        # Executed in the step that begins two later, and told a step after that has ended.
+        assert one[key][: step + 3].equal(other[key][: step + 3]), key
+    frames = [td[FRAME][step, :, 0] for td in shown]
+    assert not frames[0].equal(frames[1])
+
+
+def test_an_agent_is_not_ready_while_a_command_that_takes_time_is_under_way():
+    late = DelayConfig(act="1..3", act_hold="max")
+    env = make_env(everything("polynomial", delay=late, actions=ABSOLUTE, episode=LONG), 2)
+    td = env.reset()
+    flown = env.uav_env.state.goal
+    for t in range(4):
+        assert td["agents", "ready"].all() == (t == 0)
+        assert env.uav_env.state.goal.equal(flown)
+        mask = td[ACTION_MASK].float()
+        assert (mask.sum(-1) == 1).all() == (t > 0)
+        action = mask.flip(-1).argmax(-1)  # the last legal one that lies 200 m away
+        td = env.step(td.set(ACTION, mask.shape[-1] - 1 - action))["next"]
+    assert not env.uav_env.state.goal.equal(flown)
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"links": LinkConfig("updown")}, "links"),
+        ({"clock": ClockConfig(server="2s")}, "clock.server"),
+        ({"actions": ActionConfig(distances=[50.0], command="absolute")}, "distances"),
+    ],
+)
+def test_what_does_not_go_with_absolute_commands_is_refused_in_one_line(changed, named):
+    with pytest.raises(InputError, match=rf"^actions.command: [^\n]*{named}[^\n]*$"):
+        square(**({"actions": ABSOLUTE} | changed))
