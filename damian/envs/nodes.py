@@ -182,9 +182,9 @@ class ServerNode(WorldTransform):
         them."""
         own = entries[self.own_key] if self.own_key else received
         messages = self.server.commanded(own, entries[keys.COMMANDS])
-        belief = entries.get(keys.OWN_BELIEF, entries.get(keys.BELIEF))
-        timeline = entries.get(keys.STOPS)
-        written = self.server.observe_commanded(received, messages, steps, belief, timeline)
+        known = (entries.get(key) for key in (keys.BELIEF, keys.OWN_BELIEF, keys.STOPS))
+        sent = entries[keys.COMMANDS]
+        written = self.server.observe_commanded(received, messages, sent, steps, *known)
         frame = simulation.bound_for(messages)
         actions = simulation.config.actions
         if actions.kind == "discrete" and actions.mask:

@@ -57,10 +57,11 @@ def server_recompute(
         if timeline is not None:
             entries[keys.STOPS] = timeline
         if commanded:
+            sent = steps[next_key(keys.COMMANDS)]
             known = steps[next_key(keys.MESSAGE)] if server.observation.own else messages
-            known = server.commanded(known, steps[next_key(keys.COMMANDS)])
-            each = steps.get(next_key(keys.OWN_BELIEF), belief)
-            entries |= server.observe_commanded(messages, known, elapsed, each, timeline)
+            known = server.commanded(known, sent)
+            beliefs = belief, steps.get(next_key(keys.OWN_BELIEF), None)
+            entries |= server.observe_commanded(messages, known, sent, elapsed, *beliefs, timeline)
         if own:
             sent = steps[next_key(keys.MESSAGE)]
             own_belief = steps.get(next_key(keys.OWN_BELIEF), None)

@@ -313,31 +313,29 @@ class Server:
         self,
         received: Tensor,
         own: Messages,
+        commands: Tensor,
         steps: Tensor,
         belief: Tensor | None = None,
+        own_belief: Tensor | None = None,
         timeline: Tensor | None = None,
     ) -> dict[NestedKey, Tensor]:
-        """Observations of actors and critic from their UAVs' frames, by key.
+        """Observations of actors and critic from where commands will have taken UAVs, by key.
 
-        ``own`` [*, N] is from ``commanded``, ``received`` are packed messages of the others
-        [*, N, M], ``timeline`` [*, N, slots, 3 + E] is what follows from these, and ``belief`` that
-        of each UAV, [*, N, K, C], or of all.
+        An actor knows what it has sent itself: ``own`` [*, N] is from ``commanded``. The critic is
+        a part of learning, which knows what all have sent. The other arguments are as in
+        ``observe_with_own_messages``.
         """
-        known = self.messages(_own_or_others(own.pack(), received, 1))
-        n_agents = received.shape[-2]
-        if timeline is not None:
-            timeline = timeline.unsqueeze(-4)
-            timeline = timeline.expand(*timeline.shape[:-4], n_agents, *timeline.shape[-3:])
-        if belief is not None and belief.dim() == steps.dim() + 2:
-            belief = belief.unsqueeze(-3)
-            belief = belief.expand(*belief.shape[:-3], n_agents, *belief.shape[-2:])
-        names = {
-            keys.OBSERVATION: self.observation.actor,
-            keys.GLOBAL_OBSERVATION: self.observation.critic,
+        if own_belief is None and belief is not None:
+            own_belief = belief.unsqueeze(-3)
+            own_belief = own_belief.expand(*own_belief.shape[:-3], received.shape[-2], -1, -1)
+        known = own.pack(), steps, own_belief, timeline, timeline
+        all_sent = self.commanded(received, commands)
+        names = self.observation.critic
+        features = self.features(all_sent, steps, names, belief=belief, timeline=timeline)
+        return {
+            keys.OBSERVATION: self.observe_with_own_messages(received, *known),
+            keys.GLOBAL_OBSERVATION: stack(features, names),
         }
-        wanted = sorted({*itertools.chain(*names.values())})
-        features = self.own_features(known, steps, wanted, belief, timeline)
-        return {key: stack(features, each) for key, each in names.items()}
 
     def observe_each(
         self,
