@@ -28,7 +28,8 @@ it was chosen, from 1; 0 for none), and the step by which it has been executed, 
 [B, N, K, 3]."""
 COMMAND = (AGENTS, "command")
 """Written by ``CommandDelay`` for the environment: the landing point from which the action that is
-executed was chosen (flat id), and its number; 0 for the default action, [B, N, 2]."""
+executed was chosen (flat id), its number (0 for the default action), and 0; then ``COMMANDS``,
+[B, N, 1 + K, 3]."""
 REACH = (AGENTS, "reach")
 """How far the UAV may fly now [m], negative if it is not ready, [B, N]; for the action mask, never
 for an actor."""

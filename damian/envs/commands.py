@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn import functional as F
 from torchrl.data import Composite
 
 from damian import keys
@@ -77,7 +78,8 @@ class CommandDelay(ActionDelay):
         if sent is not None:
             commands = torch.where(expand_mask(sent, commands), commands, memory["commands"])
         memory["commands"] = commands
-        executed[keys.COMMAND] = self.from_rows(memory["held_1"]).clone()
+        held = F.pad(memory["held_1"], (0, 1)).unsqueeze(1)
+        executed[keys.COMMAND] = self.from_rows(torch.cat([held, commands], 1))
         return memory, executed
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:

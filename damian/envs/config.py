@@ -152,6 +152,9 @@ class ScenarioConfig(WorldConfig):
         holds = continuous or 0.0 in self.actions.distances
         problem = "needs 0 among actions.distances: a UAV holds until its first command arrives"
         self.refuse(absolute and not holds, "actions.command", problem)
+        problem = "needs actions.command=absolute and a delay of actions: nothing else is under way"
+        wanted = observation.intent and not self.tells_commands
+        self.refuse(wanted, "observation.intent", problem)
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
         problem = "needs source.motion=dynamic and source.after_walk=stop"
         self.refuse(episode.end_with_source and not stops, "episode.end_with_source", problem)
@@ -173,6 +176,11 @@ class ScenarioConfig(WorldConfig):
     @property
     def tells_commands(self) -> bool:
         return self.actions.command == "absolute" and self.make_delays().act.late
+
+    @property
+    def announced(self) -> int:
+        longest = self.make_delays().act.longest if self.observation.intent else 0
+        return min(longest, self.observation.carried_stops)
 
     @property
     def seeks_source(self) -> bool:

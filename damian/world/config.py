@@ -512,6 +512,11 @@ class WorldConfig(Settings):
         return False
 
     @property
+    def announced(self) -> int:
+        """Number of commands under way of which messages tell."""
+        return 0
+
+    @property
     def seeks_source(self) -> bool:
         """Whether anything is won by finding a source."""
         return True

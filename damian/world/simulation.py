@@ -49,7 +49,13 @@ class Simulation:
         n_events = n_sources * config.seeks_source + (n_requests > 0)
         n_events *= config.tells_events
         self.widths = Widths(
-            n_sources, n_readings, n_requests, n_truths, n_events, int(config.tells_commands)
+            n_sources,
+            n_readings,
+            n_requests,
+            n_truths,
+            n_events,
+            int(config.tells_commands),
+            config.announced,
         )
         regions = regions_of(config.region, rng)
         longest = max(config.actions.distances)
@@ -133,9 +139,8 @@ class Simulation:
         """Simulate one step; actions of UAVs that are not ready change nothing.
 
         Actions are discrete [B, N], or continuous [B, N, 2] in [0, 1]; only those of
-        ``action_valid`` [B, N] count. They begin where each UAV stands, or else at the landing
-        points of ``command`` [B, N, 2]: flat ids, and the numbers of the commands, which are 0
-        where there is none.
+        ``action_valid`` [B, N] count. They begin where each UAV stands, or else as ``command``
+        [B, N, 1 + K, 3] says (``damian.keys``).
         """
         state = self.decide(state, action, action_valid, command)
         state = self.vehicles.move(state)
@@ -200,7 +205,8 @@ class Simulation:
         standing = state.goal - base
         origin = state.goal
         if command is not None:
-            origin = torch.where(command[..., 1] > 0, command[..., 0], origin)
+            start, number, _ = command[..., 0, :].unbind(-1)
+            origin = torch.where(number > 0, start, origin)
         ranking, row = self.candidates.rank(origin, state.region, action)
         if self.vehicles.is_windy or command is not None:
             ranking, row = self._from_here(state, ranking, row)
@@ -218,10 +224,21 @@ class Simulation:
         motions = state.motions + ready
         state = state._replace(track=track, motions=motions)
         if command is not None:
-            number = command[..., 1:].to(track.dtype)
-            executed = torch.where(ready.unsqueeze(-1), number, state.sent.executed)
-            state = state._replace(sent=state.sent._replace(executed=executed))
+            state = state._replace(sent=self._with_commands(state, command, ready))
         return self.vehicles.take_off(state, goal, ready, departs)
+
+    def _with_commands(self, state: State, command: Tensor, ready: Tensor) -> Messages:
+        """The latest messages, in which UAVs tell what they have executed, and what is under
+        way."""
+        number = command[..., 0, 1:2].to(state.track.dtype)
+        executed = torch.where(ready.unsqueeze(-1), number, state.sent.executed)
+        commands = command[..., 1 : self.widths.announced + 1, :]
+        point, number, latest = commands.unbind(-1)
+        under_way = (number > executed) & (latest > state.steps.view(-1, 1, 1) + 1)
+        by = (latest * self.dt).to(executed.dtype).unsqueeze(-1)
+        told = torch.cat([gather_rows(self.points, point), by, torch.ones_like(by)], -1)
+        announced = told * under_way.unsqueeze(-1)
+        return state.sent._replace(executed=executed, announced=announced)
 
     def _from_here(self, state: State, ranking: Ranking, row: Tensor) -> tuple[Ranking, Tensor]:
         """The ranking of each UAV with distances from where it stands, as the wind makes them.
@@ -278,6 +295,7 @@ class Simulation:
             served=served,
             serves=serves,
             executed=sent.executed,
+            announced=sent.announced,
             trail=trail,
             landed=landed,
             events=events,

@@ -68,7 +68,7 @@ def test_an_absolute_command_that_arrives_at_once_is_the_relative_one(name, kind
     for t in range(30):
         action = random_actions(env, generator)
         goal = env.simulation.layout.unpack(absolute).goal
-        command = torch.stack([goal, torch.full_like(goal, t + 1)], -1)
+        command = torch.stack([goal, torch.full_like(goal, t + 1), goal], -1).unsqueeze(-2)
         relative, outputs = env.step_fn(relative, action)
         absolute, same = env.step_fn(absolute, action, None, command)
         assert all(one.equal(other) for one, other in zip(relative, absolute, strict=True))
@@ -222,13 +222,15 @@ def test_a_command_whose_place_is_out_of_reach_holds():
     state = env.state._replace(goal=torch.tensor([[0, 1, 2]]))
     distance = simulation.candidates.distance[:, 0]
     far = int(simulation.points.square().sum(-1).argmax())
-    command = torch.tensor([[[far, 1], [far, 1], [1, 0]]])
+    command = torch.tensor([[[[far, 1, 0]], [[far, 1, 0]], [[1, 0, 0]]]])
     action = torch.zeros(1, 3, dtype=torch.long)
     flown = simulation.decide(state, action, None, command)
     assert flown.goal[0, 0] == far
     assert distance[far] == 0
     weak = state._replace(battery=torch.full((1, 3), 3.0))
-    assert simulation.vehicles.reach(weak).amax() < simulation.airspace.length(*command[0, 0])
+    assert simulation.vehicles.reach(weak).amax() < simulation.airspace.length(
+        torch.tensor(0), torch.tensor(far)
+    )
     held = simulation.decide(weak, action, None, command)
     assert held.goal.equal(state.goal)
     assert held.sent.executed.shape[-1] == 0
@@ -240,6 +242,7 @@ def test_a_command_whose_place_is_out_of_reach_holds():
 def test_the_specs_are_right_with_absolute_commands(motion, kind):
     late = DelayConfig(obs="0..2", act="1..3", act_loss=0.2, loss=0.1)
     scenario = everything(motion, kind, delay=late, actions=ActionConfig(kind, command="absolute"))
+    scenario.observation.intent = True
     check_env_specs(make_env(scenario, 2, extras=["message"]), seed=0, break_when_any_done="both")
 
 
@@ -291,3 +294,39 @@ def test_an_agent_is_not_ready_while_a_command_that_takes_time_is_under_way():
 def test_what_does_not_go_with_absolute_commands_is_refused_in_one_line(changed, named):
     with pytest.raises(InputError, match=rf"^actions.command: [^\n]*{named}[^\n]*$"):
         square(**({"actions": ABSOLUTE} | changed))
+
+
+def test_intents_need_commands_that_are_under_way():
+    for late in ({}, {"actions": ABSOLUTE}, {"delay": DelayConfig(act=2)}):
+        with pytest.raises(InputError, match=r"^observation.intent: True needs [^\n]*$"):
+            square(**late, observation=ObservationConfig(intent=True))
+
+
+@pytest.mark.parametrize(("obs", "act"), [(0, 2), (2, 3), (3, 2)])
+def test_others_tell_where_their_commands_under_way_lead_and_by_when(obs, act):
+    delay = DelayConfig(obs=obs, act="0..2" if act == 2 else act, act_hold="max")
+    observation = ObservationConfig(["place"], own=True, stops=5, intent=True)
+    common = {"region": WIDE, "delay": delay, "observation": observation, "episode": LONG}
+    env = make_env(square(agents=2, **common, actions=ABSOLUTE), 3)
+    points = env.uav_env.simulation.points
+    half = env.uav_env.simulation.airspace.scale[0] / 2
+    (announced,) = (each for each in env.layout["observation"] if each.name == "announced")
+    generator = torch.Generator().manual_seed(4)
+    td = env.reset()
+    frames = [td[FRAME]]
+    for now in range(1, 15):
+        td = env.step(td.set(ACTION, random_actions(env.uav_env, generator)))["next"]
+        frames.append(td[FRAME])
+        told = now - obs  # when the newest message was sent that has arrived
+        nearest = announced.of(td[OBSERVATION])[:, :, 0]
+        for k, (east, north, until, exists) in enumerate(
+            nearest.unbind(-2)[i].unbind(-1) for i in range(act)
+        ):
+            sent = told - k  # the command after which an agent's frame was this
+            assert (exists == (sent > 0)).all()
+            if sent > 0:
+                assert until.allclose(torch.tensor(min((sent + act - now) / act, 1.0)).clamp(-1))
+                led = points[frames[sent]].flip(1)
+                way = ((led - points[td[FRAME]]) / half).clamp(-1, 1)
+                assert torch.stack([east, north], -1).allclose(way, atol=1e-5)
+    assert not announced.of(td[OBSERVATION])[:, :, 1:].any()
