@@ -124,9 +124,9 @@ def action_transforms(
         return [ActionDelay(act, keys.ACTION, **options)]
     # At most so many are under way, or have been executed since the message that is known.
     longest = act.longest + (0 if scenario.observation.own else delays.obs.longest)
-    n_commands = min(longest, scenario.observation.carried_stops)
-    instant = simulation.vehicles.instant
-    return [CommandDelay(act, simulation.candidates, n_commands, waits=not instant, **options)]
+    n_commands = max(min(longest, scenario.observation.carried_stops), 1)
+    waits = not simulation.vehicles.instant
+    return [CommandDelay(act, simulation.candidates, n_commands, waits=waits, **options)]
 
 
 def server_transforms(

@@ -11,12 +11,13 @@ from helpers import both_kinds, both_motions, everything, play, random_actions, 
 from torchrl.envs.utils import check_env_specs
 
 from damian import ClockConfig, UavEnv, make_env
+from damian.baselines.script import script_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.delays.samplers import Sampler
 from damian.envs.commands import destination
 from damian.keys import ACTION, ACTION_MASK, COMMANDS, FRAME, GLOBAL_OBSERVATION, OBSERVATION
-from damian.server.config import EpisodeConfig, ObservationConfig
+from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import (
     ActionConfig,
     BatteryConfig,
@@ -114,12 +115,15 @@ def test_a_delay_of_held_commands_is_a_longer_delay_of_what_is_observed(obs, act
     names = ["others", "coverage_map"]
     observation = ObservationConfig(["place", "number"], names, timeline=8, stops=8, window=3)
     common = {"region": WIDE, "observation": observation, "episode": LONG}
+    common["reward"] = RewardConfig(spotted=0.0, coverage=1.0)
     observation.own = own
     law = {"law": "uniform", "low": 0, "high": act}
     late = DelayConfig(obs=obs, act=law, act_hold="max")
-    commanded = make_env(square(**common, delay=late, actions=ABSOLUTE), 2)
+    message = {"extras": ["message"]}
+    commanded = make_env(square(**common, delay=late, actions=ABSOLUTE), 2, **message)
     observation.own = True
-    watched = make_env(square(**common, delay=DelayConfig(obs=obs + act)), 2)
+    watched = make_env(square(**common, delay=DelayConfig(obs=obs + act)), 2, **message)
+    scripts = script_policy(commanded), script_policy(watched)
     generator = torch.Generator().manual_seed(1)
     first = commanded.reset()
     second = watched.reset()
@@ -139,6 +143,10 @@ def test_a_delay_of_held_commands_is_a_longer_delay_of_what_is_observed(obs, act
         told = one["timeline"][..., : 8 - act, :]
         assert told.equal(other["timeline"][..., act:8, :])
         assert first[ACTION_MASK].equal(second[ACTION_MASK])
+        scripted = (
+            script(td.clone())[ACTION] for script, td in zip(scripts, (first, second), strict=True)
+        )
+        assert next(scripted).equal(next(scripted))
         action = free_actions(commanded, first[FRAME], generator)
         first = commanded.step(first.set(ACTION, action))["next"]
         second = watched.step(second.set(ACTION, action))["next"]
