@@ -178,9 +178,10 @@ class Twin:
         ways = [math.floor(100 * math.dist(point, target) + 0.500001) for point in self.points]
         return sorted(range(len(ways)), key=lambda point: (ways[point], point))
 
-    def step(self, now, actions, delays):
-        """Send commands, of which a delay of None is lost, and fly where those lead that arrive."""
-        for uav, (action, delay) in enumerate(zip(actions, delays, strict=True)):
+    def step(self, now, actions, delay, ready):
+        """Send commands, which are lost with a delay of None, and fly where those lead that
+        arrive."""
+        for uav, action in enumerate(actions if ready else []):
             frame = self.frame(uav, now - 1)
             east, north = self.points[frame]
             distance, heading = self.table[action]
@@ -198,24 +199,27 @@ class Twin:
                 self.goal[uav] = next(free, self.goal[uav])
 
 
-@pytest.mark.parametrize("hold", ["none", "max"])
+@pytest.mark.parametrize(("hold", "period"), [("none", 1), ("none", 3), ("max", 1)])
 @pytest.mark.parametrize("delays", [[0, 2, 1, 2, 0], [1, 2, 3, 0, 2, 3, 3, 1]])
-def test_uavs_fly_where_commands_lead_that_come_late_or_overtake_or_are_lost(delays, hold):
+def test_uavs_fly_where_commands_lead_that_come_late_or_overtake_or_are_lost(delays, hold, period):
     law = Scripted(delays)
     late = DelayConfig(act=law, act_hold=hold)
     observation = ObservationConfig(["place"], own=True, stops=4)
     common = {"delay": late, "observation": observation, "actions": ABSOLUTE, "episode": LONG}
+    common["clock"] = ClockConfig(agents=f"{period}s")
     env = make_env(square(**common), 3)
     generator = torch.Generator().manual_seed(2)
     td = env.reset()
     twins = [Twin(env, world, law.longest) for world in range(3)]
     for now in range(1, 25):
         action = random_actions(env.uav_env, generator)
+        ready = (now - 1) % period == 0
+        assert (td["agents", "ready"] == ready).all()
         td = env.step(td.set(ACTION, action))["next"]
         drawn = delays[now % len(delays)]
         delay = None if drawn == 3 else law.longest if hold == "max" else drawn
         for world, twin in enumerate(twins):
-            twin.step(now, action[world].tolist(), [delay] * 3)
+            twin.step(now, action[world].tolist(), delay, ready)
             assert env.uav_env.state.goal[world].tolist() == twin.goal
             assert td[FRAME][world].tolist() == [twin.frame(uav, now) for uav in range(3)]
     assert len({tuple(twin.goal) for twin in twins}) > 1
