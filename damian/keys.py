@@ -19,6 +19,20 @@ ACTION_MASK = (AGENTS, "action_mask")
 ACTION_VALID = (AGENTS, "action_valid")
 """Written by ``ActionDelay`` for the environment: does this action arrive now, or is it the default
 action, [B, N] bool. The environment ignores all others, which are repetitions."""
+FRAME = (AGENTS, "frame")
+"""With absolute commands that are late: the landing point from which the UAV's next command counts,
+which is that to which its last one leads, flat ids [B, N]."""
+COMMANDS = (AGENTS, "commands")
+"""Its latest commands, the newest first: where each leads (flat id), its number (the step in which
+it was chosen, from 1; 0 for none), and the step by which it has been executed, or never will be,
+[B, N, K, 3]."""
+COMMAND = (AGENTS, "command")
+"""Written by ``CommandDelay`` for the environment: the landing point from which the action that is
+executed was chosen (flat id), its number (0 for the default action), and 0; then ``COMMANDS``,
+[B, N, 1 + K, 3]."""
+REACH = (AGENTS, "reach")
+"""How far the UAV may fly now [m], negative if it is not ready, [B, N]; for the action mask, never
+for an actor."""
 READY = (AGENTS, "ready")
 """May the UAV choose an action now, [B, N] bool."""
 OBSERVATION = (AGENTS, "observation")

@@ -152,6 +152,8 @@ def server_inputs(case, records):
         requests=place.new_zeros(*place.shape[:-1], 0, 3),
         served=place.new_zeros(*place.shape[:-1], 0),
         serves=place.new_zeros(*place.shape[:-1], 0),
+        executed=place.new_zeros(*place.shape[:-1], 0),
+        announced=place.new_zeros(*place.shape[:-1], 0, 4),
         trail=torch.zeros(*zeros.shape, 2, dtype=torch.long),
         landed=torch.zeros(*zeros.shape, 2),
         events=torch.zeros(*zeros.shape, 2, 0),

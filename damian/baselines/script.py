@@ -63,8 +63,12 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
         arguments |= {"age": keys.AGE}
     elif own_messages:
         arguments |= {"own_message": keys.MESSAGE}
+    policy = script(worlds)
+    if keys.COMMANDS in available:
+        arguments |= {"commands": keys.COMMANDS}
+        policy = Commander(policy, worlds)
     in_keys = {name: key for name, key in arguments.items() if key in available}
-    return TensorDictModule(script(worlds), in_keys, [keys.ACTION])
+    return TensorDictModule(policy, in_keys, [keys.ACTION])
 
 
 def script_without_belief(worlds: UavEnv) -> "Seeker":
@@ -242,6 +246,24 @@ def _entry(values: Tensor, index: Tensor) -> Tensor:
 def _places_at(ground: Tensor, index: Tensor) -> Tensor:
     """Landing points [B, N, 2] of these indices [B, N] among ``ground`` [B, L, 2]."""
     return ground.gather(1, index.unsqueeze(-1).expand(*index.shape, 2))
+
+
+class Commander:
+    """A script whose UAVs decide from where the commands that they have sent will have taken
+    them."""
+
+    def __init__(self, script: Seeker, worlds: UavEnv) -> None:
+        self.script = script
+        self.commanded = worlds.server.commanded
+
+    def __call__(
+        self, message: Tensor, commands: Tensor, own_message: Tensor | None = None, **known: Tensor
+    ) -> Tensor:
+        """Actions, [B, N] or [B, N, 2], from what the script reads, and ``commands``."""
+        own = self.commanded(message if own_message is None else own_message, commands).pack()
+        if type(self.script) is Seeker:  # all follow the messages of all
+            return self.script(own, **known)
+        return self.script(message, own_message=own, **known)  # type: ignore[call-arg]
 
 
 class Searcher(Seeker):

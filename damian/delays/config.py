@@ -27,6 +27,13 @@ class DelayConfig(Settings):
     act: Any = setting(
         0, "Delay of actions, written as ``obs``; a UAV holds until the first one arrives."
     )
+    act_loss: float = setting(0.0, "Probability that an action never arrives.", low=0, high=1)
+    act_hold: str = setting(
+        "none",
+        "``max``: an action is executed when the longest delay of ``act`` has passed; else as it "
+        "arrives, unless a newer one has.",
+        choices=("none", "max"),
+    )
     rew: Any = setting(0, "Delay of rewards, written as ``obs``; none may be lost.")
     loss: float = setting(
         0.0, "Probability that a message to the server node is lost.", low=0, high=1

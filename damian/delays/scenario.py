@@ -24,10 +24,11 @@ class ScenarioDelays:
         obs = LossSampler(law) if draws_loss else law
         self.obs: Sampler = HeldSampler(obs) if delay.hold == "max" else obs
         """Of the messages to the server, with their losses, and as the server holds them back."""
-        self.act, self.rew = (
-            sampler_of(getattr(delay, n), dt, key=f"delay.{n}") for n in ("act", "rew")
-        )
-        """Of the actions, and of the rewards; no reward is lost."""
+        act = sampler_of(delay.act, dt, delay.act_loss, "delay.act")
+        self.act: Sampler = HeldSampler(act) if delay.act_hold == "max" else act
+        """Of the actions, with their losses, and as the UAVs hold them back."""
+        self.rew = sampler_of(delay.rew, dt, key="delay.rew")
+        """Of the rewards, none of which is lost."""
         self.links = link_sampler(links.delay, links.loss, dt, "links.delay")
         """Of what the UAVs receive from the server (updown), or from each other (matrix)."""
         checks.require(not self.rew.loses, "delay.rew", delay.rew, LOSES)

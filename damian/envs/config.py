@@ -104,15 +104,6 @@ class ScenarioConfig(WorldConfig):
             "does not go with links=matrix: no UAV computes a belief from what it hears directly"
         )
         self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
-        forward = observation.forward
-        problem = "needs observation.own=true: a UAV that flies forward knows what it did itself"
-        self.refuse(forward and not observation.own, "observation.forward", problem)
-        problem = "does not go with links=matrix: what UAVs hear directly is not flown forward"
-        self.refuse(forward and links == "matrix", "observation.forward", problem)
-        problem = "does not go with observation.belief: no belief is flown forward"
-        self.refuse(forward and observation.belief, "observation.forward", problem)
-        problem = "=policy does not go with delay.history: the copies tell no past actions"
-        self.refuse(forward == "policy" and self.delay.history, "observation.forward", problem)
         drawn = {"source.miss", "source.false_alarm"} & {*self.randomise}
         problem = (
             "does not go with randomise of source.miss or source.false_alarm, which the filter "
@@ -153,6 +144,49 @@ class ScenarioConfig(WorldConfig):
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
         problem = "needs source.motion=dynamic and source.after_walk=stop"
         self.refuse(episode.end_with_source and not stops, "episode.end_with_source", problem)
+        self._check_commands()
+        self._check_forward()
+
+    def _check_commands(self) -> None:
+        absolute = self.actions.command == "absolute"
+        holds = self.actions.kind == "continuous" or 0.0 in self.actions.distances
+        unknown = f"links={self.links.kind}: the server would not know what a UAV has sent"
+        refused = {
+            f"does not go with {unknown}": self.links.kind != "server",
+            "does not go with clock.server: between two broadcasts no observation changes": (
+                self.clock.steps("server") > 1
+            ),
+            "needs 0 among actions.distances: a UAV holds until its first command arrives": (
+                not holds
+            ),
+        }
+        for problem, wrong in refused.items():
+            self.refuse(absolute and wrong, "actions.command", problem)
+        problem = "needs actions.command=absolute and a delay of actions: nothing else is under way"
+        wanted = self.observation.intent and not self.tells_commands
+        self.refuse(wanted, "observation.intent", problem)
+
+    def _check_forward(self) -> None:
+        forward = self.observation.forward
+        refused = {
+            "needs observation.own=true: a UAV that flies forward knows what it did itself": (
+                not self.observation.own
+            ),
+            "does not go with links=matrix: what UAVs hear directly is not flown forward": (
+                self.links.kind == "matrix"
+            ),
+            "does not go with observation.belief: no belief is flown forward": bool(
+                self.observation.belief
+            ),
+            "does not go with actions.command=absolute: no frame is flown forward": (
+                self.actions.command == "absolute"
+            ),
+            "=policy does not go with delay.history: the copies tell no past actions": (
+                forward == "policy" and self.delay.history > 0
+            ),
+        }
+        for problem, wrong in refused.items():
+            self.refuse(forward and wrong, "observation.forward", problem)
 
     def make_delays(self) -> "ScenarioDelays":
         """Resolve the laws of all delays to samplers, which reads the files of traces."""
@@ -167,6 +201,15 @@ class ScenarioConfig(WorldConfig):
     @property
     def tells_events(self) -> bool:
         return EVENTS in self.observation.global_features
+
+    @property
+    def tells_commands(self) -> bool:
+        return self.actions.command == "absolute" and self.make_delays().act.late
+
+    @property
+    def announced(self) -> int:
+        longest = self.make_delays().act.longest if self.observation.intent else 0
+        return min(longest, self.observation.carried_stops)
 
     @property
     def seeks_source(self) -> bool:

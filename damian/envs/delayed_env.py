@@ -155,7 +155,10 @@ class DelayedEnv(TransformedEnv):
             changed[i], written = transform.on_action(changed[i], entries)
             entries = entries | written
         worlds, outputs = self.uav_env.step_fn(
-            worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID)
+            worlds,
+            entries[keys.ACTION],
+            entries.get(keys.ACTION_VALID),
+            entries.get(keys.COMMAND),
         )
         for i, transform in enumerate(transforms):
             changed[i], written = transform.on_step(changed[i], outputs)

@@ -40,8 +40,14 @@ class ToldWorlds(Simulation):
     def __init__(self, simulation: Simulation) -> None:
         self.__dict__ = simulation.__dict__  # the same tables, also on another device
 
-    def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
-        state = self.vehicles.move(self.decide(state, action, action_valid))
+    def step(
+        self,
+        state: State,
+        action: Tensor,
+        action_valid: Tensor | None = None,
+        command: Tensor | None = None,
+    ) -> State:
+        state = self.vehicles.move(self.decide(state, action, action_valid, command))
         return self._sense(state._replace(steps=state.steps + 1), action_valid)
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:

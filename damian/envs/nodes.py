@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 
 from damian import keys
-from damian.common.tensors import expand_mask
+from damian.common.tensors import expand_mask, gather_rows
 from damian.server.belief import (
     Beliefs,
     SourceGrid,
@@ -23,6 +23,7 @@ from damian.server.server import Server, own_or_others
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.entries import Entries, add_spec, existing
 from damian.world.coverage import KnownCoverage
+from damian.world.simulation import Simulation
 
 
 class WorldTransform(StatefulTransform):
@@ -69,6 +70,8 @@ class ServerNode(WorldTransform):
             the same formulas, [B, N, N, M] (receiver, sender); None if they get them from the
             server.
         reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
+        simulation: of the worlds, if commands are absolute and late: actors, critic and action
+            masks then see each UAV where the commands that it has sent will have taken it.
     """
 
     stage = "server"
@@ -81,6 +84,7 @@ class ServerNode(WorldTransform):
         *,
         heard_key: NestedKey | None = None,
         reward_terms: bool = False,
+        simulation: Simulation | None = None,
     ) -> None:
         names = server.reward.terms if reward_terms else []
         created = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.REWARD]
@@ -89,6 +93,8 @@ class ServerNode(WorldTransform):
         self.server = server
         self.heard_key = heard_key
         self.reward_terms = reward_terms
+        self.simulation = simulation
+        of_commands = [keys.COMMANDS, keys.REACH, keys.READY] if simulation else []
         self.own_key = keys.MESSAGE if server.observation.own else None
         own = server.observation.own
         timeline = server.observation.timeline > 0
@@ -97,7 +103,7 @@ class ServerNode(WorldTransform):
         self.known_key = keys.MESSAGE if server.knows_requests and is_late else None
         # Without them a timeline follows from the newest messages alone.
         stops = [keys.STOPS, keys.OWN_STOPS, keys.HEARD_STOPS] if timeline else []
-        self.step_keys = [*self.required_keys, keys.SOURCE_OVER, *stops]
+        self.step_keys = [*self.required_keys, keys.SOURCE_OVER, *stops, *of_commands]
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -140,11 +146,15 @@ class ServerNode(WorldTransform):
         over = entries.get(keys.SOURCE_OVER)
         belief = entries.get(keys.BELIEF)
         timeline = entries.get(keys.STOPS)
-        outputs = self.server(messages, steps, over, known, belief, timeline, news=news)
+        observers = () if self.simulation else ("actor", "critic")
+        remembered = known, belief, timeline, observers, news
+        outputs = self.server(messages, steps, over, *remembered)
         written = outputs.entries(self.reward_terms)
         if self.known_key:
             written[self.in_keys[0]] = received
-        if self.heard_key:
+        if self.simulation:
+            written |= self._in_frames(self.simulation, received, entries, steps)
+        elif self.heard_key:
             rows = self.server.with_own_knowledge(entries[self.heard_key], sent.unsqueeze(-3))
             heard = self.server.messages(rows)
             heard_timeline = None
@@ -168,6 +178,24 @@ class ServerNode(WorldTransform):
         if outputs.coverage is not None:
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
         return memory, written
+
+    def _in_frames(
+        self, simulation: Simulation, received: Tensor, entries: Entries, steps: Tensor
+    ) -> Entries:
+        """What UAVs see and may do from where the commands that they have sent will have taken
+        them."""
+        own = entries[self.own_key] if self.own_key else received
+        messages = self.server.commanded(own, entries[keys.COMMANDS])
+        known = (entries.get(key) for key in (keys.BELIEF, keys.OWN_BELIEF, keys.STOPS))
+        sent = entries[keys.COMMANDS]
+        written = self.server.observe_commanded(received, messages, sent, steps, *known)
+        frame = simulation.bound_for(messages)
+        actions = simulation.config.actions
+        if actions.kind == "discrete" and actions.mask:
+            reach = torch.where(entries[keys.READY], entries[keys.REACH], -1.0)
+            distance = gather_rows(simulation.candidates.distance, frame)
+            written[keys.ACTION_MASK] = simulation.legal(distance, reach)
+        return written | {keys.FRAME: frame}
 
 
 def _by_sender(own_first: Tensor) -> Tensor:

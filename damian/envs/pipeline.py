@@ -14,6 +14,7 @@ What a step passes, in this order (a transform is there only if the scenario ask
 
 from collections.abc import Collection
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -23,6 +24,7 @@ from torchrl.envs import Compose, Transform
 from damian import keys
 from damian.common import checks
 from damian.delays.scenario import ScenarioDelays
+from damian.envs.commands import CommandDelay
 from damian.envs.config import ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.forward import Forward, longest_flight
@@ -40,6 +42,7 @@ from damian.transforms import (
     SampleAndHold,
 )
 from damian.world.landing import ActionConfig, action_table, displacement
+from damian.world.simulation import Simulation
 from damian.world.vehicles import MOTION_MODELS
 
 _STOPS = [keys.STOPS, keys.OWN_STOPS]
@@ -48,6 +51,8 @@ _REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LO
 _REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS]
 _REPORTED += [keys.RECALLED, keys.OWN_RECALLED, keys.FORWARD, keys.FORWARD_MASK]
 """Entries that only the extra ``message`` outputs."""
+_OF_COMMANDS = [keys.REACH]
+"""Entries of which the server node makes the action masks of late commands."""
 _LINKED = [keys.LINKED, keys.LINK_DELAY, keys.HEARD_STOPS]
 """Entries from which UAVs that hear each other directly compute what they observe."""
 
@@ -86,7 +91,7 @@ def make_transforms(
     backwards."""
     remote = has_server_node(scenario, delays)
     transforms = [
-        *action_transforms(scenario, delays),
+        *action_transforms(scenario, delays, env.simulation),
         *(server_transforms(scenario, delays, env, extras) if remote else []),
         *reward_transforms(scenario, delays, extras),
         *observation_transforms(scenario, delays),
@@ -95,28 +100,35 @@ def make_transforms(
         *_LINKED * (scenario.links.kind == "matrix"),
         *_REPORTED * ("message" not in extras),
         *_STOPS * (not delays.obs.late),
+        *_OF_COMMANDS * scenario.tells_commands,
     ]
     if remote and dropped:
         transforms.append(Drop(dropped))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
-def action_transforms(scenario: ScenarioConfig, delays: ScenarioDelays) -> list[Transform]:
+def action_transforms(
+    scenario: ScenarioConfig, delays: ScenarioDelays, simulation: Simulation
+) -> list[Transform]:
     """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not
     sent."""
     clock = scenario.clock
     act = delays.act
     if not act.late and clock.steps("agents") == 1:
         return []
-    late = ActionDelay(
-        act,
-        keys.ACTION,
-        default=hold_action(scenario.actions),
-        sent_key="ready",
-        valid_key=keys.ACTION_VALID,
+    options: dict[str, Any] = {
+        "default": hold_action(scenario.actions),
+        "sent_key": "ready",
+        "valid_key": keys.ACTION_VALID,
         **delays.told,
-    )
-    return [late]
+    }
+    if not scenario.tells_commands:
+        return [ActionDelay(act, keys.ACTION, **options)]
+    # At most so many are under way, or have been executed since the message that is known.
+    longest = act.longest + (0 if scenario.observation.own else delays.obs.longest)
+    n_commands = max(min(longest, scenario.observation.carried_stops), 1)
+    waits = not simulation.vehicles.instant
+    return [CommandDelay(act, simulation.candidates, n_commands, waits=waits, **options)]
 
 
 def server_transforms(
@@ -177,7 +189,13 @@ def server_transforms(
     if forward:
         transforms += forward_transforms(scenario, delays, env, masks=output_messages)
         heard = keys.FORWARD
-    node = ServerNode(server, held, heard_key=heard, reward_terms="reward_terms" in extras)
+    node = ServerNode(
+        server,
+        held,
+        heard_key=heard,
+        reward_terms="reward_terms" in extras,
+        simulation=env.simulation if scenario.tells_commands else None,
+    )
     return [*transforms, node]
 
 
@@ -345,7 +363,8 @@ def has_server_node(scenario: ScenarioConfig, delays: ScenarioDelays) -> bool:
     observation = scenario.observation
     forgets = observation.timeline > observation.carried_stops  # one message does not tell it all
     remembers = bool(observation.belief) or scenario.delay.messages > 0 or forgets
-    return delays.obs.late or remembers or scenario.links.kind == "matrix"
+    sees_commands = scenario.tells_commands
+    return delays.obs.late or remembers or sees_commands or scenario.links.kind == "matrix"
 
 
 def hold_action(actions: ActionConfig) -> int:

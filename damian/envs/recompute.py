@@ -32,6 +32,9 @@ def server_recompute(
     own = "actor" in corrected and server.observation.own
     observers = {"critic", "actor"}.intersection(corrected)
     observed = bool(observers)
+    commanded = server.tells_commands and observed
+    if commanded:
+        observers, own = set(), False
     if own:
         observers.remove("actor")
     kept = {key for name, key in CORRECTED.items() if name not in corrected}
@@ -53,6 +56,12 @@ def server_recompute(
             entries[keys.BELIEF] = belief
         if timeline is not None:
             entries[keys.STOPS] = timeline
+        if commanded:
+            sent = steps[next_key(keys.COMMANDS)]
+            known = steps[next_key(keys.MESSAGE)] if server.observation.own else messages
+            known = server.commanded(known, sent)
+            beliefs = belief, steps.get(next_key(keys.OWN_BELIEF), None)
+            entries |= server.observe_commanded(messages, known, sent, elapsed, *beliefs, timeline)
         if own:
             sent = steps[next_key(keys.MESSAGE)]
             own_belief = steps.get(next_key(keys.OWN_BELIEF), None)

@@ -180,8 +180,9 @@ class UavEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(keys.ACTION)
         valid = tensordict.get(keys.ACTION_VALID, None)
+        command = tensordict.get(keys.COMMAND, None)
         before = self.worlds
-        self.worlds, outputs = self.step_fn(before, action, valid)
+        self.worlds, outputs = self.step_fn(before, action, valid, command)
         if self.messages_only:  # TorchRL expects a reward from every environment
             outputs[keys.REWARD] = self.full_reward_spec[keys.REWARD].zero()
         stepped = tensordict.get(keys.STEPPED, None)
@@ -226,12 +227,16 @@ class UavEnv(EnvBase):
         return worlds, outputs
 
     def step_fn(
-        self, worlds: PackedState, action: Tensor, valid: Tensor | None = None
+        self,
+        worlds: PackedState,
+        action: Tensor,
+        valid: Tensor | None = None,
+        command: Tensor | None = None,
     ) -> tuple[PackedState, Outputs]:
         """One step of the physics, then the server's outputs; inputs as in ``Simulation.step``."""
         layout = self.simulation.layout
         before = layout.unpack(worlds)
-        state = self.simulation.step(before, action, valid)
+        state = self.simulation.step(before, action, valid, command)
         if self.messages_only:
             return layout.pack(state), self._state_outputs(state)
         known = None
@@ -253,6 +258,9 @@ class UavEnv(EnvBase):
         actions = self.scenario.actions
         if actions.kind == "discrete" and actions.mask:
             outputs[keys.ACTION_MASK] = self.simulation.action_mask(state)
+        if self.server.tells_commands:
+            outputs[keys.FRAME] = state.goal
+            outputs[keys.REACH] = vehicles.reach(state)
         if "message" in self.extras:
             outputs[keys.MESSAGE] = state.sent.pack()
             outputs[keys.MESSAGE_SENT] = state.message_sent

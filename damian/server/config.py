@@ -51,6 +51,11 @@ class ObservationConfig(Settings):
         "Whether each UAV knows its own messages at once, not when the server has them, as in the "
         "paper.",
     )
+    intent: bool = setting(
+        False,
+        "Whether messages also tell where the commands under way will take their UAV, and by when; "
+        "each actor observes this of the nearest others.",
+    )
     actions: bool = setting(
         False,
         "Whether each actor observes what each discrete action offers: where it leads, the ground, "
@@ -114,7 +119,8 @@ class ObservationConfig(Settings):
     def actor(self) -> list[str]:
         """Features of the actor's observation, in order."""
         features = [*self.local_features, *self.belief, *self.timed] if self.ctde else self.critic
-        return [*features, *["age"] * self.age, *["actions"] * self.actions]
+        told = [*["age"] * self.age, *["announced"] * self.intent, *["actions"] * self.actions]
+        return [*features, *told]
 
     @property
     def critic(self) -> list[str]:

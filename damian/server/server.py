@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey
 from torch import Tensor
+from torch.nn import functional as F
 
 from damian import keys
 from damian.common import checks
@@ -145,6 +146,11 @@ class Server:
         self._read_terms()
 
     @property
+    def tells_commands(self) -> bool:
+        """Whether messages tell which command was executed last."""
+        return self._widths.commands > 0
+
+    @property
     def grid(self) -> SourceGrid | None:
         """Cells of the belief; None if no feature reads it."""
         return self._context.tables.get(source_grid)
@@ -274,6 +280,62 @@ class Server:
         if timeline is not None and own_timeline is not None:
             both = own_or_others(own_timeline, timeline, 2)
         return self.observe_each(known, steps, belief, both)
+
+    def commanded(self, own: Tensor, commands: Tensor) -> Messages:
+        """Messages of UAVs as they will be when the commands under way have been executed, [*, N].
+
+        ``own``: packed messages [*, N, M] as their UAVs know them; ``commands`` [*, N, K, 3] as in
+        ``damian.keys``. Where a command leads is known at once, what will happen there is not. A
+        command is under way if the message tells of no later one, and could tell of it.
+        """
+        messages = self.messages(own)
+        place, number, latest = commands.unbind(-1)
+        told = (messages.time / self.dt).round().unsqueeze(-1)
+        under_way = (number > messages.executed) & (latest > told)
+        n_under_way = under_way.sum(-1, keepdim=True)
+        slot = torch.arange(messages.trail.shape[-1], device=own.device)
+        from_message = slot - n_under_way + place.shape[-1]
+        index = torch.where(slot < n_under_way, slot, from_message)
+        trail = torch.cat([place, messages.trail], -1).gather(-1, index)
+        times = torch.cat([latest * self.dt, messages.landed], -1)
+        events = F.pad(messages.events, (0, 0, place.shape[-1], 0))
+        there = gather_rows(self._context.points, trail[..., 0])
+        moves = n_under_way > 0
+        return messages._replace(
+            position=torch.where(moves, there, messages.position),
+            target=torch.where(moves, there, messages.target),
+            trail=trail,
+            landed=times.gather(-1, index).to(times.dtype),
+            events=events.take_along_dim(index.unsqueeze(-1), -2),
+        )
+
+    def observe_commanded(
+        self,
+        received: Tensor,
+        own: Messages,
+        commands: Tensor,
+        steps: Tensor,
+        belief: Tensor | None = None,
+        own_belief: Tensor | None = None,
+        timeline: Tensor | None = None,
+    ) -> dict[NestedKey, Tensor]:
+        """Observations of actors and critic from where commands will have taken UAVs, by key.
+
+        An actor knows what it has sent itself: ``own`` [*, N] is from ``commanded``. The critic is
+        a part of learning, which knows what all have sent. The other arguments are as in
+        ``observe_with_own_messages``.
+        """
+        if own_belief is None and belief is not None:
+            own_belief = belief.unsqueeze(-3)
+            own_belief = own_belief.expand(*own_belief.shape[:-3], received.shape[-2], -1, -1)
+        known = own.pack(), steps, own_belief, timeline, timeline
+        all_sent = self.commanded(received, commands)
+        names = self.observation.critic
+        features = self.features(all_sent, steps, names, belief=belief, timeline=timeline)
+        return {
+            keys.OBSERVATION: self.observe_with_own_messages(received, *known),
+            keys.GLOBAL_OBSERVATION: stack(features, names),
+        }
 
     def observe_each(
         self,

@@ -12,9 +12,13 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorS
 from damian.common.errors import InputError
 from damian.delays.laws import sampler_of
 from damian.delays.line import DelayLine
+from damian.delays.samplers import HeldSampler
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import Entries, existing, sibling_key, spec_rows
+
+_INITIAL = ("initial", "initial_beside")
+"""Names in the memory of the default actions, and of what travels with them."""
 
 
 class ActionSpecs(NamedTuple):
@@ -109,8 +113,9 @@ class ActionDelay(ActionTransform):
     """Delays actions: the environment executes the action that the policy chose some steps ago.
 
     Until the first action of an episode arrives, the environment executes a default action. In a
-    step in which no newer action arrives, it executes the same action again. The TensorDict keeps
-    the chosen action. With delay 0 the rollout is the same, bit for bit, as without the transform.
+    step in which no newer action arrives, it executes the same action again: the newest wins, and
+    one that arrives after a newer one is dropped. The TensorDict keeps the chosen action. With
+    delay 0 the rollout is the same, bit for bit, as without the transform.
 
     A worked timeline, with a delay of 3 steps: the action a0, chosen at t = 0, is executed in the
     step that begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
@@ -123,6 +128,8 @@ class ActionDelay(ActionTransform):
             shape of an action; an index for discrete and one-hot actions. If not given, the legal
             value nearest to 0.
         loss: probability that an action never arrives.
+        hold: execute each action when the longest delay has passed, so that none is dropped: a
+            jitter buffer, with which methods for constant delays work under random ones.
         sent_key: key of a flag in the policy's input, [...] bool: which actions are sent; if not
             given, all.
         valid_key: key of a flag that is written for the environment, [...] bool: true if the action
@@ -141,6 +148,7 @@ class ActionDelay(ActionTransform):
         *,
         default: Any = None,
         loss: float = 0.0,
+        hold: bool = False,
         dt: float = 1.0,
         sent_key: NestedKey | None = None,
         valid_key: NestedKey | None = None,
@@ -149,7 +157,8 @@ class ActionDelay(ActionTransform):
     ) -> None:
         super().__init__(action_key, default, seed)
         self.out_keys_inv = self.in_keys_inv
-        self.sampler = sampler_of(delay, dt, loss)
+        sampler = sampler_of(delay, dt, loss)
+        self.sampler = HeldSampler(sampler) if hold else sampler
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (
             sibling_key(self.action_key, key) for key in (sent_key, valid_key)
@@ -164,20 +173,30 @@ class ActionDelay(ActionTransform):
         return [*self.contexts.keys.values()]
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        initial = self.action_rows(self.actions.initial)
-        streams = self.streams(tensordict.batch_size, initial.device, self.sampler)
-        memory = self.line.init_memory([initial], streams) | {"initial": initial}
+        first = self.begins()
+        streams = self.streams(tensordict.batch_size, first[0].device, self.sampler)
+        memory = self.line.init_memory(first, streams) | dict(zip(_INITIAL, first, strict=False))
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
+    def begins(self) -> list[Tensor]:
+        """The default action of each row, and what travels with it, [M, ...] each."""
+        return [self.action_rows(self.actions.initial)]
+
+    def beside(self, memory: Memory, entries: Entries) -> list[Tensor]:
+        """What travels with the actions that are chosen now, [M, ...] each."""
+        return []
+
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        return self.line.reset(memory, [memory["initial"]], mask)[0], {}
+        first = [memory[name] for name in _INITIAL if name in memory]
+        return self.line.reset(memory, first, mask)[0], {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         # A distribution may draw one-hot actions as floats, where the specs have integers.
         chosen = self.to_rows(entries[self.action_key]).to(memory["initial"].dtype)
         sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
-        memory, delivery = self.line.step(memory, [chosen], sent, context)
+        sends = [chosen, *self.beside(memory, entries)]
+        memory, delivery = self.line.step(memory, sends, sent, context)
         executed: Entries = {self.action_key: self.from_rows(delivery.held[0]).clone()}
         if self.valid_key:
             default = memory["generated_at"] == memory["reset_at"]

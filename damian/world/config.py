@@ -457,6 +457,12 @@ class ActionConfig(Settings):
         high=360,
     )
     mask: bool = setting(True, "Mask actions without effect: outside, battery too low, in flight.")
+    command: str = setting(
+        "relative",
+        "What a late action says: a way from wherever the UAV is by then (relative), or the place "
+        "to which it led from where the UAV chose it (absolute).",
+        choices=("relative", "absolute"),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -525,6 +531,16 @@ class WorldConfig(Settings):
     def tells_events(self) -> bool:
         """Whether messages tell what was heard and served at each stop."""
         return False
+
+    @property
+    def tells_commands(self) -> bool:
+        """Whether messages tell which absolute command was executed last."""
+        return False
+
+    @property
+    def announced(self) -> int:
+        """Number of commands under way of which messages tell."""
+        return 0
 
     @property
     def seeks_source(self) -> bool:

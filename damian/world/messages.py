@@ -33,6 +33,10 @@ class Widths(NamedTuple):
     them."""
     events: int = 0
     """Number of events that messages tell of each stop."""
+    commands: int = 0
+    """1 if messages tell which command was executed last."""
+    announced: int = 0
+    """Number of commands under way of which messages tell, D."""
 
 
 ONE_SOURCE = Widths()
@@ -81,6 +85,12 @@ class Messages(NamedTuple):
     none."""
     serves: Annotated[Tensor, Column(None)]
     """Whether it serves one now, 0 or 1, [*, N, 1]; [*, N, 0] if there are no requests."""
+    executed: Annotated[Tensor, Column(None)]
+    """Number of the command that the UAV has executed last, 0 before the first one, [*, N, 1];
+    [*, N, 0] if commands are not absolute, or not late."""
+    announced: Annotated[Tensor, Column(None)]
+    """Where the commands under way lead, the newest first, east, north [m], by when they will have
+    been executed [s], and 1; zeros for no command, [*, N, D, 4]."""
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a
     stop."""
@@ -133,6 +143,7 @@ class Messages(NamedTuple):
             detected_position=found.detected_position.unflatten(-1, (widths.sources, 2)),
             true_position=found.true_position.unflatten(-1, (widths.truths, 2)),
             requests=found.requests.unflatten(-1, (widths.requests, 3)),
+            announced=found.announced.unflatten(-1, (widths.announced, 4)),
             events=found.events.unflatten(-1, (stops, widths.events)),
         )
 
@@ -172,7 +183,7 @@ class Messages(NamedTuple):
 
 _HINTS = get_type_hints(Messages, include_extras=True)
 _COLUMNS: list[Column] = [hint.__metadata__[0] for hint in _HINTS.values()]
-_ROWS = ("detected_position", "true_position", "requests", "events")
+_ROWS = ("detected_position", "true_position", "requests", "announced", "events")
 """Fields that have a row for each source, request or stop."""
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
 """Number of columns of all fields whose number does not depend on the settings; they come first."""
@@ -187,4 +198,5 @@ def _variable(widths: Widths) -> list[int]:
     n = widths.sources
     m = widths.requests
     t = widths.truths
-    return [n, 2 * n, t, 2 * t, 3 * m, m, min(m, 1), widths.readings]
+    told = widths.commands, 4 * widths.announced
+    return [n, 2 * n, t, 2 * t, 3 * m, m, min(m, 1), *told, widths.readings]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import gather_rows, move_attributes, tree_map, tree_where
+from damian.common.tensors import distances, gather_rows, move_attributes, tree_map, tree_where
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
@@ -49,7 +49,15 @@ class Simulation:
         n_truths = n_sources if config.tells_truth else 0
         n_events = n_sources * config.seeks_source + (n_requests > 0)
         n_events *= config.tells_events
-        self.widths = Widths(n_sources, n_readings, n_requests, n_truths, n_events)
+        self.widths = Widths(
+            n_sources,
+            n_readings,
+            n_requests,
+            n_truths,
+            n_events,
+            int(config.tells_commands),
+            config.announced,
+        )
         regions = regions_of(config.region, rng)
         longest = max(config.actions.distances)
         self.airspace = build_airspace(regions, config.region, config.agents, longest)
@@ -123,13 +131,20 @@ class Simulation:
         state = self._first_messages(state._replace(drawn=drawn))
         return self.layout.pack(state)
 
-    def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
+    def step(
+        self,
+        state: State,
+        action: Tensor,
+        action_valid: Tensor | None = None,
+        command: Tensor | None = None,
+    ) -> State:
         """Simulate one step; actions of UAVs that are not ready change nothing.
 
         Actions are discrete [B, N], or continuous [B, N, 2] in [0, 1]; only those of
-        ``action_valid`` [B, N] count.
+        ``action_valid`` [B, N] count. They begin where each UAV stands, or else as ``command``
+        [B, N, 1 + K, 3] says (``damian.keys``).
         """
-        decided = self.decide(state, action, action_valid)
+        decided = self.decide(state, action, action_valid, command)
         if self.news.aborts:
             decided = self._abort(state, decided)
         moved = self.vehicles.move(decided)
@@ -142,8 +157,13 @@ class Simulation:
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
-        reach = self.vehicles.reach(state).unsqueeze(-1)
-        valid = self._action_distances(state) <= reach
+        return self.legal(self._action_distances(state), self.vehicles.reach(state))
+
+    def legal(self, distance: Tensor, reach: Tensor) -> Tensor:
+        """The same by the lengths of the actions [m], [B, N, A], and how far each UAV may fly now
+        [m], [B, N]."""
+        reach = reach.unsqueeze(-1)
+        valid = distance <= reach
         if not self.candidates.can_hold:
             stuck = ~valid.any(-1, keepdim=True)
             valid = valid | stuck
@@ -166,17 +186,38 @@ class Simulation:
         origin = state.goal.unsqueeze(-1).expand_as(goals)
         return self.vehicles.distance(state, origin, goals)
 
+    def bound_for(self, messages: Messages) -> Tensor:
+        """The landing points on which UAVs stand, or to which they fly, flat ids [B, N]."""
+        latest = messages.trail[..., 0]
+        if self.vehicles.instant:
+            return latest
+        n_points = self.airspace.max_points
+        region = messages.region(n_points)
+        ground = gather_rows(self.airspace.points, region)
+        nearest = distances(messages.target, ground).argmin(-1)
+        return torch.where(messages.in_flight, nearest + region.unsqueeze(-1) * n_points, latest)
+
     # The stages of one step, in order.
 
-    def decide(self, state: State, action: Tensor, action_valid: Tensor | None) -> State:
+    def decide(
+        self,
+        state: State,
+        action: Tensor,
+        action_valid: Tensor | None,
+        command: Tensor | None = None,
+    ) -> State:
         """Assign landing points to the UAVs that may choose, and start their flights, as in
         ``step``."""
         n_points = self.airspace.max_points
         base = state.region.unsqueeze(-1) * n_points
         standing = state.goal - base
-        ranking, row = self.candidates.rank(state.goal, state.region, action)
-        if self.vehicles.is_windy:
-            ranking, row = self._in_wind(state, ranking, row)
+        origin = state.goal
+        if command is not None:
+            start, number, _ = command[..., 0, :].unbind(-1)
+            origin = torch.where(number > 0, start, origin)
+        ranking, row = self.candidates.rank(origin, state.region, action)
+        if self.vehicles.is_windy or command is not None:
+            ranking, row = self._from_here(state, ranking, row)
         reach = self.vehicles.reach(state)
         if action_valid is not None:
             reach = torch.where(action_valid, reach, -1.0)
@@ -187,13 +228,32 @@ class Simulation:
         track = torch.where(departs, self._heading(state.goal, goal), state.track)
         motions = state.motions + ready
         state = state._replace(track=track, motions=motions)
+        if command is not None:
+            state = state._replace(sent=self._with_commands(state, command, ready))
         return self.vehicles.take_off(state, goal, ready, departs)
 
-    def _in_wind(self, state: State, ranking: Ranking, row: Tensor) -> tuple[Ranking, Tensor]:
-        """The ranking of each UAV with distances as the wind makes them."""
+    def _with_commands(self, state: State, command: Tensor, ready: Tensor) -> Messages:
+        """The latest messages, in which UAVs tell what they have executed, and what is under
+        way."""
+        number = command[..., 0, 1:2].to(state.track.dtype)
+        executed = torch.where(ready.unsqueeze(-1), number, state.sent.executed)
+        commands = command[..., 1 : self.widths.announced + 1, :]
+        point, number, latest = commands.unbind(-1)
+        under_way = (number > executed) & (latest > state.steps.view(-1, 1, 1) + 1)
+        by = (latest * self.dt).to(executed.dtype).unsqueeze(-1)
+        told = torch.cat([gather_rows(self.points, point), by, torch.ones_like(by)], -1)
+        announced = told * under_way.unsqueeze(-1)
+        return state.sent._replace(executed=executed, announced=announced)
+
+    def _from_here(self, state: State, ranking: Ranking, row: Tensor) -> tuple[Ranking, Tensor]:
+        """The ranking of each UAV with distances from where it stands, as the wind makes them.
+
+        Its own point is the last candidate: about another point, all others may be taken.
+        """
         point = gather_rows(ranking.point, row).long()  # [B, N, K]
         base = state.region * self.airspace.max_points
-        flat = point + base.view(-1, 1, 1)
+        flat = torch.cat([point + base.view(-1, 1, 1), state.goal.unsqueeze(-1)], -1)
+        point = flat - base.view(-1, 1, 1)
         distance = self._distance_to(state, flat)
         return Ranking.of_each(point, distance)
 
@@ -267,6 +327,8 @@ class Simulation:
             requests=self._heard(state, on_ground),
             served=served,
             serves=serves,
+            executed=sent.executed,
+            announced=sent.announced,
             trail=trail,
             landed=landed,
             events=events,

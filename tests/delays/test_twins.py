@@ -217,11 +217,14 @@ def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sen
                 ]
 
 
-@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
-def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key):
+@pytest.mark.parametrize(
+    ("loss", "sent_key", "hold"), [(0.0, None, False), (0.25, "ready", False), (0.25, None, True)]
+)
+def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key, hold):
     chosen = choices()
     default = 5
     further = {"sent_key": sent_key, "valid_key": "action_valid", "default": default, "loss": loss}
+    further["hold"] = hold
     transform = ActionDelay(law, ACTION, **further, **options(law))
     outputs = play(delayed(transform), chosen)
     seen = before(outputs, *OBSERVATION)
@@ -233,6 +236,8 @@ def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key
         receiver.begin(0, default)
         for t in range(STEPS):
             delay = sender.send(t + 1, seen[t][w][n][4], sum(ready[t][w]) if sent_key else N_AGENTS)
+            if hold and delay is not None:
+                delay = transform.sampler.longest
             sent = sent_key is None or ready[t][w][n]
             fresh = receiver.step(t + 1, chosen[t][w, n].item(), delay if sent else None)
             assert observed[t][w][n][5:] == [receiver.holds.content, fresh or receiver.waits]

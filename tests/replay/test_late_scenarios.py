@@ -16,7 +16,7 @@ from damian.envs.recompute import CORRECTED, server_recompute
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
-from damian.world.config import MotionConfig, RequestConfig, SourceConfig
+from damian.world.config import ActionConfig, MotionConfig, RequestConfig, SourceConfig
 
 STEPS = 40
 WORLDS = 4
@@ -105,6 +105,11 @@ CASES = {
         "observation": ObservationConfig(
             ["spotted"], ["detections", "events"], timeline=7, stops=2, own=True
         ),
+    },
+    "late messages, absolute commands": {
+        "delay": DelayConfig(obs=LATE, act="0..2", act_loss=0.1),
+        "actions": ActionConfig(command="absolute"),
+        "observation": ObservationConfig(LOCAL, GLOBAL, timeline=7, own=True),
     },
     "late truth": {
         "delay": DelayConfig(obs=LATE),

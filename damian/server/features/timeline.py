@@ -90,3 +90,27 @@ def _events(v: FeatureCache) -> Tensor:
     """
     known = v(known_stops)[..., 2:-1]
     return four(of_nearest(v, known.flatten(-2))).unflatten(-1, known.shape[-2:])
+
+
+@feature(
+    "actor",
+    [OTHERS, None, 4],
+    low=-1.0,
+    name="announced",
+    entries=["east", "north", "until", "announced"],
+    rows="others",
+)
+def _announced(v: FeatureCache) -> Tensor:
+    """Where the commands under way will take the four nearest other UAVs, by their newest messages,
+    [*, N, 4, D, 4].
+
+    Of each command, the newest first: the way to its place, east and north, as in ``timeline``,
+    how many steps from now it will have been executed, over D, and 1. It may not come true.
+    """
+    place, by, exists = v.messages.announced.split([2, 1, 1], -1)
+    now = v.context.now[..., None, None, None]
+    until = (by - now) / (v.context.dt * by.shape[-2])
+    until = of_nearest(v, (until * exists).clamp(-1, 1).flatten(-2)).unsqueeze(-1)
+    ways = ways_to_nearest(v, torch.cat([place, exists], -1))
+    announced = torch.cat([ways[..., :2], until, ways[..., 2:]], -1)
+    return four(announced.flatten(-2)).unflatten(-1, announced.shape[-2:])

@@ -271,6 +271,8 @@ def messages_of(
         requests=at.new_zeros(len(at), 0, 3),
         served=at.new_zeros(len(at), 0),
         serves=at.new_zeros(len(at), 0),
+        executed=at.new_zeros(len(at), 0),
+        announced=at.new_zeros(len(at), 0, 4),
         trail=stops[..., 0],
         landed=torch.where(stops[..., 1] >= 0, stops[..., 1] * dt, -1.0),
         events=at.new_zeros(*stops.shape[:-1], 0),

@@ -68,11 +68,13 @@ class ReportedEnv(UavEnv):
         told = {
             "source.count": scenario.source.count == 1,
             "requests.rate": not scenario.requests.slots,
+            "actions.command": not scenario.tells_commands,
         }
         for key, is_told in told.items():
             if not is_told:
                 raise InputError(
-                    f"{key}: it is not told by reports, which know one source and no requests"
+                    f"{key}: it is not told by reports, which know one source, no requests, and "
+                    "no commands under way"
                 )
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
         super().__init__(scenario, 1, seed, extras=extras, messages_only=True)
@@ -84,7 +86,11 @@ class ReportedEnv(UavEnv):
         return outputs | {keys.RECEIVED: message.clone(), keys.AGE: age, keys.DELAY: age.long()}
 
     def step_fn(
-        self, worlds: Any, action: Tensor, valid: Tensor | None = None
+        self,
+        worlds: Any,
+        action: Tensor,
+        valid: Tensor | None = None,
+        command: Tensor | None = None,
     ) -> tuple[Any, Outputs]:
         """The outputs after a step, of what is ``Reported`` instead of the worlds of a
         simulation."""
