@@ -14,12 +14,11 @@ from damian.models.config import SetsConfig
 WORLDS, STEPS = 4, 16
 LATE = ["observation.own=true", "observation.forward=script"]
 CROWDED = "scenario=delaybench/crowded"
-FLIGHTS = "scenario=delaybench/crowded motion=polynomial"
-CHARGING = f"{FLIGHTS} battery=charging battery.capacity_kwh=0.02"
+CHARGING = f"{CROWDED} motion=polynomial battery=charging battery.capacity_kwh=0.02"
 
 
 def env_of(words, *more):
-    scenario = damian.compose_scenario(*words.split(), *more)
+    scenario = damian.compose_scenario(*words.split(), "region.initial_conditions=16", *more)
     env = damian.make_env(scenario, WORLDS, 3, extras=["message"])
     env.assume(assumed_script(env))
     return env
@@ -34,8 +33,14 @@ def same(one, other, *entries):
         assert one[key].equal(other[key])
 
 
-@pytest.mark.parametrize("delay", ["delay.obs=1..4", "delay.obs=3 delay.loss=0.2"])
-@pytest.mark.parametrize("scenario", [f"{CROWDED} aware=timeline", FLIGHTS, CHARGING])
+@pytest.mark.parametrize(
+    ("scenario", "delay"),
+    [
+        (f"{CROWDED} aware=timeline", "delay.obs=1..4"),
+        (CROWDED, "delay.obs=3 delay.loss=0.2 observation.forward_steps=12"),
+        (CHARGING, "delay.obs=1..4"),
+    ],
+)
 def test_without_news_the_late_script_flies_as_the_undelayed_one(scenario, delay):
     undelayed, late = env_of(scenario), env_of(f"{scenario} {delay}", *LATE)
     expected = flown(undelayed, script_policy(undelayed))
