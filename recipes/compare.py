@@ -33,11 +33,11 @@ from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.runs.measures import BUILT_IN
 from damian.runs.processes import end_interrupted
-from damian.runs.run_folder import PLANNER, check_no_links, locked
+from damian.runs.run_folder import PLANNER, SCRIPT, check_no_links, locked
 
 from . import cli
 from .config import TrainConfig
-from .evaluate import fly, fly_planner
+from .evaluate import fly, fly_planner, fly_script
 from .known import key_of
 from .shared.runs import Run, check_policy_fits
 from .shared.settings import check_learning, late
@@ -152,7 +152,7 @@ def _seeds(
             else:
                 seeded = replace(seeded, learner=replace(seeded.learner, teacher=str(policy)))
         stage = int(source is not None) if trains else 2
-        flies = fly_planner if method.flies == PLANNER else fly
+        flies = {PLANNER: fly_planner, SCRIPT: fly_script}.get(method.flies or "", fly)
         yield Run(train if trains else flies, seeded, folder / f"seed_{seed}", policy, stage)
 
 

@@ -57,10 +57,16 @@ def fly(config: TrainConfig, folder: Path) -> None:
     report(config, folder, env, actor, planner)
 
 
-def fly_planner(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the planner, with its default settings, beside the untrained networks."""
+def fly_script(config: TrainConfig, folder: Path) -> None:
+    """Evaluate the script, without any network."""
     save_config(config, folder)
-    report(config, folder, make_eval_env(config), planner=PlannerConfig())
+    report(config, folder, make_eval_env(config), networks=False)
+
+
+def fly_planner(config: TrainConfig, folder: Path) -> None:
+    """Evaluate the planner with its default settings, without any network."""
+    save_config(config, folder)
+    report(config, folder, make_eval_env(config), planner=PlannerConfig(), networks=False)
 
 
 def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
@@ -133,6 +139,8 @@ def report(
     env: DelayedEnv,
     actor: TensorDictModuleBase | None = None,
     planner: PlannerConfig | None = None,
+    *,
+    networks: bool = True,
 ) -> dict[str, Evaluation]:
     """Evaluate an actor beside others, write, print and return the results, by policy."""
 
@@ -143,10 +151,12 @@ def report(
 
     random = fly(random_policy(env))
     rows = {}
-    for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():
+    untrained = untrained_actor(config, env) if networks else None
+    for name, policy in {TRAINED: actor, UNTRAINED: untrained}.items():
         if policy is not None:
+            sampled = fly(policy, learnt=True)
             most_likely = fly(policy, sample=False, learnt=True)
-            rows = {name: fly(policy, learnt=True), name + DETERMINISTIC: most_likely} | rows
+            rows = {name: sampled, name + DETERMINISTIC: most_likely} | rows
     try:
         rows[SCRIPT] = fly(script_policy(env))
     except InputError as error:  # the region is too large for the script, but not for the networks
