@@ -159,6 +159,19 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_a_method_of_i
     assert prior["recovery"] == pytest.approx((2.5 - 4) / 6)
 
 
+def test_a_script_that_flies_forward_is_a_method_with_a_model_of_the_world():
+    words = ["observation.own=true", "observation.forward=script"]
+    methods = METHODS | {"forward": Method(flies="script", overrides=words)}
+    rows = rows_of("t", "late", SCORES)
+    rows += [row("t", "late", "forward", seed, 8.0, "script") for seed in (0, 1)]
+    rows += [row("t", "late", "blind", seed, 2.0, "script") for seed in (0, 1)]
+    table = comparison(rows, methods).table
+    lines = table[table["policy"] == "script"].set_index("method")
+    assert lines.loc["forward", "regime"] == "world model"
+    assert lines.loc["forward", "J_norm"] == pytest.approx(0.8)
+    assert lines.loc["script", "return"] == 2.0
+
+
 def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_method():
     # Straight learning curves over 100 steps: the mean of the naive one ends with 4, of the aware
     # one with 8. The mean over the last tenth of the steps lags a straight curve by a twentieth of
