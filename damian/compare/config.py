@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 from damian.common import checks
 from damian.common.fields import Settings, setting
 from damian.runs.measures import check_score
-from damian.runs.run_folder import PLANNER, SCRIPT, UNTRAINED
 
 MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
@@ -46,7 +45,7 @@ class Method(Settings):
         None,
         "What flies in the place of a trained policy: the network before the first update, the "
         "script, or the planner.",
-        choices=(UNTRAINED, SCRIPT, PLANNER),
+        choices=("untrained", "script", "planner"),
     )
     tasks: list[str] | None = setting(None, "Tasks that the method does; all of them if not given.")
     simulator: bool | None = setting(
@@ -64,7 +63,7 @@ class Method(Settings):
     def has_model(self) -> bool:
         """Whether it flies with a model of the world, which tells what is not known yet."""
         flown_forward = any(word.startswith("observation.forward=") for word in self.overrides)
-        return flown_forward or self.flies == PLANNER
+        return flown_forward or self.flies == "planner"
 
 
 @dataclass
