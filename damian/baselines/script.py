@@ -110,8 +110,12 @@ def _script_of(worlds: UavEnv, believes: bool) -> "type[Seeker]":
     n_regions, n_points = worlds.simulation.airspace.points.shape[:2]
     n_pairs = n_regions * n_points**2
     shown = f"{n_points} landing points"
-    should = "are too many for the scripted policy: take a larger step"
-    checks.require(n_pairs <= MAX_PAIRS, "region.lattice_step", shown, should)
+    checks.require(
+        n_pairs <= MAX_PAIRS,
+        "region.lattice_step",
+        shown,
+        "are too many for the scripted policy: take a larger step",
+    )
     scenario = worlds.scenario
     if scenario.requests.slots:
         return Dispatcher

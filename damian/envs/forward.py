@@ -227,8 +227,12 @@ def assumed_policy(simulation: Simulation, server: Server, policy: TensorDictMod
         InputError: the policy remembers, or reads more than observation and mask.
     """
     read = {*policy.in_keys} - {keys.OBSERVATION, keys.ACTION_MASK}
-    should = "reads no more than the observation: leave out model.rnn, or observation.forward"
-    checks.require(not read, "observation.forward", "policy", should)
+    checks.require(
+        not read,
+        "observation.forward",
+        "policy",
+        "reads no more than the observation: leave out model.rnn, or observation.forward",
+    )
     names = server.observation.actor
 
     def choose(state: State, _: int) -> Tensor:

@@ -153,8 +153,9 @@ class Delays:
             return space
         entries = dict(space.spaces) if isinstance(space, Dict) else {"observation": space}
         taken = sorted(added.keys() & entries.keys())
-        should = "is an entry of it already: rename that"
-        checks.require(not taken, "observation", listed(taken), should)
+        checks.require(
+            not taken, "observation", listed(taken), "is an entry of it already: rename that"
+        )
         for name, each in added.items():
             entries[name] = Box(-np.inf, np.inf, each.shape)
         return Dict(entries)

@@ -42,19 +42,23 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
             found |= server.features(messages, steps, [name])
             values = found[name].float()
             within = (values >= declared.low - _ROUNDING) & (values <= declared.high + _ROUNDING)
-            should = (
+            checks.require(
+                bool(within.all()),
+                key,
+                f"{[*values[~within], 0][0]:g}",
                 f"is not between {declared.low:g} and {declared.high:g}: scale it, or declare its "
-                "bounds"
+                "bounds",
             )
-            checks.require(bool(within.all()), key, f"{[*values[~within], 0][0]:g}", should)
             if declared.scope == "local":
                 own = _among_others(server, name, some, elapsed)
                 same = own.float().allclose(values[:_WORLDS], atol=_ROUNDING)
-                should = (
+                checks.require(
+                    same,
+                    key,
+                    "local",
                     "changes with the messages of other UAVs: make it global, or read only the "
-                    "UAV's own"
+                    "UAV's own",
                 )
-                checks.require(same, key, "local", should)
     for term in server.terms.values():
         with naming_errors(f"reward term {term.name}"):
             term.value(found, Counters(steps, messages.motions, messages.time >= 0))

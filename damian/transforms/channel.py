@@ -141,8 +141,12 @@ class Channel(StatefulTransform):
         """The shape of the rows: there is one for each link (receiver, sender), [*B, N, N]."""
         agents = super().find_rows(tensordict)
         n = agents[-1]
-        should = f"are given for {self.n_agents} agents, but {self._beside} is of {n}"
-        checks.require(self.n_agents in (None, n), "Channel", "the links", should)
+        checks.require(
+            self.n_agents in (None, n),
+            "Channel",
+            "the links",
+            f"are given for {self.n_agents} agents, but {self._beside} is of {n}",
+        )
         return torch.Size((*agents, n))
 
     @property

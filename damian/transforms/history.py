@@ -161,10 +161,12 @@ class ActionHistory(ActionTransform):
             return observation_spec
         old = observation_spec[key]
         flat = old.dtype.is_floating_point and len(old.shape) == len(rows) + 1
-        should = (
-            "is not a vector of floats, so no actions can be appended to it; use out_key instead"
+        checks.require(
+            flat,
+            "append_to",
+            key,
+            "is not a vector of floats, so no actions can be appended to it; use out_key instead",
         )
-        checks.require(flat, "append_to", key, should)
         observation_spec[key] = self._appended(old, width)
         return observation_spec
 

@@ -47,8 +47,12 @@ class SampleAndHold(StatefulTransform):
         dt: float = 1.0,
     ) -> None:
         super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv)
-        should = "is empty, and so is in_keys_inv: name the entries or the actions to hold"
-        checks.require(bool(self.in_keys or self.in_keys_inv), "in_keys", in_keys, should)
+        checks.require(
+            bool(self.in_keys or self.in_keys_inv),
+            "in_keys",
+            in_keys,
+            "is empty, and so is in_keys_inv: name the entries or the actions to hold",
+        )
         checks.above("dt", dt, 0.0, "s")
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")

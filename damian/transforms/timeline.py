@@ -101,8 +101,12 @@ class ObservationTimeline(StatefulTransform):
         alone = not group and ages is None
         checks.require(position_key is None or alone, "position_key", position_key, should)
         shared = not group and position_key is None
-        should = "goes with messages in one frame: leave out group and position_key"
-        checks.require(own_key is None or shared, "own_key", own_key, should)
+        checks.require(
+            own_key is None or shared,
+            "own_key",
+            own_key,
+            "goes with messages in one frame: leave out group and position_key",
+        )
         super().__init__(message_key)
         self.slots = slots
         self.encode = encode

@@ -104,8 +104,11 @@ class RegionConfig(Settings):
             self.refuse(
                 not getattr(self, name), name, f"is missing: region.kind={self.kind} needs it"
             )
-        problem = "means nothing without a region of your own (region.kind=package.module:function)"
-        self.refuse(self.options is not None and ":" not in self.kind, "options", problem)
+        self.refuse(
+            self.options is not None and ":" not in self.kind,
+            "options",
+            "means nothing without a region of your own (region.kind=package.module:function)",
+        )
         indices = self.index if isinstance(self.index, list) else [self.index]
         good = indices == [None] or (
             indices and all(type(each) is int and each >= 0 for each in indices)
@@ -116,26 +119,29 @@ class RegionConfig(Settings):
         texts = self.where if isinstance(self.where, list) else [self.where]
         fits = texts and all(isinstance(each, str) and re.search(".[:=]", each) for each in texts)
         good = texts == [None] or fits
-        problem = (
-            "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
+        self.refuse(
+            not good,
+            "where",
+            "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts",
         )
-        self.refuse(not good, "where", problem)
         both = self.index is not None and self.where is not None
         self.refuse(both, "where", "and region.index both choose; give one of them")
         zones = self.zones
         drawn = checks.is_number(self.zones)
         wrong = zones % 1 or not 0 <= zones <= 100 if drawn else not isinstance(zones, list | str)
-        problem = (
-            "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100"
+        self.refuse(
+            wrong,
+            "zones",
+            "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100",
         )
-        self.refuse(wrong, "zones", problem)
         for zone in zones if isinstance(zones, list) else []:
             good = isinstance(zone, list) and len(zone) > 2
-            problem = (
+            self.refuse(
+                not good,
+                "zones",
                 "has a zone that is not a list of three or more corners: "
-                "region.zones=[[[0,0],[50,0],[0,50]]]"
+                "region.zones=[[[0,0],[50,0],[0,50]]]",
             )
-            self.refuse(not good, "zones", problem)
             for place in zone:
                 check_place("region.zones", place)
         self.refuse_unread()
@@ -427,12 +433,18 @@ class BatteryConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = "is not a list of places; leave it out to charge anywhere"
-        self.refuse(self.charging_points == [], "charging_points", problem)
+        self.refuse(
+            self.charging_points == [],
+            "charging_points",
+            "is not a list of places; leave it out to charge anywhere",
+        )
         for place in self.charging_points or []:
             check_place("battery.charging_points", place)
-        problem = "needs battery.enabled=true: the batteries stay full"
-        self.refuse(self.charging_points and not self.enabled, "charging_points", problem)
+        self.refuse(
+            self.charging_points and not self.enabled,
+            "charging_points",
+            "needs battery.enabled=true: the batteries stay full",
+        )
 
 
 @dataclass
@@ -513,14 +525,23 @@ class WorldConfig(Settings):
             for name, rule in rules(type(section)).items():
                 values = getattr(section, name)
                 wrong = rule.each and isinstance(values, list) and len(values) != self.agents
-                problem = f"is not one value for each of the {self.agents} UAVs"
-                self.refuse(wrong, f"{section.section}.{name}", problem)
+                self.refuse(
+                    wrong,
+                    f"{section.section}.{name}",
+                    f"is not one value for each of the {self.agents} UAVs",
+                )
         self._check_randomise()
-        problem = "needs motion=polynomial: instant flights feel no wind"
-        self.refuse(self.is_windy and self.motion.kind == "instant", "wind", problem)
+        self.refuse(
+            self.is_windy and self.motion.kind == "instant",
+            "wind",
+            "needs motion=polynomial: instant flights feel no wind",
+        )
         continuous = self.actions.kind == "continuous"
-        problem = "needs discrete actions, whose mask says where a flight may end"
-        self.refuse(self.may_abort and continuous, "motion.abort", problem)
+        self.refuse(
+            self.may_abort and continuous,
+            "motion.abort",
+            "needs discrete actions, whose mask says where a flight may end",
+        )
 
     @property
     def tells_truth(self) -> bool:
@@ -569,16 +590,20 @@ class WorldConfig(Settings):
             checks.require(good, own, values, "is not a range or a list of at most 8 values")
             section, _, name = key.partition(".")
             given = getattr(getattr(self, section), name)
-            problem = (
+            checks.require(
+                not isinstance(given, list),
+                own,
+                values,
                 f"draws one value for all UAVs, but {key}={given} has one for each: leave one of "
-                "them out"
+                "them out",
             )
-            checks.require(not isinstance(given, list), own, values, problem)
             apart = section == "source" and any(name in each for each in self.source.each)
-            problem = (
+            checks.require(
+                not apart,
+                own,
+                values,
                 f"draws one value for all sources, but source.each tells {name}: leave one of them "
-                "out"
+                "out",
             )
-            checks.require(not apart, own, values, problem)
             for value in values:
                 replace(getattr(self, section), **{name: value})

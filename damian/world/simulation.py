@@ -470,10 +470,12 @@ class Simulation:
             longest = 2 * self.candidates.max_distance
         flies = bool((length < longest).any())
         moves = flies or self.airspace.max_points == 1
-        problem = (
-            "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
+        checks.require(
+            moves,
+            "actions.distances",
+            actions.distances,
+            "[m] lead from no landing point to another one: take larger ones, or a finer lattice",
         )
-        checks.require(moves, "actions.distances", actions.distances, problem)
         return length.where(length.isfinite(), 0.0)
 
     def _shortest_in_wind(self, state: State) -> Tensor:
