@@ -3,7 +3,7 @@ extend."""
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
@@ -139,7 +139,7 @@ class TrainConfig(ScenarioConfig):
 class PlannerConfig(Settings):
     """Settings of the planner (``damian.baselines.planner``)."""
 
-    section: ClassVar[str] = "planner"
+    section = "planner"
 
     horizon: int = setting(4, "Steps that it looks ahead.", low=1, high=1000)
     samples: int = setting(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import distances, gather_rows, tree_map
+from damian.common.tensors import distances, gather_rows, tree_map, where_rows
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.forward import Assumed
 from damian.envs.uav_env import UavEnv
@@ -407,7 +407,7 @@ class Rescuer(Coverer):
         place = heard_places.sum(1) / times
         goal, assigned = _goal_of(uav, known.target, place, heard.any(1))
         searched = self.searched(known, uav)
-        goal = torch.where(assigned.unsqueeze(-1), goal, searched)
+        goal = where_rows(assigned, goal, searched)
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         close = (-from_goal / self.radius).exp()
@@ -443,7 +443,7 @@ class Dispatcher(Rescuer):
         other = alone.target[:, 0]
         if not self.hears_all:
             other = self.searched(known, uav)
-        goal = torch.where(assigned.unsqueeze(-1), goal, other)
+        goal = where_rows(assigned, goal, other)
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         inside = from_goal <= self.radius

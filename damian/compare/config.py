@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, setting
@@ -84,7 +84,7 @@ class HeldOut(Settings):
 class Experiment(Settings):
     """Tasks, delays and methods to compare, as written in a file of conf/experiment."""
 
-    section: ClassVar[str] = "experiment"
+    section = "experiment"
 
     tasks: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each task.")
     delays: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each delay.")

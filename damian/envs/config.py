@@ -3,7 +3,7 @@
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from damian.common import checks
 from damian.common.fields import Settings, setting
@@ -20,7 +20,7 @@ class ClockConfig(Settings):
     """Periods of the clocks, such as ``1s``, ``200ms`` or ``2min``, each a multiple of the faster
     ones."""
 
-    section: ClassVar[str] = "clock"
+    section = "clock"
 
     simulation: str = setting("1s", "Length of a simulation step, ``dt``.")
     agents: str | None = setting(

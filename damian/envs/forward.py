@@ -13,7 +13,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from damian import keys
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
-from damian.common.tensors import expand_mask, tree_map, tree_where
+from damian.common.tensors import tree_map, tree_where, where_rows
 from damian.envs.nodes import WorldTransform
 from damian.server.features.base import stack
 from damian.server.server import Server, own_or_others
@@ -100,7 +100,7 @@ class ToldWorlds(Simulation):
         earliest = torch.where(known, age, -1).argmax(-1)
         at = earliest[..., None, None].expand(*earliest.shape, 1, rows.shape[-1])
         first = rows.gather(2, at).squeeze(2)
-        first = torch.where(known.any(-1, keepdim=True), first, newest)
+        first = where_rows(known.any(-1), first, newest)
         begin = (now - steps).clamp(min=0)
         latest = self._messages(newest)
         region = latest.region(self.airspace.max_points)
@@ -215,7 +215,7 @@ def _where_told(known: Tensor, told: State, flown: State) -> State:
         if name == "sent":
             replaced[name] = tree_where(known, new, old)
         else:
-            replaced[name] = torch.where(expand_mask(known, new), new, old)
+            replaced[name] = where_rows(known, new, old)
     return flown._replace(**replaced)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from damian import keys
 from damian.common import checks
 from damian.common.errors import naming_errors
-from damian.common.tensors import expand_mask, tree_map
+from damian.common.tensors import tree_map, where_rows
 from damian.server.features import feature_of
 from damian.server.layout import Layout
 from damian.server.rewards import Counters
@@ -80,9 +80,7 @@ def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) 
             other = field.roll(
                 1, 1
             )  # those of another UAV of its world: landing points of one region
-        return torch.where(
-            expand_mask(own, field.unsqueeze(1)), field.unsqueeze(1), other.unsqueeze(1)
-        )
+        return where_rows(own, field.unsqueeze(1), other.unsqueeze(1))
 
     return server.own_features(tree_map(changed_of_others, messages), steps, [name])[name]
 

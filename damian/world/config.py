@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, check_place, constant, rules, setting
@@ -30,7 +30,7 @@ class RegionConfig(Settings):
     region from a file, which also takes {lat: 53.1, lon: -4.5} in degrees.
     """
 
-    section: ClassVar[str] = "region"
+    section = "region"
 
     kind: str = setting(
         "random",
@@ -153,7 +153,7 @@ class RegionConfig(Settings):
 class MotionConfig(Settings):
     """How UAVs move."""
 
-    section: ClassVar[str] = "motion"
+    section = "motion"
 
     kind: str = setting(
         "instant",
@@ -214,7 +214,7 @@ class MotionConfig(Settings):
 class FailureConfig(Settings):
     """UAVs that fall silent for a while and stay where they are."""
 
-    section: ClassVar[str] = "failure"
+    section = "failure"
 
     probability: float = setting(
         0.0, "Probability that a UAV fails in a simulation step.", low=0, high=1
@@ -228,7 +228,7 @@ class FailureConfig(Settings):
 class WindConfig(Settings):
     """Wind, which flights that take time feel."""
 
-    section: ClassVar[str] = "wind"
+    section = "wind"
 
     speed: float = setting(0.0, "Mean speed of the wind.", unit="m/s", low=0, high=100)
     direction: float | None = setting(
@@ -247,7 +247,7 @@ class WindConfig(Settings):
 class SourceConfig(Settings):
     """The signal source that the UAVs search for."""
 
-    section: ClassVar[str] = "source"
+    section = "source"
 
     count: int = setting(1, "Number of sources.", low=1, high=32)
     each: list[Any] = setting(
@@ -359,7 +359,7 @@ class SourceConfig(Settings):
 class RequestConfig(Settings):
     """Requests that appear at random places, to be served by landing near them."""
 
-    section: ClassVar[str] = "requests"
+    section = "requests"
 
     rate: float = setting(
         0.0,
@@ -391,7 +391,7 @@ class RequestConfig(Settings):
 class BatteryConfig(Settings):
     """Batteries of the UAVs, and the places where they charge."""
 
-    section: ClassVar[str] = "battery"
+    section = "battery"
 
     enabled: bool = setting(False, "Whether flights drain the battery.", kinds=CHARGING)
     engine_power_kw: float = setting(
@@ -451,7 +451,7 @@ class BatteryConfig(Settings):
 class ActionConfig(Settings):
     """The (distance, heading) actions of the UAVs (paper, section 4.2)."""
 
-    section: ClassVar[str] = "actions"
+    section = "actions"
 
     kind: str = setting(
         "discrete",

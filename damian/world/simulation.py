@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import distances, gather_rows, move_attributes, tree_map, tree_where
+from damian.common.tensors import (
+    distances,
+    gather_rows,
+    move_attributes,
+    tree_map,
+    tree_where,
+    where_rows,
+)
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
@@ -236,7 +243,7 @@ class Simulation:
         """The latest messages, in which UAVs tell what they have executed, and what is under
         way."""
         number = command[..., 0, 1:2].to(state.track.dtype)
-        executed = torch.where(ready.unsqueeze(-1), number, state.sent.executed)
+        executed = where_rows(ready, number, state.sent.executed)
         commands = command[..., 1 : self.widths.announced + 1, :]
         point, number, latest = commands.unbind(-1)
         under_way = (number > executed) & (latest > state.steps.view(-1, 1, 1) + 1)
@@ -403,10 +410,9 @@ class Simulation:
         if self.widths.events:
             happened = torch.cat([events.unsqueeze(-2), happened[..., :-1, :]], -2)
         if added is not None:
-            added = added.unsqueeze(-1)
-            trail = torch.where(added, trail, sent.trail)
-            landed = torch.where(added, landed, sent.landed)
-            happened = torch.where(added.unsqueeze(-1), happened, sent.events)
+            trail = where_rows(added, trail, sent.trail)
+            landed = where_rows(added, landed, sent.landed)
+            happened = where_rows(added, happened, sent.events)
         return trail, landed, happened
 
     def _serve(self, state: State, now: Tensor, lands: Tensor) -> tuple[State, Tensor, Tensor]:
@@ -439,7 +445,7 @@ class Simulation:
         ways = requests[..., :2] - state.position[..., None, :2]
         near = ways.square().sum(-1) <= reach**2
         hears = on_ground.unsqueeze(-1) & near
-        return torch.where(hears.unsqueeze(-1), requests, state.sent.requests)
+        return where_rows(hears, requests, state.sent.requests)
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:
         """Whether each UAV's observed battery level is 0, or allows nothing but holding, [B, N]."""
@@ -603,7 +609,7 @@ def _last_found(
     [B, N, K] says whether they do at this time [B, N] and place [B, N, 2]."""
     last_time, last_place = before
     last_time = torch.where(found, time.unsqueeze(-1), last_time)
-    last_place = torch.where(found.unsqueeze(-1), place.unsqueeze(-2), last_place)
+    last_place = where_rows(found, place.unsqueeze(-2), last_place)
     return last_time, last_place
 
 
