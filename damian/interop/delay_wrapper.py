@@ -80,8 +80,11 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
             "action": action,
             "reward": reward,
             "loss": loss,
+            "history": history,
+            "timeline": timeline,
+            "default": default,
+            "dt": dt,
         }
-        told |= {"history": history, "timeline": timeline, "default": default, "dt": dt}
         gymnasium.utils.RecordConstructorArgs.__init__(self, **told)
         super().__init__(env)
         space: Any = env.observation_space

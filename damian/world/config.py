@@ -15,9 +15,19 @@ POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 """Variants of a section that read a setting (``kinds``)."""
 FOOTPRINT = "footprint"
 """The sensor that tells the radius of a UAV's footprint, if it is drawn."""
-RANDOMISED = ("motion.max_speed", "motion.max_acceleration", "battery.capacity_kwh")
-RANDOMISED += ("motion.abort", "wind.speed", "wind.direction", "wind.gusts")
-RANDOMISED += ("source.level_db", "source.miss", "source.false_alarm", "delay.loss")
+RANDOMISED = (
+    "motion.max_speed",
+    "motion.max_acceleration",
+    "battery.capacity_kwh",
+    "motion.abort",
+    "wind.speed",
+    "wind.direction",
+    "wind.gusts",
+    "source.level_db",
+    "source.miss",
+    "source.false_alarm",
+    "delay.loss",
+)
 """Settings that may be drawn for each world and episode."""
 
 

@@ -39,6 +39,9 @@ _SOURCE = counter_rng.number_of("source")
 class Simulation:
     """The worlds' constants, regions and walks, drawn on the CPU, and functions of their state."""
 
+    foretold = False
+    """Whether nothing happens that messages do not tell: no flight is aborted, and no UAV fails."""
+
     def __init__(self, config: WorldConfig, dt: float, stops: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.config = config
@@ -85,9 +88,10 @@ class Simulation:
         self.pairs = pairs.view(config.agents, -1)
         """Numbers of the pairs of a UAV and a source, [N, K]; made within a step, they would not
         compile."""
-        self.unsure = any(each.miss or each.false_alarm for each in self.sources)
-        """Whether reports about a source may be wrong."""
         choices = self.vehicles.values.choices
+        drawn = {"source.miss", "source.false_alarm"} & {*choices}
+        self.unsure = bool(drawn) or any(each.miss or each.false_alarm for each in self.sources)
+        """Whether reports about a source may be wrong."""
         self.draws = bool(self.sensors or choices or self.unsure)
         """Whether first messages differ from episode to episode that begins alike."""
         shortest = self._shortest_flights()  # refuses actions that lead nowhere
@@ -152,11 +156,11 @@ class Simulation:
         [B, N, 1 + K, 3] says (``damian.keys``).
         """
         decided = self.decide(state, action, action_valid, command)
-        if self.news.aborts:
+        if self.news.aborts and not self.foretold:
             decided = self._abort(state, decided)
         moved = self.vehicles.move(decided)
         moved = moved._replace(steps=state.steps + 1)
-        if not self.news.fails:
+        if self.foretold or not self.news.fails:
             return self._sense(moved, action_valid)
         moved = self.news.fail(moved)
         joins = state.failed & ~moved.failed
@@ -371,25 +375,18 @@ class Simulation:
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
         """What each UAV reports of each source; some in reach miss it, some out of reach raise an
         alarm."""
-        values = self.vehicles.values
-        unsure = self.unsure
-        miss = values.get("source.miss", state.drawn)
-        if isinstance(miss, Tensor):
-            unsure = True
-            miss = miss.unsqueeze(-1)
-        else:
-            miss = self.misses
-        alarm = values.get("source.false_alarm", state.drawn)
-        if isinstance(alarm, Tensor):
-            unsure = True
-            alarm = alarm.unsqueeze(-1)
-        else:
-            alarm = self.false_alarms
-        if not unsure:
+        if not self.unsure:
             return in_reach
+        miss = self._chance("source.miss", state, self.misses)
+        alarm = self._chance("source.false_alarm", state, self.false_alarms)
         share = draw(state, _REPORT, self.pairs)
         false_alarm = listens & (share < alarm)
         return torch.where(in_reach, share >= miss, false_alarm)
+
+    def _chance(self, key: str, state: State, settings: Tensor) -> Tensor:
+        """A probability that is drawn for each world, [B, 1, 1], or that of each source, [K]."""
+        drawn = self.vehicles.values.get(key, state.drawn)
+        return drawn.unsqueeze(-1) if isinstance(drawn, Tensor) else settings
 
     def _events(self, detected: Tensor, serves: Tensor) -> Tensor:
         """What happens at a stop that begins now, as in ``Messages``, [B, N, E]."""
