@@ -185,11 +185,13 @@ def _check_whole(
             if "/" not in each[0]
         ]
         written = [found for found in files if isinstance(found, Mapping) and "law" in found]
-        problem = (
+        checks.require(
+            not written or law in written,
+            key,
+            law,
             "mixes laws of several files; write the one that you mean as a whole: "
-            f"{key}={{law: ...}}"
+            f"{key}={{law: ...}}",
         )
-        checks.require(not written or law in written, key, law, problem)
 
 
 LAWS = ("delay.obs", "delay.act", "delay.rew", "links.delay")

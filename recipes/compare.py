@@ -86,13 +86,19 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
             with named(_place(run.folder.parent)):
                 check_policy_fits(run.config, by_folder[Path(run.config.checkpoint)])
     succeeds = any(run.config.episode.can_succeed for run in runs)
-    should = (
-        "is in none of the tasks anything that can be reached: choose return or perceived_return"
+    checks.require(
+        succeeds or "success" not in config.score,
+        "score",
+        config.score,
+        "is in none of the tasks anything that can be reached: choose return or perceived_return",
     )
-    checks.require(succeeds or "success" not in config.score, "score", config.score, should)
     measured = all(config.score in (*BUILT_IN, *run.config.metrics) for run in runs)
-    should = f"is not measured by every run: add overrides=['metrics=[{config.score}]']"
-    checks.require(measured, "score", config.score, should)
+    checks.require(
+        measured,
+        "score",
+        config.score,
+        f"is not measured by every run: add overrides=['metrics=[{config.score}]']",
+    )
     return sorted(runs, key=lambda run: (run.stage, run.config.seed))
 
 
@@ -132,10 +138,12 @@ def _seeds(
         late_by = [] if method.delayed else late(unseeded.make_delays())
         if late_by and away:
             return  # a held-out delay, under which the undelayed method is not flown
-        should = (
-            "delays this method, with which others are compared: put delays under experiment.delays"
+        checks.require(
+            not late_by,
+            ", ".join(late_by),
+            "its value",
+            "delays this method, with which others are compared: put delays under experiment.delays",
         )
-        checks.require(not late_by, ", ".join(late_by), "its value", should)
         if trains:
             able = not method.teacher or hasattr(unseeded.learner, "teacher")
             checks.require(able, "learner", unseeded.learner.name, "has no setting teacher")

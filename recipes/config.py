@@ -3,7 +3,7 @@ extend."""
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
@@ -139,7 +139,7 @@ class TrainConfig(ScenarioConfig):
 class PlannerConfig(Settings):
     """Settings of the planner (``damian.baselines.planner``)."""
 
-    section: ClassVar[str] = "planner"
+    section = "planner"
 
     horizon: int = setting(4, "Steps that it looks ahead.", low=1, high=1000)
     samples: int = setting(
@@ -189,12 +189,21 @@ class FlyConfig(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = "is for damian train: nothing is trained here; give the run folder as checkpoint"
-        self.refuse(self.resume is not None, "resume", problem)
-        problem = "needs checkpoint: the run folder with the policy to fly"
-        self.refuse(self.learnt and not self.checkpoint, "policy", problem)
-        problem = "flies no checkpoint: leave it out"
-        self.refuse(self.policy and self.checkpoint and not self.learnt, "policy", problem)
+        self.refuse(
+            self.resume is not None,
+            "resume",
+            "is for damian train: nothing is trained here; give the run folder as checkpoint",
+        )
+        self.refuse(
+            self.learnt and not self.checkpoint,
+            "policy",
+            "needs checkpoint: the run folder with the policy to fly",
+        )
+        self.refuse(
+            self.policy and self.checkpoint and not self.learnt,
+            "policy",
+            "flies no checkpoint: leave it out",
+        )
         known = {*self.shown} <= {*map(str, range(self.agents))}
         self.refuse(not known, "shown", f"is not a list of UAVs from 0 to {self.agents - 1}")
 

@@ -134,8 +134,12 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
         state.load()
         made = state.progress.frames
         updates = max(state.progress.updates, 1)
-        problem = f"is fewer than the {made} that the run has made"
-        checks.require(made - made / updates < config.frames, "frames", config.frames, problem)
+        checks.require(
+            made - made / updates < config.frames,
+            "frames",
+            config.frames,
+            f"is fewer than the {made} that the run has made",
+        )
     elif config.checkpoint:
         trained = stored_values(run_folder(Path(config.checkpoint)), "checkpoint")["learner"][
             "name"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import distances, gather_rows, tree_map
+from damian.common.tensors import distances, gather_rows, tree_map, where_rows
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.forward import Assumed
 from damian.envs.uav_env import UavEnv
@@ -110,8 +110,12 @@ def _script_of(worlds: UavEnv, believes: bool) -> "type[Seeker]":
     n_regions, n_points = worlds.simulation.airspace.points.shape[:2]
     n_pairs = n_regions * n_points**2
     shown = f"{n_points} landing points"
-    should = "are too many for the scripted policy: take a larger step"
-    checks.require(n_pairs <= MAX_PAIRS, "region.lattice_step", shown, should)
+    checks.require(
+        n_pairs <= MAX_PAIRS,
+        "region.lattice_step",
+        shown,
+        "are too many for the scripted policy: take a larger step",
+    )
     scenario = worlds.scenario
     if scenario.requests.slots:
         return Dispatcher
@@ -403,7 +407,7 @@ class Rescuer(Coverer):
         place = heard_places.sum(1) / times
         goal, assigned = _goal_of(uav, known.target, place, heard.any(1))
         searched = self.searched(known, uav)
-        goal = torch.where(assigned.unsqueeze(-1), goal, searched)
+        goal = where_rows(assigned, goal, searched)
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         close = (-from_goal / self.radius).exp()
@@ -439,7 +443,7 @@ class Dispatcher(Rescuer):
         other = alone.target[:, 0]
         if not self.hears_all:
             other = self.searched(known, uav)
-        goal = torch.where(assigned.unsqueeze(-1), goal, other)
+        goal = where_rows(assigned, goal, other)
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         inside = from_goal <= self.radius

@@ -117,12 +117,11 @@ class Settings:
         for each in dataclasses.fields(self):
             kinds = rules(type(self))[each.name].kinds
             read = not kinds or self.variant in kinds or ":" in self.variant
-            problem = (
-                f"means nothing with {self.section}={self.variant}: only {' or '.join(kinds)} "
-                "reads it"
-            )
             self.refuse(
-                not read and getattr(self, each.name) != default_of(each), each.name, problem
+                not read and getattr(self, each.name) != default_of(each),
+                each.name,
+                f"means nothing with {self.section}={self.variant}: only {' or '.join(kinds)} "
+                "reads it",
             )
 
 
@@ -211,8 +210,12 @@ def filled(kind: type[S], values: Mapping[str, Any], path: str = "") -> S:
             below = value.items() if isinstance(value, Mapping) else ()
             given[name] = {k: filled(section, v or {}, f"{path}{name}.{k}.") for k, v in below}
         else:
-            problem = f"is not a section; write {path}{name}=OPTION, or {path}{name}.KEY=VALUE"
-            checks.require(isinstance(value, Mapping), f"{path}{name}", value, problem)
+            checks.require(
+                isinstance(value, Mapping),
+                f"{path}{name}",
+                value,
+                f"is not a section; write {path}{name}=OPTION, or {path}{name}.KEY=VALUE",
+            )
             given[name] = filled(section.class_for(value), value, f"{path}{name}.")
     made = kind(**given)
     made.refuse_unread()

@@ -158,8 +158,12 @@ def check_parameters(
     errors."""
     known = parameters_of(function)
     for name, value in given.items():
-        problem = f"is not a parameter of {path}, which has {', '.join(known) or 'none'}"
-        checks.require(name in known, f"{key}.{name}", value, problem)
+        checks.require(
+            name in known,
+            f"{key}.{name}",
+            value,
+            f"is not a parameter of {path}, which has {', '.join(known) or 'none'}",
+        )
     missing = [
         name for name, each in known.items() if each.default is each.empty and name not in given
     ]

@@ -1,6 +1,7 @@
 """Helpers that index tensors and map functions over nested named tuples of tensors."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -68,7 +69,11 @@ def move_attributes(owner: object, device: torch.device) -> None:
         setattr(owner, name, to_device(value, device))
 
 
+def where_rows(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:
+    """Take the rows of ``new`` [*, ...] where the mask [*] is true and of ``old`` elsewhere."""
+    return torch.where(expand_mask(mask, new), new, old)
+
+
 def tree_where(mask: Tensor, new: Tree, old: Tree) -> Tree:
-    """Take the rows of ``new`` where the mask [*] is true and of ``old`` elsewhere; tensors are
-    [*, ...]."""
-    return tree_map(lambda a, b: torch.where(expand_mask(mask, a), a, b), new, old)
+    """The same of nested named tuples of tensors."""
+    return tree_map(partial(where_rows, mask), new, old)

@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, setting
@@ -83,7 +83,7 @@ class HeldOut(Settings):
 class Experiment(Settings):
     """Tasks, delays and methods to compare, as written in a file of conf/experiment."""
 
-    section: ClassVar[str] = "experiment"
+    section = "experiment"
 
     tasks: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each task.")
     delays: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each delay.")
@@ -100,11 +100,13 @@ class Experiment(Settings):
         for kind in ("tasks", "delays", "methods", "held_out"):
             for name in getattr(self, kind):
                 good = re.fullmatch(r"[\w.+-]+", name) and name not in ("none", "random", "script")
-                should = (
+                checks.require(
+                    bool(good),
+                    f"experiment.{kind}",
+                    name,
                     "cannot name a folder: use letters, digits, _ . + - but not none, random or "
-                    "script"
+                    "script",
                 )
-                checks.require(bool(good), f"experiment.{kind}", name, should)
         for kind in ("tasks", "methods"):
             self.refuse(
                 not getattr(self, kind), kind, "is missing or empty; an experiment needs one"
@@ -117,15 +119,23 @@ class Experiment(Settings):
 
     def _check_methods(self) -> None:
         undelayed = [name for name, method in self.methods.items() if not method.delayed]
-        should = "are not delayed: exactly one method must have delayed=false"
-        checks.require(len(undelayed) == 1, "experiment.methods", undelayed, should)
+        checks.require(
+            len(undelayed) == 1,
+            "experiment.methods",
+            undelayed,
+            "are not delayed: exactly one method must have delayed=false",
+        )
         never = not self.delays and len(self.methods) > len(undelayed)
         self.refuse(never, "delays", "is empty, but there are delayed methods")
         for name, method in self.methods.items():
             key = f"experiment.methods.{name}"
             good = method.delayed and method.policy_of is None
-            should = "goes with neither policy_of nor delayed=false"
-            checks.require(good or not method.flies, f"{key}.flies", method.flies, should)
+            checks.require(
+                good or not method.flies,
+                f"{key}.flies",
+                method.flies,
+                "goes with neither policy_of nor delayed=false",
+            )
             source = self.methods.get(method.source or "", method)
             for task in self.tasks if method.tasks is None else method.tasks:
                 options = self.tasks if source.tasks is None else source.tasks
@@ -164,8 +174,12 @@ class CompareConfig(Settings):
         check_score(self.score)
         for word in self.overrides:
             ours = word.lstrip("+~").partition("=")[0].partition(".")[0] in SET_BY_COMPARISON
-            problem = "cannot be the same for every run: the comparison sets it; leave it out"
-            checks.require(not ours, "overrides", word, problem)
+            checks.require(
+                not ours,
+                "overrides",
+                word,
+                "cannot be the same for every run: the comparison sets it; leave it out",
+            )
         for kind in ("tasks", "delays", "methods"):
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))

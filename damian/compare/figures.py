@@ -29,8 +29,18 @@ LABELS = {
 }
 """Axis labels of the measures in training: in hindsight, from late data, or as the server perceived
 them."""
-METHOD_COLOURS = ("#0F3C2D", "#E15A00", "#4B96FF", "#A5000F", "#5A9696", "#FFA500", "#873C96")
-METHOD_COLOURS += ("#1E2DFF", "#FF87FF", "#0000A5")
+METHOD_COLOURS = (
+    "#0F3C2D",
+    "#E15A00",
+    "#4B96FF",
+    "#A5000F",
+    "#5A9696",
+    "#FFA500",
+    "#873C96",
+    "#1E2DFF",
+    "#FF87FF",
+    "#0000A5",
+)
 """Colours of methods: each pair is far apart in OKLab, for readers without green receptors too."""
 _POINTS = 200
 """Number of points of a learning curve."""

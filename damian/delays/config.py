@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, setting
@@ -21,7 +21,7 @@ class DelayConfig(Settings):
     (docs/concepts.md), or one of your own (docs/extending.md).
     """
 
-    section: ClassVar[str] = "delay"
+    section = "delay"
 
     obs: Any = setting(0, f"Delay of messages to the server: 3 (steps), 3s, or {_EXAMPLE}.")
     act: Any = setting(
@@ -64,7 +64,7 @@ class LinkConfig(Settings):
     """How observations reach the UAVs. Rewards and the critic always follow from what the server
     holds."""
 
-    section: ClassVar[str] = "links"
+    section = "links"
 
     kind: str = setting(
         "server",

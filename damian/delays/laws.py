@@ -79,8 +79,12 @@ def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "del
         ends = [_number(each) for each in written.split("..", 1)]
         low, high = (in_steps(key, each, dt, _NO_DELAY) for each in ends)
         alike = isinstance(ends[0], str) == isinstance(ends[1], str)
-        problem = "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order"
-        checks.require(alike and low <= high, key, written, problem)
+        checks.require(
+            alike and low <= high,
+            key,
+            written,
+            "is not a range of two numbers of steps (1..7) or two times (3s..7s) in order",
+        )
         written = Uniform(low, high)
     law = law_of(written, key)
     for name, rule in rules(type(law)).items():
@@ -90,8 +94,12 @@ def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "del
         if rule.low is not None:
             checks.in_range(f"{key}.{name}", value, rule.low, rule.high, rule.unit)
     sampler = law.sampler(dt, loss, key)
-    problem = f"loses no message, but loss={loss}: its sampler has to lose that share"
-    checks.require(sampler.loses or loss == 0, key, type(law).__name__, problem)
+    checks.require(
+        sampler.loses or loss == 0,
+        key,
+        type(law).__name__,
+        f"loses no message, but loss={loss}: its sampler has to lose that share",
+    )
     return sampler
 
 
@@ -170,8 +178,12 @@ class Uniform(Law):
         low = _exact_steps(f"{key}.low", self.low, dt)
         high = _exact_steps(f"{key}.high", self.high, dt)
         in_time = isinstance(self.low, str), isinstance(self.high, str)
-        should = f"and high={self.high} are not two steps or two times in order"
-        checks.require(low <= high and in_time[0] == in_time[1], f"{key}.low", self.low, should)
+        checks.require(
+            low <= high and in_time[0] == in_time[1],
+            f"{key}.low",
+            self.low,
+            f"and high={self.high} are not two steps or two times in order",
+        )
         if all(in_time):
             chances = _rounded_up(low, high)
         else:
@@ -286,12 +298,20 @@ class Lag(Law):
         period = None
         draws_again = bool(self.hold_probability) or self.stagger
         if self.update_period == "episode":
-            problem = "draws one lag: hold_probability and stagger have no effect"
-            checks.require(not draws_again, f"{key}.update_period", "episode", problem)
+            checks.require(
+                not draws_again,
+                f"{key}.update_period",
+                "episode",
+                "draws one lag: hold_probability and stagger have no effect",
+            )
         else:
             period = in_steps(f"{key}.update_period", self.update_period, dt)
-            problem = "is not above 0; or write episode"
-            checks.require(period > 0, f"{key}.update_period", self.update_period, problem)
+            checks.require(
+                period > 0,
+                f"{key}.update_period",
+                self.update_period,
+                "is not above 0; or write episode",
+            )
         lags = _memoryless(self.lag, dt, 0.0, f"{key}.lag")
         return LagSampler(self, lags, loss, period)
 
@@ -366,8 +386,12 @@ def law_of(written: Any, key: str = "delay") -> Law:
     values = {name: _number(value) for name, value in written.items() if name != "law"}
     names = [field.name for field in fields(law)]
     for name, value in values.items():
-        should = f"is not a setting of the law {kind}, which has {', '.join(names) or 'none'}"
-        checks.require(name in names, f"{key}.{name}", value, should)
+        checks.require(
+            name in names,
+            f"{key}.{name}",
+            value,
+            f"is not a setting of the law {kind}, which has {', '.join(names) or 'none'}",
+        )
     return law(**values)
 
 
@@ -409,8 +433,12 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     n = len(next(iter(matrices.values())))
     for name, matrix in matrices.items():
         good = [len(row) if is_matrix(row) else 0 for row in matrix] == [n] * n
-        should = f"is not N x N, {n} x {n}: a list for each receiver, with an entry for each sender"
-        checks.require(good, name, matrix, should)
+        checks.require(
+            good,
+            name,
+            matrix,
+            f"is not N x N, {n} x {n}: a list for each receiver, with an entry for each sender",
+        )
     distinct: list[Any] = []
     samplers: list[Sampler] = []
     index = []

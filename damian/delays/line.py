@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.common.tensors import expand_mask
+from damian.common.tensors import where_rows
 from damian.delays.samplers import MessageContext, Sampler
 
 Memory = dict[str, Tensor]
@@ -90,7 +90,7 @@ class DelayLine:
         }
         memory["state"] = self.sampler.begin_episode(memory["state"], mask)
         for i, new in enumerate(values):
-            memory[f"held_{i}"] = torch.where(expand_mask(mask, new), new, memory[f"held_{i}"])
+            memory[f"held_{i}"] = where_rows(mask, new, memory[f"held_{i}"])
         zero = torch.zeros_like(memory["generated_at"])
         return memory, Delivery(values, zero, zero == 0, zero)
 
@@ -138,7 +138,7 @@ class DelayLine:
             flat = memory[f"slots_{i}"].flatten(0, 1)
             old = memory[f"held_{i}"]
             flat.index_copy_(0, row_sent, value)
-            held.append(torch.where(expand_mask(fresh, old), flat.index_select(0, row_now), old))
+            held.append(where_rows(fresh, flat.index_select(0, row_now), old))
             memory[f"held_{i}"] = held[i]
         return memory, Delivery(held, clock - generated_at, fresh, delay)
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from damian.common import checks, counter_rng
+from damian.common.tensors import where_rows
 
 _LOSS_DRAW, _HOLD_DRAW, _PHASE_DRAW, _LINK_LOSS_DRAW = 0, 1, 2, 3
 """Counters that tell the further draws of a message from the draw of its delay."""
@@ -290,7 +291,7 @@ class LagSampler(Sampler):
 
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
         first = self.initial_state(state[:, 0])
-        return torch.where(mask.unsqueeze(-1), first, state)
+        return where_rows(mask, first, state)
 
     def forward(
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None

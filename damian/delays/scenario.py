@@ -42,8 +42,12 @@ class ScenarioDelays:
             told_receiver = key == "links.delay" and links.kind == "matrix"
             known = ["position", *["receiver_position"] * told_receiver]
             for name in sampler.reads:
-                problem = f"reads {name}, but a law can read only {', '.join(known)}"
-                checks.require(name in known, key, type(sampler).__name__, problem)
+                checks.require(
+                    name in known,
+                    key,
+                    type(sampler).__name__,
+                    f"reads {name}, but a law can read only {', '.join(known)}",
+                )
         self.reads_positions = links.range is not None or any(
             sampler.reads for sampler in laws.values()
         )

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from torchrl.data import Composite
 
 from damian import keys
-from damian.common.tensors import expand_mask, gather_rows
+from damian.common.tensors import expand_mask, gather_rows, where_rows
 from damian.transforms.action import ActionDelay
 from damian.transforms.base import Change, Memory
 from damian.transforms.entries import Entries, add_spec
@@ -76,7 +76,7 @@ class CommandDelay(ActionDelay):
         commands = torch.cat([newest, memory["commands"][:, :-1]], 1)
         sent = self.sending_rows(entries)
         if sent is not None:
-            commands = torch.where(expand_mask(sent, commands), commands, memory["commands"])
+            commands = where_rows(sent, commands, memory["commands"])
         memory["commands"] = commands
         held = F.pad(memory["held_1"], (0, 1)).unsqueeze(1)
         executed[keys.COMMAND] = self.from_rows(torch.cat([held, commands], 1))

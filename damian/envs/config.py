@@ -3,7 +3,7 @@
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from damian.common import checks
 from damian.common.fields import Settings, setting
@@ -20,7 +20,7 @@ class ClockConfig(Settings):
     """Periods of the clocks, such as ``1s``, ``200ms`` or ``2min``, each a multiple of the faster
     ones."""
 
-    section: ClassVar[str] = "clock"
+    section = "clock"
 
     simulation: str = setting("1s", "Length of a simulation step, ``dt``.")
     agents: str | None = setting(
@@ -59,8 +59,12 @@ class ClockConfig(Settings):
     def _check_multiple(self, slow: str, fast: str) -> None:
         ratio = self._seconds(slow) / self._seconds(fast)
         whole = math.isclose(ratio, max(round(ratio), 1), rel_tol=1e-9)
-        problem = f"is not a multiple of clock.{fast}={self._period(fast)}"
-        checks.require(whole, f"clock.{slow}", self._period(slow), problem)
+        checks.require(
+            whole,
+            f"clock.{slow}",
+            self._period(slow),
+            f"is not a multiple of clock.{fast}={self._period(fast)}",
+        )
 
     def _period(self, name: str) -> str:
         return getattr(self, name) or self.simulation
@@ -96,20 +100,28 @@ class ScenarioConfig(WorldConfig):
         links = self.links.kind
         observation = self.observation
         episode = self.episode
-        problem = "does not go with clock.server: between two broadcasts no observation changes"
-        self.refuse(observation.own and self.clock.steps("server") > 1, "observation.own", problem)
-        problem = "does not go with links=updown: the server has computed what a UAV receives"
-        self.refuse(observation.own and links == "updown", "observation.own", problem)
-        problem = (
-            "does not go with links=matrix: no UAV computes a belief from what it hears directly"
+        self.refuse(
+            observation.own and self.clock.steps("server") > 1,
+            "observation.own",
+            "does not go with clock.server: between two broadcasts no observation changes",
         )
-        self.refuse(observation.belief and links == "matrix", "observation.belief", problem)
+        self.refuse(
+            observation.own and links == "updown",
+            "observation.own",
+            "does not go with links=updown: the server has computed what a UAV receives",
+        )
+        self.refuse(
+            observation.belief and links == "matrix",
+            "observation.belief",
+            "does not go with links=matrix: no UAV computes a belief from what it hears directly",
+        )
         drawn = {"source.miss", "source.false_alarm"} & {*self.randomise}
-        problem = (
+        self.refuse(
+            observation.belief and drawn,
+            "observation.belief",
             "does not go with randomise of source.miss or source.false_alarm, which the filter "
-            "knows"
+            "knows",
         )
-        self.refuse(observation.belief and drawn, "observation.belief", problem)
         continuous = self.actions.kind == "continuous"
         per_action = {"belief": "belief_gain" in observation.belief, "actions": observation.actions}
         problem = "needs discrete actions: it has values for each of them"
@@ -118,16 +130,16 @@ class ScenarioConfig(WorldConfig):
         problem = "is empty for a single UAV: add another feature"
         empty = self.agents == 1 and observation.critic == ["agent_distances"]
         self.refuse(empty, "observation.global_features", problem)
-        problem = (
+        self.refuse(
+            self.delay.messages and links != "server",
+            "delay.messages",
             f"does not go with links={links}: a UAV would get the messages that the server has "
-            "received"
-        )
-        self.refuse(self.delay.messages and links != "server", "delay.messages", problem)
-        problem = (
-            "does not go with delay.order=arrival: a slot would change with when a message arrived"
+            "received",
         )
         self.refuse(
-            observation.timeline and self.delay.order == "arrival", "observation.timeline", problem
+            observation.timeline and self.delay.order == "arrival",
+            "observation.timeline",
+            "does not go with delay.order=arrival: a slot would change with when a message arrived",
         )
         asked = "requests" in observation.global_features or self.reward.served
         self.refuse(
@@ -135,15 +147,19 @@ class ScenarioConfig(WorldConfig):
         )
         told = self.seeks_source or self.requests.slots
         wrong = self.tells_events and not (observation.timeline and told)
-        problem = (
-            f"has {EVENTS}, which need observation.timeline, and a source or requests that count"
+        self.refuse(
+            wrong,
+            "observation.global_features",
+            f"has {EVENTS}, which need observation.timeline, and a source or requests that count",
         )
-        self.refuse(wrong, "observation.global_features", problem)
         never = episode.discharged_share is not None and not self.battery.enabled
         self.refuse(never, "episode.discharged_share", "needs battery.enabled=true")
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
-        problem = "needs source.motion=dynamic and source.after_walk=stop"
-        self.refuse(episode.end_with_source and not stops, "episode.end_with_source", problem)
+        self.refuse(
+            episode.end_with_source and not stops,
+            "episode.end_with_source",
+            "needs source.motion=dynamic and source.after_walk=stop",
+        )
         self._check_commands()
         self._check_forward()
 

@@ -13,7 +13,7 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 from damian import keys
 from damian.common import devices
 from damian.common.compiling import CompiledMethods
-from damian.common.tensors import expand_mask
+from damian.common.tensors import where_rows
 from damian.delays.scenario import ScenarioDelays
 from damian.envs.forward import Assumed, Forward
 from damian.envs.nodes import Drop
@@ -190,9 +190,7 @@ class DelayedEnv(TransformedEnv):
         if torch.compiler.is_compiling() or not devices.data_dependent(done.device) or done.any():
             mask = done.view(-1)
             worlds, memories, first = self.reset_fn(worlds, memories, mask)
-            following |= {
-                k: torch.where(expand_mask(mask, x), x, following[k]) for k, x in first.items()
-            }
+            following |= {k: where_rows(mask, x, following[k]) for k, x in first.items()}
         return worlds, memories, outputs, following
 
     def _fused(self) -> list[StatefulTransform]:

@@ -13,7 +13,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from damian import keys
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
-from damian.common.tensors import expand_mask, tree_map, tree_where
+from damian.common.tensors import tree_map, tree_where, where_rows
 from damian.envs.nodes import WorldTransform
 from damian.server.features.base import stack
 from damian.server.server import Server, own_or_others
@@ -37,18 +37,10 @@ class ToldWorlds(Simulation):
     known, no flight is aborted and no UAV fails. Gusts are drawn from streams of their own.
     """
 
+    foretold = True
+
     def __init__(self, simulation: Simulation) -> None:
         self.__dict__ = simulation.__dict__  # the same tables, also on another device
-
-    def step(
-        self,
-        state: State,
-        action: Tensor,
-        action_valid: Tensor | None = None,
-        command: Tensor | None = None,
-    ) -> State:
-        state = self.vehicles.move(self.decide(state, action, action_valid, command))
-        return self._sense(state._replace(steps=state.steps + 1), action_valid)
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         nowhere = torch.full_like(state.source, torch.inf)
@@ -100,7 +92,7 @@ class ToldWorlds(Simulation):
         earliest = torch.where(known, age, -1).argmax(-1)
         at = earliest[..., None, None].expand(*earliest.shape, 1, rows.shape[-1])
         first = rows.gather(2, at).squeeze(2)
-        first = torch.where(known.any(-1, keepdim=True), first, newest)
+        first = where_rows(known.any(-1), first, newest)
         begin = (now - steps).clamp(min=0)
         latest = self._messages(newest)
         region = latest.region(self.airspace.max_points)
@@ -201,22 +193,32 @@ class Forward(WorldTransform):
         return observation_spec
 
 
-_OF_UAVS = ("origin", "goal", "elapsed", "vertical", "cruise", "cruise_before", "air")
-_OF_UAVS += ("battery_before", "failed")
-_OF_UAVS += ("position", "track", "battery", "motions", "message_sent", "sent")
-"""Fields of a state that have a row for each UAV, and follow from its messages."""
+_OF_UAVS = (
+    "origin",
+    "goal",
+    "elapsed",
+    "vertical",
+    "cruise",
+    "cruise_before",
+    "air",
+    "failed",
+    "battery_before",
+    "position",
+    "track",
+    "battery",
+    "motions",
+    "message_sent",
+)
+"""Fields of a state, beside ``sent``, that have a row for each UAV and follow from its messages."""
 
 
 def _where_told(known: Tensor, told: State, flown: State) -> State:
     """The state of copies, with the UAVs of which messages are ``known`` [C, N] as these tell."""
     replaced = {}
     for name in _OF_UAVS:
-        new, old = getattr(told, name), getattr(flown, name)
-        if name == "sent":
-            replaced[name] = tree_where(known, new, old)
-        else:
-            replaced[name] = torch.where(expand_mask(known, new), new, old)
-    return flown._replace(**replaced)
+        replaced[name] = where_rows(known, getattr(told, name), getattr(flown, name))
+    sent = tree_where(known, told.sent, flown.sent)
+    return flown._replace(**replaced, sent=sent)
 
 
 def assumed_policy(simulation: Simulation, server: Server, policy: TensorDictModuleBase) -> Assumed:
@@ -227,8 +229,12 @@ def assumed_policy(simulation: Simulation, server: Server, policy: TensorDictMod
         InputError: the policy remembers, or reads more than observation and mask.
     """
     read = {*policy.in_keys} - {keys.OBSERVATION, keys.ACTION_MASK}
-    should = "reads no more than the observation: leave out model.rnn, or observation.forward"
-    checks.require(not read, "observation.forward", "policy", should)
+    checks.require(
+        not read,
+        "observation.forward",
+        "policy",
+        "reads no more than the observation: leave out model.rnn, or observation.forward",
+    )
     names = server.observation.actor
 
     def choose(state: State, _: int) -> Tensor:

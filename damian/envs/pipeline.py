@@ -47,9 +47,20 @@ from damian.world.vehicles import MOTION_MODELS
 
 _STOPS = [keys.STOPS, keys.OWN_STOPS]
 """Entries that only back-updating reads behind the server node."""
-_REPORTED = [keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY, keys.LOSS]
-_REPORTED += [keys.BELIEF, keys.OWN_BELIEF, *_STOPS]
-_REPORTED += [keys.RECALLED, keys.OWN_RECALLED, keys.FORWARD, keys.FORWARD_MASK]
+_REPORTED = [
+    keys.MESSAGE,
+    keys.MESSAGE_SENT,
+    keys.RECEIVED,
+    keys.DELAY,
+    keys.LOSS,
+    keys.BELIEF,
+    keys.OWN_BELIEF,
+    *_STOPS,
+    keys.RECALLED,
+    keys.OWN_RECALLED,
+    keys.FORWARD,
+    keys.FORWARD_MASK,
+]
 """Entries that only the extra ``message`` outputs."""
 _OF_COMMANDS = [keys.REACH]
 """Entries of which the server node makes the action masks of late commands."""
@@ -223,6 +234,7 @@ def remembering_transforms(
 ) -> list[Transform]:
     """What keeps messages of earlier steps: the belief, and the history to learn a belief from."""
     own = scenario.observation.own
+    delay_key = keys.DELAY if delayed else None
     transforms = list[Transform]()
     if server.grid is not None:
         transforms.append(Belief(server, longest, delayed=delayed, own=own))
@@ -231,14 +243,13 @@ def remembering_transforms(
             scenario.delay.messages,
             keys.MESSAGE,
             keys.TIMELINE,
-            delay_key=keys.DELAY if delayed else None,
+            delay_key=delay_key,
             sent_key=keys.MESSAGE_SENT,
             encode=partial(scaled_messages, server),
             group=True,
             own=own,
         )
         transforms.append(history)
-    delay_key = keys.DELAY if delayed else None
     own_key = keys.OWN_STOPS if own else None
     transforms += timeline_transforms(scenario, server, keys.STOPS, delay_key, own_key=own_key)
     return transforms

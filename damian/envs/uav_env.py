@@ -14,7 +14,7 @@ from torchrl.envs.utils import make_composite_from_td
 
 from damian import keys
 from damian.common import checks, counter_rng, devices
-from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
+from damian.common.tensors import gather_rows, tree_map, tree_where, where_rows
 from damian.envs.config import ScenarioConfig
 from damian.server.belief import certain_belief
 from damian.server.components import checked_features
@@ -194,7 +194,7 @@ class UavEnv(EnvBase):
                 old = tensordict.get(key, None)
                 if old is None or old.shape != new.shape:  # transforms restore what they change
                     old = torch.zeros_like(new)
-                outputs[key] = torch.where(expand_mask(stepped, new), new, old)
+                outputs[key] = where_rows(stepped, new, old)
         return self.to_tensordict(outputs)
 
     @torch.no_grad()

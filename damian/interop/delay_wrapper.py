@@ -80,8 +80,11 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
             "action": action,
             "reward": reward,
             "loss": loss,
+            "history": history,
+            "timeline": timeline,
+            "default": default,
+            "dt": dt,
         }
-        told |= {"history": history, "timeline": timeline, "default": default, "dt": dt}
         gymnasium.utils.RecordConstructorArgs.__init__(self, **told)
         super().__init__(env)
         space: Any = env.observation_space
@@ -153,8 +156,9 @@ class Delays:
             return space
         entries = dict(space.spaces) if isinstance(space, Dict) else {"observation": space}
         taken = sorted(added.keys() & entries.keys())
-        should = "is an entry of it already: rename that"
-        checks.require(not taken, "observation", listed(taken), should)
+        checks.require(
+            not taken, "observation", listed(taken), "is an entry of it already: rename that"
+        )
         for name, each in added.items():
             entries[name] = Box(-np.inf, np.inf, each.shape)
         return Dict(entries)

@@ -73,8 +73,9 @@ def exported(
     policy = ExportedPolicy(actor, env.full_action_spec_unbatched[keys.ACTION]).eval()
     steps = env.rollout(16, break_when_any_done=False).flatten()
     missing = [str(each) for each in policy.in_keys if each not in steps.keys(True)]
-    should = "is what its actor reads, and not in the environment"
-    checks.require(not missing, key, ", ".join(missing), should)
+    checks.require(
+        not missing, key, ", ".join(missing), "is what its actor reads, and not in the environment"
+    )
     inputs = [steps[each] for each in policy.in_keys]
     examples = tuple(each[:2].clone() for each in inputs)
     sizes = {0: torch.export.Dim("worlds", min=1)}
@@ -90,12 +91,17 @@ def exported(
         warnings.simplefilter("ignore", FutureWarning)  # torch's own
         live = actor(steps)[keys.ACTION]
         name = policy.last.distribution_class.__name__
-        should = "needs a property deterministic_sample: without it the action is drawn by chance"
-        checks.require(policy(*inputs)[0].allclose(live), key, name, should)
+        checks.require(
+            policy(*inputs)[0].allclose(live),
+            key,
+            name,
+            "needs a property deterministic_sample: without it the action is drawn by chance",
+        )
         program = torch.export.export(policy, examples, dynamic_shapes=((sizes,) * len(examples),))
         found = program.module()(*inputs)[0]
-        should = "are not those of the program"
-        checks.require(found.allclose(live), key, "the actor's actions", should)
+        checks.require(
+            found.allclose(live), key, "the actor's actions", "are not those of the program"
+        )
         onnx = torch.onnx.export(
             program, (), input_names=policy.inputs, output_names=outputs, verbose=False
         )

@@ -129,8 +129,10 @@ def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, An
 
 def one_uav(scenario: ScenarioConfig) -> None:
     """Refuse a scenario of several UAVs, because a Gymnasium environment has one agent."""
-    should = (
+    checks.require(
+        scenario.agents == 1,
+        "agents",
+        scenario.agents,
         "is not 1: a Gymnasium environment has one agent; take "
-        "damian.interop.pettingzoo.UavParallelEnv"
+        "damian.interop.pettingzoo.UavParallelEnv",
     )
-    checks.require(scenario.agents == 1, "agents", scenario.agents, should)

@@ -126,8 +126,11 @@ class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
             "action": action,
             "reward": reward,
             "loss": loss,
+            "history": history,
+            "timeline": timeline,
+            "default": default or {},
+            "dt": dt,
         }
-        told |= {"history": history, "timeline": timeline, "default": default or {}, "dt": dt}
         observed = {agent: env.observation_space(agent) for agent in env.possible_agents}
         self._delays = Delays(
             observed, {agent: env.action_space(agent) for agent in observed}, told

@@ -128,10 +128,12 @@ class BackupdateStorage(TimeStorage):
         checks.require(
             data.dim() == 2, "steps", f"a batch of shape {list(data.shape)}", "is not [T, B]"
         )
-        should = (
-            "joins steps before they are corrected: leave it out, and join the steps that are read"
+        checks.require(
+            "steps_to_next_obs" not in data,
+            "transform",
+            "MultiStepTransform",
+            "joins steps before they are corrected: leave it out, and join the steps that are read",
         )
-        checks.require("steps_to_next_obs" not in data, "transform", "MultiStepTransform", should)
         self._require_entries(data)
         super().set(cursor, self._with_added_entries(data), set_cursor=set_cursor)
         self.backupdate(len(data) + self.longest)
@@ -156,25 +158,29 @@ class BackupdateStorage(TimeStorage):
             along = [
                 (data[self._count].squeeze(-1).diff(dim=dim) == 1).double().mean() for dim in (0, 1)
             ]
-            should = (
-                "grows from world to world instead of step to step: give ReplayBuffer.extend [B, T]"
+            checks.require(
+                bool(along[0] >= along[1]),
+                "step_count",
+                self._count,
+                "grows from world to world instead of step to step: give ReplayBuffer.extend [B, T]",
             )
-            checks.require(bool(along[0] >= along[1]), "step_count", self._count, should)
         n_worlds = self._n_worlds = data.shape[1] if self._n_worlds is None else self._n_worlds
-        should = (
-            f"is not one of {n_worlds} worlds: give ReplayBuffer.extend [B, T], as rollouts return "
-            "it"
-        )
         checks.require(
-            data.shape[1] == n_worlds, "steps", f"a batch of shape {list(data.shape)}", should
+            data.shape[1] == n_worlds,
+            "steps",
+            f"a batch of shape {list(data.shape)}",
+            f"is not one of {n_worlds} worlds: give ReplayBuffer.extend [B, T], as rollouts return "
+            "it",
         )
         needs = len(data) + 2 * self.longest + self.lookback
-        should = (
+        checks.require(
+            self.max_size >= needs * n_worlds,
+            "max_size",
+            self.max_size,
             f"is too little for batches of {len(data)} steps and delays of up to {self.longest} "
             "steps: "
-            f"{needs} steps of {n_worlds} worlds need {needs * n_worlds}"
+            f"{needs} steps of {n_worlds} worlds need {needs * n_worlds}",
         )
-        checks.require(self.max_size >= needs * n_worlds, "max_size", self.max_size, should)
         for name, key in delays.items():
             takes = f"steps, but a {name} takes {int(data[key].max())} steps"
             checks.require(bool(data[key].max() <= self.longest), "longest", self.longest, takes)
@@ -254,8 +260,12 @@ class BackupdateStorage(TimeStorage):
         """Apply the corrections to what ``recompute`` returned for steps [T, B]."""
         entries = {unravel_key(key): value for key, value in entries.items()}
         some = [key in entries for key in ENDS]
-        should = "are returned in part: return all or none"
-        checks.require(all(some) or not any(some), "recompute", ENDS, should)
+        checks.require(
+            all(some) or not any(some),
+            "recompute",
+            ENDS,
+            "are returned in part: return all or none",
+        )
         count = steps[self._count].squeeze(-1)
         for correction in self.corrections:
             entries = correction.correct(entries, steps, count)

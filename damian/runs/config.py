@@ -1,7 +1,7 @@
 """Settings of what a run writes."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common.fields import Settings, setting
 
@@ -10,7 +10,7 @@ from damian.common.fields import Settings, setting
 class LoggerConfig(Settings):
     """Which files of metrics the training writes into the run folder."""
 
-    section: ClassVar[str] = "logger"
+    section = "logger"
 
     tensorboard: bool = setting(True, "Write TensorBoard events.")
     csv: bool = setting(True, "Write ``metrics.csv``.")

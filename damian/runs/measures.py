@@ -52,8 +52,12 @@ def declared(name: str) -> Metric:
 
 def check_score(name: str) -> None:
     """Require a metric by which methods can be compared."""
-    problem = "is neither better when higher nor when lower: declare that, or choose another score"
-    checks.require(bool(METRICS.get(name, "score").better), "score", name, problem)
+    checks.require(
+        bool(METRICS.get(name, "score").better),
+        "score",
+        name,
+        "is neither better when higher nor when lower: declare that, or choose another score",
+    )
 
 
 _UNKNOWN = Metric(lambda _: float("nan"))

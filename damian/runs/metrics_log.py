@@ -54,8 +54,12 @@ def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Lo
     for path, make, parameters in map(read_logger, config.custom):
         with naming_errors(f"logger.custom: {path}"):
             logger = make(folder, **parameters)
-            should = "is not a logger: it has no method log_scalar(name, value, step)"
-            checks.require(hasattr(logger, "log_scalar"), path, type(logger).__name__, should)
+            checks.require(
+                hasattr(logger, "log_scalar"),
+                path,
+                type(logger).__name__,
+                "is not a logger: it has no method log_scalar(name, value, step)",
+            )
         loggers.append(logger)
     return loggers
 

@@ -179,8 +179,12 @@ def build_source_grid(
     edge = cell or _edge(polygons, radius)
     largest = max(polygon.area for polygon in polygons)
     n_cells = math.ceil(largest / edge**2)  # at least
-    should = f"makes {n_cells} cells, more than {_MAX_CELLS}: take larger ones"
-    checks.require(n_cells <= _MAX_CELLS, "observation.belief_cell", f"{edge:g} m", should)
+    checks.require(
+        n_cells <= _MAX_CELLS,
+        "observation.belief_cell",
+        f"{edge:g} m",
+        f"makes {n_cells} cells, more than {_MAX_CELLS}: take larger ones",
+    )
     columns = _columns(polygons, edge)
     positions = columns * edge
     centres = torch.as_tensor(positions, dtype=torch.float32)

@@ -11,7 +11,7 @@ from torch import Tensor
 from damian import keys
 from damian.common import checks
 from damian.common.errors import naming_errors
-from damian.common.tensors import expand_mask, tree_map
+from damian.common.tensors import tree_map, where_rows
 from damian.server.features import feature_of
 from damian.server.layout import Layout
 from damian.server.rewards import Counters
@@ -42,19 +42,23 @@ def checked_features(server: Server, messages: Messages, steps: Tensor) -> Featu
             found |= server.features(messages, steps, [name])
             values = found[name].float()
             within = (values >= declared.low - _ROUNDING) & (values <= declared.high + _ROUNDING)
-            should = (
+            checks.require(
+                bool(within.all()),
+                key,
+                f"{[*values[~within], 0][0]:g}",
                 f"is not between {declared.low:g} and {declared.high:g}: scale it, or declare its "
-                "bounds"
+                "bounds",
             )
-            checks.require(bool(within.all()), key, f"{[*values[~within], 0][0]:g}", should)
             if declared.scope == "local":
                 own = _among_others(server, name, some, elapsed)
                 same = own.float().allclose(values[:_WORLDS], atol=_ROUNDING)
-                should = (
+                checks.require(
+                    same,
+                    key,
+                    "local",
                     "changes with the messages of other UAVs: make it global, or read only the "
-                    "UAV's own"
+                    "UAV's own",
                 )
-                checks.require(same, key, "local", should)
     for term in server.terms.values():
         with naming_errors(f"reward term {term.name}"):
             term.value(found, Counters(steps, messages.motions, messages.time >= 0))
@@ -76,9 +80,7 @@ def _among_others(server: Server, name: str, messages: Messages, steps: Tensor) 
             other = field.roll(
                 1, 1
             )  # those of another UAV of its world: landing points of one region
-        return torch.where(
-            expand_mask(own, field.unsqueeze(1)), field.unsqueeze(1), other.unsqueeze(1)
-        )
+        return where_rows(own, field.unsqueeze(1), other.unsqueeze(1))
 
     return server.own_features(tree_map(changed_of_others, messages), steps, [name])[name]
 

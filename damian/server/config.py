@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, constant, setting
@@ -19,7 +19,7 @@ class ObservationConfig(Settings):
     The last ones, from ``place`` and ``others`` on, go beyond the paper's Table 2.
     """
 
-    section: ClassVar[str] = "observation"
+    section = "observation"
 
     local_features: list[str] = setting(
         ["spotted"],
@@ -183,7 +183,7 @@ BUILT_IN = tuple(each.name for each in fields(RewardWeights))
 class RewardConfig(RewardWeights):
     """The task: weights and parameters of the reward terms, bonus and penalty (eq. 5-8)."""
 
-    section: ClassVar[str] = "reward"
+    section = "reward"
 
     individual: float = constant(1.0, "w_a of eq. 8; the weights of the terms scale the same.")
     system: float = constant(1.0, "w_s of eq. 8; the weights of the terms scale the same.")
@@ -238,7 +238,7 @@ class EpisodeConfig(Settings):
     """Conditions that end an episode (paper, section 4.1). Without any of them the task never
     ends."""
 
-    section: ClassVar[str] = "episode"
+    section = "episode"
 
     max_steps: int | None = setting(
         50, "Time limit; none if not given.", unit="steps", low=1, high=checks.STEPS

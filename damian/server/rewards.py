@@ -109,10 +109,12 @@ def terms_of(config: RewardConfig) -> dict[str, WeightedTerm]:
         checks.in_range(f"{key}.weight", weight, -1e6, 1e6)
         name = name_of(parameters, path.rpartition(":")[2], key)
         check_parameters(term.compute, parameters, path, key)
-        problem = (
-            f"is the name of another term: give it another one, as in {{term: {path}, name: other}}"
+        checks.require(
+            name not in (*BUILT_IN, *found),
+            f"{key}.name",
+            name,
+            f"is the name of another term: give it another one, as in {{term: {path}, name: other}}",
         )
-        checks.require(name not in (*BUILT_IN, *found), f"{key}.name", name, problem)
         if weight != 0:
             found[name] = WeightedTerm(name, weight * factor[term.scope], term, parameters)
     return found

@@ -88,8 +88,12 @@ class Server:
         airspace = simulation.airspace
         battery = simulation.config.battery
         n_points = airspace.points.shape[:2].numel()
-        should = "are more landing points than a message can number: take a larger step"
-        checks.require(n_points < MAX_EXACT_INTEGER, "region.lattice_step", n_points, should)
+        checks.require(
+            n_points < MAX_EXACT_INTEGER,
+            "region.lattice_step",
+            n_points,
+            "are more landing points than a message can number: take a larger step",
+        )
         check_features(observation)
         self.observation = observation
         self.reward = reward

@@ -218,8 +218,16 @@ COLUMNS: dict[str, str] = {
 }
 """What each column means, by its name."""
 
-OUTPUTS = (keys.STATE, keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY)
-OUTPUTS += (keys.BELIEF, keys.REWARD_TERMS, keys.SUCCESS)
+OUTPUTS = (
+    keys.STATE,
+    keys.MESSAGE,
+    keys.MESSAGE_SENT,
+    keys.RECEIVED,
+    keys.DELAY,
+    keys.BELIEF,
+    keys.REWARD_TERMS,
+    keys.SUCCESS,
+)
 """Entries from which an episode is made, beside the reward; some settings lack some of them."""
 
 

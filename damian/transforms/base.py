@@ -24,7 +24,7 @@ from torchrl.envs import (
 
 from damian.common import counter_rng
 from damian.common.errors import InputError
-from damian.common.tensors import expand_mask
+from damian.common.tensors import where_rows
 from damian.delays.line import Memory
 from damian.delays.samplers import Sampler, streams_for
 from damian.keys import DONE, STEPPED
@@ -320,7 +320,7 @@ class StatefulTransform(Transform):
         for key, new in first.items():
             begun = self.to_rows(new)
             old = self.to_rows(merged[key])
-            merged[key] = self.from_rows(torch.where(expand_mask(rows, begun), begun, old))
+            merged[key] = self.from_rows(where_rows(rows, begun, old))
         return memory, merged
 
     def _only_stepped(
@@ -335,7 +335,7 @@ class StatefulTransform(Transform):
         memory = self.memory
         for name, new in change[0].items():
             if new is not memory[name]:
-                memory[name] = torch.where(expand_mask(rows, new), new, memory[name])
+                memory[name] = where_rows(rows, new, memory[name])
         merged: Entries = {}
         for key, new in change[1].items():
             # A later transform that widens an entry restores it itself.
@@ -346,9 +346,7 @@ class StatefulTransform(Transform):
             old = next(same_shape, torch.zeros_like(new))
             new_rows = self.to_rows(new)
             old_rows = self.to_rows(old)
-            merged[key] = self.from_rows(
-                torch.where(expand_mask(rows, new_rows), new_rows, old_rows)
-            )
+            merged[key] = self.from_rows(where_rows(rows, new_rows, old_rows))
         return memory, merged
 
     def _reset_on_native_autoreset(

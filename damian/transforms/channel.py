@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import expand_mask
+from damian.common.tensors import expand_mask, where_rows
 from damian.delays.laws import link_sampler
 from damian.delays.line import DelayLine, slot_rows
 from damian.delays.samplers import MessageContext
@@ -141,8 +141,12 @@ class Channel(StatefulTransform):
         """The shape of the rows: there is one for each link (receiver, sender), [*B, N, N]."""
         agents = super().find_rows(tensordict)
         n = agents[-1]
-        should = f"are given for {self.n_agents} agents, but {self._beside} is of {n}"
-        checks.require(self.n_agents in (None, n), "Channel", "the links", should)
+        checks.require(
+            self.n_agents in (None, n),
+            "Channel",
+            "the links",
+            f"are given for {self.n_agents} agents, but {self._beside} is of {n}",
+        )
         return torch.Size((*agents, n))
 
     @property
@@ -189,7 +193,7 @@ class Channel(StatefulTransform):
         for name, new in after.items():
             old = begun[name]
             changed = new is not old
-            memory[name] = torch.where(expand_mask(mask, new), new, old) if changed else new
+            memory[name] = where_rows(mask, new, old) if changed else new
         return memory, self._outputs(memory)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
@@ -226,7 +230,7 @@ class Channel(StatefulTransform):
         old = memory["held"]
         rows = slot * len(memory["link"]) + memory["sender"]
         new = memory["contents"].flatten(0, 1).index_select(0, rows)
-        held = torch.where(expand_mask(mask, old), new, old)
+        held = where_rows(mask, new, old)
         return memory | {"held": held}
 
     def _wanted(self, entries: Entries, active: Tensor) -> Tensor:

@@ -40,8 +40,12 @@ class ContextReader:
         """Keys of the entries that the law gets, by name."""
         known = dict(context_keys or {}) if sampler.sees_context else {}
         for name in sampler.reads:
-            should = f"has no key for {name}, which the delay law reads"
-            checks.require(name in known, "context_keys", known, should)
+            checks.require(
+                name in known,
+                "context_keys",
+                known,
+                f"has no key for {name}, which the delay law reads",
+            )
         for name, key in known.items():
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(key)))
 

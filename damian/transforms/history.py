@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from damian.common import checks
-from damian.common.tensors import expand_mask, gather_rows
+from damian.common.tensors import gather_rows, where_rows
 from damian.keys import next_key
 from damian.transforms.action import ActionTransform
 from damian.transforms.base import Change, Correction, Memory
@@ -90,7 +90,7 @@ class ActionHistory(ActionTransform):
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         first = memory["first"]
-        memory = memory | {"recent": torch.where(expand_mask(mask, first), first, memory["recent"])}
+        memory = memory | {"recent": where_rows(mask, first, memory["recent"])}
         return self.on_step(memory, entries)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
@@ -161,10 +161,12 @@ class ActionHistory(ActionTransform):
             return observation_spec
         old = observation_spec[key]
         flat = old.dtype.is_floating_point and len(old.shape) == len(rows) + 1
-        should = (
-            "is not a vector of floats, so no actions can be appended to it; use out_key instead"
+        checks.require(
+            flat,
+            "append_to",
+            key,
+            "is not a vector of floats, so no actions can be appended to it; use out_key instead",
         )
-        checks.require(flat, "append_to", key, should)
         observation_spec[key] = self._appended(old, width)
         return observation_spec
 

@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.tensors import expand_mask
+from damian.common.tensors import where_rows
 from damian.delays.laws import Delay, in_steps
 from damian.keys import next_key
 from damian.transforms.base import Change, Correction, Memory, StatefulTransform
@@ -47,8 +47,12 @@ class SampleAndHold(StatefulTransform):
         dt: float = 1.0,
     ) -> None:
         super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv)
-        should = "is empty, and so is in_keys_inv: name the entries or the actions to hold"
-        checks.require(bool(self.in_keys or self.in_keys_inv), "in_keys", in_keys, should)
+        checks.require(
+            bool(self.in_keys or self.in_keys_inv),
+            "in_keys",
+            in_keys,
+            "is empty, and so is in_keys_inv: name the entries or the actions to hold",
+        )
         checks.above("dt", dt, 0.0, "s")
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
@@ -100,7 +104,7 @@ class SampleAndHold(StatefulTransform):
         for i, key in enumerate(keys):
             new = self.to_rows(entries[key])
             old = memory[f"{name}_{i}"]
-            held = torch.where(expand_mask(sampled, new), new, old)
+            held = where_rows(sampled, new, old)
             memory = memory | {f"{name}_{i}": held}
             outputs[key] = self.from_rows(held).clone()  # the memory keeps the held values
         return memory, outputs
@@ -123,7 +127,7 @@ class SampleAndHold(StatefulTransform):
                 value = entries[key]
                 stored = steps[key][..., : value.shape[-1]]
                 at_tick = value[tick.clamp(min=0), world]
-                corrected[key] = torch.where(expand_mask(stays, value), stored, at_tick)
+                corrected[key] = where_rows(stays, stored, at_tick)
             return corrected
 
         return Correction(hold_again, lookback=self.period - 1)

@@ -12,7 +12,7 @@ from torchrl.data import Composite, Unbounded
 from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.common.tensors import expand_mask, next_true
+from damian.common.tensors import expand_mask, next_true, where_rows
 from damian.delays.laws import LOSES, sampler_of
 from damian.delays.line import slot_rows
 from damian.keys import next_key
@@ -131,19 +131,16 @@ class RewardDelay(StatefulTransform):
         row = slot_rows(slot)
         here = past.flatten(0, 1).index_select(0, row)
         due = memory["due"].flatten().index_select(0, row)
-        arrives = expand_mask(due == time, here)
-        received = torch.where(arrives, here, 0)
+        received = where_rows(due == time, here, 0)
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = any_flag(done, self.rows)
-            is_late = expand_mask(memory["due"] > time, past)
-            late = torch.where(is_late, past, 0)
+            late = where_rows(memory["due"] > time, past, 0)
             # In double precision, so that the order of the sum, which depends on the batch, does
             # not matter.
             precise = torch.float64 if past.is_floating_point() else past.dtype
             in_transit = late.sum(0, dtype=precise).to(past.dtype)
-            pays = expand_mask(ended, received)
-            received = torch.where(pays, received + in_transit, received)
+            received = where_rows(ended, received + in_transit, received)
             memory["time"] = time + self.n_slots * ended
         outputs: Entries = {self.reward_key: self.from_rows(received)}
         return memory, outputs | self._told(delay, reward)
@@ -161,13 +158,12 @@ class RewardDelay(StatefulTransform):
         row = slot_rows(slot)
         there = flat.index_select(0, row)
         old = due.index_select(0, row)
-        same_arrival = expand_mask(old == arrival, there)
-        added = torch.where(same_arrival, there, 0) + reward
+        added = where_rows(old == arrival, there, 0) + reward
         # ``old`` is never later; a compiler that sees that it is read before writes the new times
         # in place.
         arrival = torch.maximum(arrival, old)
         if stepped is not None:
-            added = torch.where(expand_mask(stepped, there), added, there)
+            added = where_rows(stepped, added, there)
             arrival = torch.where(stepped, arrival, old)
         due.index_copy_(0, row, arrival)
         flat.index_copy_(0, row, added)
@@ -222,8 +218,7 @@ class RewardDelay(StatefulTransform):
                 f"earned_key: nothing says what {key} was earned: give RewardDelay an earned_key"
             )
         paid = self._paid(steps, count).squeeze(-1)
-        unpaid = torch.zeros_like(earned)
-        reward = torch.where(expand_mask(paid, earned), earned, unpaid)
+        reward = where_rows(paid, earned, 0)
         return entries | {key: reward}
 
     def _paid(self, steps: TensorDictBase, count: Tensor) -> Tensor:

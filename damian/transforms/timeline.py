@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from damian.common import checks
-from damian.common.tensors import expand_mask
+from damian.common.tensors import expand_mask, where_rows
 from damian.keys import next_key
 from damian.transforms.base import Change, Correction, Memory, StatefulTransform
 from damian.transforms.entries import Entries, add_spec, existing, sibling_key, spec_rows
@@ -101,8 +101,12 @@ class ObservationTimeline(StatefulTransform):
         alone = not group and ages is None
         checks.require(position_key is None or alone, "position_key", position_key, should)
         shared = not group and position_key is None
-        should = "goes with messages in one frame: leave out group and position_key"
-        checks.require(own_key is None or shared, "own_key", own_key, should)
+        checks.require(
+            own_key is None or shared,
+            "own_key",
+            own_key,
+            "goes with messages in one frame: leave out group and position_key",
+        )
         super().__init__(message_key)
         self.slots = slots
         self.encode = encode
@@ -134,10 +138,7 @@ class ObservationTimeline(StatefulTransform):
         first = self._sent(entries.__getitem__)
         first["sent"] = torch.ones_like(first["sent"])
         begun = self._added(empty, first)
-        memory = {
-            name: torch.where(expand_mask(mask, new), new, memory[name])
-            for name, new in begun.items()
-        }
+        memory = {name: where_rows(mask, new, memory[name]) for name, new in begun.items()}
         return memory, self._written(memory)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
@@ -199,11 +200,10 @@ class ObservationTimeline(StatefulTransform):
         older = {name: torch.cat([blank[name], old[:, :-1]], 1) for name, old in older.items()}
         facts, told = told_slots(newest["kept"], newest["ages"], self.slots)
         told = told & is_sent
-        is_told = told.unsqueeze(-1)
         due = older["due"].minimum(newest["due"].unsqueeze(1))
         return {
-            "kept": torch.where(is_told, facts, older["kept"]),
-            "due": torch.where(is_told, due, older["due"]),
+            "kept": where_rows(told, facts, older["kept"]),
+            "due": where_rows(told, due, older["due"]),
             "sent": older["sent"] | told,
         }
 
@@ -276,7 +276,7 @@ class ObservationTimeline(StatefulTransform):
             is_step = (k <= count) & (sent_at >= 0).unsqueeze(-1)
             exists = is_reset | is_step
             slot = {
-                name: torch.where(expand_mask(is_reset, new), first[name][of_reset], new[of_step])
+                name: where_rows(is_reset, first[name][of_reset], new[of_step])
                 for name, new in after.items()
             }
             sent = slot["sent"] & expand_mask(exists, slot["sent"])

@@ -133,8 +133,12 @@ def build_airspace(
     lattices = [landing_lattice(polygon, step, degrees, n_points) for polygon in polygons]
     sizes = [len(lattice) for lattice in lattices]
     for region, size in zip(regions, sizes, strict=True):
-        problem = f"UAVs are more than the {size} landing points of {region.name}"
-        checks.require(size >= n_agents, "agents", n_agents, problem)
+        checks.require(
+            size >= n_agents,
+            "agents",
+            n_agents,
+            f"UAVs are more than the {size} landing points of {region.name}",
+        )
     points = _padded(lattices, torch.inf)
     edges = [_edges(polygon) for polygon in polygons]
     scales = [largest_vertex_distance(polygon) for polygon in polygons]

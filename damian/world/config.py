@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from damian.common import checks
 from damian.common.fields import Settings, check_place, constant, rules, setting
@@ -15,9 +15,19 @@ POLYNOMIAL, DYNAMIC, CHARGING = ("polynomial",), ("dynamic",), ("charging",)
 """Variants of a section that read a setting (``kinds``)."""
 FOOTPRINT = "footprint"
 """The sensor that tells the radius of a UAV's footprint, if it is drawn."""
-RANDOMISED = ("motion.max_speed", "motion.max_acceleration", "battery.capacity_kwh")
-RANDOMISED += ("motion.abort", "wind.speed", "wind.direction", "wind.gusts")
-RANDOMISED += ("source.level_db", "source.miss", "source.false_alarm", "delay.loss")
+RANDOMISED = (
+    "motion.max_speed",
+    "motion.max_acceleration",
+    "battery.capacity_kwh",
+    "motion.abort",
+    "wind.speed",
+    "wind.direction",
+    "wind.gusts",
+    "source.level_db",
+    "source.miss",
+    "source.false_alarm",
+    "delay.loss",
+)
 """Settings that may be drawn for each world and episode."""
 
 
@@ -30,7 +40,7 @@ class RegionConfig(Settings):
     region from a file, which also takes {lat: 53.1, lon: -4.5} in degrees.
     """
 
-    section: ClassVar[str] = "region"
+    section = "region"
 
     kind: str = setting(
         "random",
@@ -104,8 +114,11 @@ class RegionConfig(Settings):
             self.refuse(
                 not getattr(self, name), name, f"is missing: region.kind={self.kind} needs it"
             )
-        problem = "means nothing without a region of your own (region.kind=package.module:function)"
-        self.refuse(self.options is not None and ":" not in self.kind, "options", problem)
+        self.refuse(
+            self.options is not None and ":" not in self.kind,
+            "options",
+            "means nothing without a region of your own (region.kind=package.module:function)",
+        )
         indices = self.index if isinstance(self.index, list) else [self.index]
         good = indices == [None] or (
             indices and all(type(each) is int and each >= 0 for each in indices)
@@ -116,26 +129,29 @@ class RegionConfig(Settings):
         texts = self.where if isinstance(self.where, list) else [self.where]
         fits = texts and all(isinstance(each, str) and re.search(".[:=]", each) for each in texts)
         good = texts == [None] or fits
-        problem = (
-            "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
+        self.refuse(
+            not good,
+            "where",
+            "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts",
         )
-        self.refuse(not good, "where", problem)
         both = self.index is not None and self.where is not None
         self.refuse(both, "where", "and region.index both choose; give one of them")
         zones = self.zones
         drawn = checks.is_number(self.zones)
         wrong = zones % 1 or not 0 <= zones <= 100 if drawn else not isinstance(zones, list | str)
-        problem = (
-            "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100"
+        self.refuse(
+            wrong,
+            "zones",
+            "is not a list of zones, the path of a map, or the number of random ones, from 0 to 100",
         )
-        self.refuse(wrong, "zones", problem)
         for zone in zones if isinstance(zones, list) else []:
             good = isinstance(zone, list) and len(zone) > 2
-            problem = (
+            self.refuse(
+                not good,
+                "zones",
                 "has a zone that is not a list of three or more corners: "
-                "region.zones=[[[0,0],[50,0],[0,50]]]"
+                "region.zones=[[[0,0],[50,0],[0,50]]]",
             )
-            self.refuse(not good, "zones", problem)
             for place in zone:
                 check_place("region.zones", place)
         self.refuse_unread()
@@ -147,7 +163,7 @@ class RegionConfig(Settings):
 class MotionConfig(Settings):
     """How UAVs move."""
 
-    section: ClassVar[str] = "motion"
+    section = "motion"
 
     kind: str = setting(
         "instant",
@@ -208,7 +224,7 @@ class MotionConfig(Settings):
 class FailureConfig(Settings):
     """UAVs that fall silent for a while and stay where they are."""
 
-    section: ClassVar[str] = "failure"
+    section = "failure"
 
     probability: float = setting(
         0.0, "Probability that a UAV fails in a simulation step.", low=0, high=1
@@ -222,7 +238,7 @@ class FailureConfig(Settings):
 class WindConfig(Settings):
     """Wind, which flights that take time feel."""
 
-    section: ClassVar[str] = "wind"
+    section = "wind"
 
     speed: float = setting(0.0, "Mean speed of the wind.", unit="m/s", low=0, high=100)
     direction: float | None = setting(
@@ -241,7 +257,7 @@ class WindConfig(Settings):
 class SourceConfig(Settings):
     """The signal source that the UAVs search for."""
 
-    section: ClassVar[str] = "source"
+    section = "source"
 
     count: int = setting(1, "Number of sources.", low=1, high=32)
     each: list[Any] = setting(
@@ -353,7 +369,7 @@ class SourceConfig(Settings):
 class RequestConfig(Settings):
     """Requests that appear at random places, to be served by landing near them."""
 
-    section: ClassVar[str] = "requests"
+    section = "requests"
 
     rate: float = setting(
         0.0,
@@ -385,7 +401,7 @@ class RequestConfig(Settings):
 class BatteryConfig(Settings):
     """Batteries of the UAVs, and the places where they charge."""
 
-    section: ClassVar[str] = "battery"
+    section = "battery"
 
     enabled: bool = setting(False, "Whether flights drain the battery.", kinds=CHARGING)
     engine_power_kw: float = setting(
@@ -427,19 +443,25 @@ class BatteryConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = "is not a list of places; leave it out to charge anywhere"
-        self.refuse(self.charging_points == [], "charging_points", problem)
+        self.refuse(
+            self.charging_points == [],
+            "charging_points",
+            "is not a list of places; leave it out to charge anywhere",
+        )
         for place in self.charging_points or []:
             check_place("battery.charging_points", place)
-        problem = "needs battery.enabled=true: the batteries stay full"
-        self.refuse(self.charging_points and not self.enabled, "charging_points", problem)
+        self.refuse(
+            self.charging_points and not self.enabled,
+            "charging_points",
+            "needs battery.enabled=true: the batteries stay full",
+        )
 
 
 @dataclass
 class ActionConfig(Settings):
     """The (distance, heading) actions of the UAVs (paper, section 4.2)."""
 
-    section: ClassVar[str] = "actions"
+    section = "actions"
 
     kind: str = setting(
         "discrete",
@@ -513,14 +535,23 @@ class WorldConfig(Settings):
             for name, rule in rules(type(section)).items():
                 values = getattr(section, name)
                 wrong = rule.each and isinstance(values, list) and len(values) != self.agents
-                problem = f"is not one value for each of the {self.agents} UAVs"
-                self.refuse(wrong, f"{section.section}.{name}", problem)
+                self.refuse(
+                    wrong,
+                    f"{section.section}.{name}",
+                    f"is not one value for each of the {self.agents} UAVs",
+                )
         self._check_randomise()
-        problem = "needs motion=polynomial: instant flights feel no wind"
-        self.refuse(self.is_windy and self.motion.kind == "instant", "wind", problem)
+        self.refuse(
+            self.is_windy and self.motion.kind == "instant",
+            "wind",
+            "needs motion=polynomial: instant flights feel no wind",
+        )
         continuous = self.actions.kind == "continuous"
-        problem = "needs discrete actions, whose mask says where a flight may end"
-        self.refuse(self.may_abort and continuous, "motion.abort", problem)
+        self.refuse(
+            self.may_abort and continuous,
+            "motion.abort",
+            "needs discrete actions, whose mask says where a flight may end",
+        )
 
     @property
     def tells_truth(self) -> bool:
@@ -569,16 +600,20 @@ class WorldConfig(Settings):
             checks.require(good, own, values, "is not a range or a list of at most 8 values")
             section, _, name = key.partition(".")
             given = getattr(getattr(self, section), name)
-            problem = (
+            checks.require(
+                not isinstance(given, list),
+                own,
+                values,
                 f"draws one value for all UAVs, but {key}={given} has one for each: leave one of "
-                "them out"
+                "them out",
             )
-            checks.require(not isinstance(given, list), own, values, problem)
             apart = section == "source" and any(name in each for each in self.source.each)
-            problem = (
+            checks.require(
+                not apart,
+                own,
+                values,
                 f"draws one value for all sources, but source.each tells {name}: leave one of them "
-                "out"
+                "out",
             )
-            checks.require(not apart, own, values, problem)
             for value in values:
                 replace(getattr(self, section), **{name: value})

@@ -25,11 +25,13 @@ def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> 
     n_fit = math.floor(room + _TINY) + 1
     fits = shared or n_agents <= n_fit
     shown = f"{config.max_level:g} m"
-    problem = (
+    checks.require(
+        fits,
+        "motion.max_level",
+        shown,
         f"leaves room for {n_fit} flight levels from min_level={lowest:g} m, "
-        f"level_separation={apart:g} m apart, but there are {n_agents} UAVs"
+        f"level_separation={apart:g} m apart, but there are {n_agents} UAVs",
     )
-    checks.require(fits, "motion.max_level", shown, problem)
     return [lowest + i % n_fit * apart for i in range(n_agents)]
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from damian.common import counter_rng
-from damian.common.tensors import gather_rows
+from damian.common.tensors import gather_rows, where_rows
 from damian.world.regions.polygon import sample_interior
 from damian.world.regions.region import Region
 
@@ -86,7 +86,7 @@ def appear(
     appeared = requests[..., 2].masked_fill(waits, torch.inf)
     rank = appeared.argsort(dim=-1, stable=True).argsort(-1)
     taken = (rank < number) & ~waits
-    return torch.where(taken.unsqueeze(-1), new, requests)
+    return where_rows(taken, new, requests)
 
 
 def serve(

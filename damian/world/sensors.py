@@ -31,8 +31,12 @@ class Sensor(NamedTuple):
         values = self.compute(state, world)
         shape = (*state.track.shape, self.width)
         same = values.shape == shape or (self.width == 1 and values.shape == shape[:-1])
-        problem = f"is not {[*shape]}, of its worlds, UAVs and width: return or declare another one"
-        checks.require(same, f"sensor {self.name}: shape", [*values.shape], problem)
+        checks.require(
+            same,
+            f"sensor {self.name}: shape",
+            [*values.shape],
+            f"is not {[*shape]}, of its worlds, UAVs and width: return or declare another one",
+        )
         return values.float().view(shape)
 
 

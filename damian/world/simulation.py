@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import distances, gather_rows, move_attributes, tree_map, tree_where
+from damian.common.tensors import (
+    distances,
+    gather_rows,
+    move_attributes,
+    tree_map,
+    tree_where,
+    where_rows,
+)
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
@@ -31,6 +38,9 @@ _SOURCE = counter_rng.number_of("source")
 
 class Simulation:
     """The worlds' constants, regions and walks, drawn on the CPU, and functions of their state."""
+
+    foretold = False
+    """Whether nothing happens that messages do not tell: no flight is aborted, and no UAV fails."""
 
     def __init__(self, config: WorldConfig, dt: float, stops: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -78,9 +88,10 @@ class Simulation:
         self.pairs = pairs.view(config.agents, -1)
         """Numbers of the pairs of a UAV and a source, [N, K]; made within a step, they would not
         compile."""
-        self.unsure = any(each.miss or each.false_alarm for each in self.sources)
-        """Whether reports about a source may be wrong."""
         choices = self.vehicles.values.choices
+        drawn = {"source.miss", "source.false_alarm"} & {*choices}
+        self.unsure = bool(drawn) or any(each.miss or each.false_alarm for each in self.sources)
+        """Whether reports about a source may be wrong."""
         self.draws = bool(self.sensors or choices or self.unsure)
         """Whether first messages differ from episode to episode that begins alike."""
         shortest = self._shortest_flights()  # refuses actions that lead nowhere
@@ -145,11 +156,11 @@ class Simulation:
         [B, N, 1 + K, 3] says (``damian.keys``).
         """
         decided = self.decide(state, action, action_valid, command)
-        if self.news.aborts:
+        if self.news.aborts and not self.foretold:
             decided = self._abort(state, decided)
         moved = self.vehicles.move(decided)
         moved = moved._replace(steps=state.steps + 1)
-        if not self.news.fails:
+        if self.foretold or not self.news.fails:
             return self._sense(moved, action_valid)
         moved = self.news.fail(moved)
         joins = state.failed & ~moved.failed
@@ -236,7 +247,7 @@ class Simulation:
         """The latest messages, in which UAVs tell what they have executed, and what is under
         way."""
         number = command[..., 0, 1:2].to(state.track.dtype)
-        executed = torch.where(ready.unsqueeze(-1), number, state.sent.executed)
+        executed = where_rows(ready, number, state.sent.executed)
         commands = command[..., 1 : self.widths.announced + 1, :]
         point, number, latest = commands.unbind(-1)
         under_way = (number > executed) & (latest > state.steps.view(-1, 1, 1) + 1)
@@ -364,25 +375,18 @@ class Simulation:
     def _reported(self, state: State, in_reach: Tensor, listens: Tensor) -> Tensor:
         """What each UAV reports of each source; some in reach miss it, some out of reach raise an
         alarm."""
-        values = self.vehicles.values
-        unsure = self.unsure
-        miss = values.get("source.miss", state.drawn)
-        if isinstance(miss, Tensor):
-            unsure = True
-            miss = miss.unsqueeze(-1)
-        else:
-            miss = self.misses
-        alarm = values.get("source.false_alarm", state.drawn)
-        if isinstance(alarm, Tensor):
-            unsure = True
-            alarm = alarm.unsqueeze(-1)
-        else:
-            alarm = self.false_alarms
-        if not unsure:
+        if not self.unsure:
             return in_reach
+        miss = self._chance("source.miss", state, self.misses)
+        alarm = self._chance("source.false_alarm", state, self.false_alarms)
         share = draw(state, _REPORT, self.pairs)
         false_alarm = listens & (share < alarm)
         return torch.where(in_reach, share >= miss, false_alarm)
+
+    def _chance(self, key: str, state: State, settings: Tensor) -> Tensor:
+        """A probability that is drawn for each world, [B, 1, 1], or that of each source, [K]."""
+        drawn = self.vehicles.values.get(key, state.drawn)
+        return drawn.unsqueeze(-1) if isinstance(drawn, Tensor) else settings
 
     def _events(self, detected: Tensor, serves: Tensor) -> Tensor:
         """What happens at a stop that begins now, as in ``Messages``, [B, N, E]."""
@@ -403,10 +407,9 @@ class Simulation:
         if self.widths.events:
             happened = torch.cat([events.unsqueeze(-2), happened[..., :-1, :]], -2)
         if added is not None:
-            added = added.unsqueeze(-1)
-            trail = torch.where(added, trail, sent.trail)
-            landed = torch.where(added, landed, sent.landed)
-            happened = torch.where(added.unsqueeze(-1), happened, sent.events)
+            trail = where_rows(added, trail, sent.trail)
+            landed = where_rows(added, landed, sent.landed)
+            happened = where_rows(added, happened, sent.events)
         return trail, landed, happened
 
     def _serve(self, state: State, now: Tensor, lands: Tensor) -> tuple[State, Tensor, Tensor]:
@@ -439,7 +442,7 @@ class Simulation:
         ways = requests[..., :2] - state.position[..., None, :2]
         near = ways.square().sum(-1) <= reach**2
         hears = on_ground.unsqueeze(-1) & near
-        return torch.where(hears.unsqueeze(-1), requests, state.sent.requests)
+        return where_rows(hears, requests, state.sent.requests)
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:
         """Whether each UAV's observed battery level is 0, or allows nothing but holding, [B, N]."""
@@ -470,10 +473,12 @@ class Simulation:
             longest = 2 * self.candidates.max_distance
         flies = bool((length < longest).any())
         moves = flies or self.airspace.max_points == 1
-        problem = (
-            "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
+        checks.require(
+            moves,
+            "actions.distances",
+            actions.distances,
+            "[m] lead from no landing point to another one: take larger ones, or a finer lattice",
         )
-        checks.require(moves, "actions.distances", actions.distances, problem)
         return length.where(length.isfinite(), 0.0)
 
     def _shortest_in_wind(self, state: State) -> Tensor:
@@ -601,7 +606,7 @@ def _last_found(
     [B, N, K] says whether they do at this time [B, N] and place [B, N, 2]."""
     last_time, last_place = before
     last_time = torch.where(found, time.unsqueeze(-1), last_time)
-    last_place = torch.where(found.unsqueeze(-1), place.unsqueeze(-2), last_place)
+    last_place = where_rows(found, place.unsqueeze(-2), last_place)
     return last_time, last_place
 
 

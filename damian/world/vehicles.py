@@ -10,7 +10,7 @@ from torch import Tensor
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
 from damian.common.registry import Registry
-from damian.common.tensors import expand_mask, gather_rows, tree_where
+from damian.common.tensors import gather_rows, tree_where, where_rows
 from damian.world.airspace import Airspace
 from damian.world.battery import (
     battery_of,
@@ -387,7 +387,7 @@ class PolynomialFlight(MotionModel):
         departs."""
         sends = on_ground | (state.elapsed == 1)
         start = gather_rows(self.points, state.origin)
-        position = torch.where(expand_mask(on_ground, start), messages.position, start)
+        position = where_rows(on_ground, messages.position, start)
         sent = messages._replace(position=position)
         return sends, tree_where(sends, sent, state.sent)
 

@@ -84,8 +84,12 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     with own_code(config.learner):
         learner = config.learner.make(env, learning_setup(config, env.delays), buffer)
         has_actor = "actor" in learner.components()
-    should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
-    checks.require(has_actor, f"{name}: components", [*learner.components()], should)
+    checks.require(
+        has_actor,
+        f"{name}: components",
+        [*learner.components()],
+        "has no actor, which evaluations load: return {'actor': self.actor, ...}",
+    )
     assume(config, env, cast(TensorDictModuleBase, learner.components()["actor"]))
     return learner
 
@@ -120,11 +124,13 @@ def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     if not setup.backupdate:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
     least = setup.least_buffer
-    should = (
+    checks.require(
+        size >= least,
+        f"{config.learner.name}: buffer_size",
+        size,
         f"is too little for back-updating, which needs {least}: a period and twice the longest "
-        "delay"
+        "delay",
     )
-    checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
     storage = corrected_storage(config, env, config.corrected, size, setup.worlds)
     return ReplayBuffer(storage=storage)
 
@@ -158,8 +164,12 @@ def require_memory(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | 
     stored = 0 if buffer is None else buffer.storage.max_size / config.worlds
     needed = BASE_MEMORY + COPIES * step * (config.update_steps + stored) / 2**30
     free = free_memory(torch.device(config.device))
-    problem = f"these worlds need about {needed:.1f} GiB of memory, {free:.1f} are free: take fewer"
-    checks.require(needed < free, "worlds", config.worlds, problem)
+    checks.require(
+        needed < free,
+        "worlds",
+        config.worlds,
+        f"these worlds need about {needed:.1f} GiB of memory, {free:.1f} are free: take fewer",
+    )
 
 
 def hindsight_returns(config: TrainConfig, env: DelayedEnv) -> HindsightReturns | None:

@@ -75,9 +75,11 @@ def check_learning(config: TrainConfig) -> None:
     _check_backupdate(config, delays.obs.late)
     messages = config.delay.messages
     name = config.learner.name
-    problem = f"is not read by learner={name}, whose reads have no timeline: leave it out"
     checks.require(
-        not messages or "timeline" in config.learner.reads, "delay.messages", messages, problem
+        not messages or "timeline" in config.learner.reads,
+        "delay.messages",
+        messages,
+        f"is not read by learner={name}, whose reads have no timeline: leave it out",
     )
 
 
@@ -88,11 +90,13 @@ def _check_backupdate(config: TrainConfig, late_messages: bool) -> None:
     unable = "hindsight" in config.learner.reads and no_messages
     checks.require(not unable, "learner", config.learner.name, problem)
     onboard = "actor" in config.corrected and config.links.kind != "server"
-    problem = (
+    checks.require(
+        not onboard,
+        "corrected",
+        config.corrected,
         f"does not go with links={config.links.kind}: an actor sees what links bring, not the "
-        "server"
+        "server",
     )
-    checks.require(not onboard, "corrected", config.corrected, problem)
     for key, default in (("settle", False), ("corrected", ["reward", "critic"])):
         alone = getattr(config, key) != default and not config.backupdate
         checks.require(

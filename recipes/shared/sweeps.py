@@ -233,11 +233,13 @@ def stored_results(folder: Path, key: str = "folder") -> Results:
         InputError: it is not the folder of a comparison; ``key`` is the setting that names it.
     """
     is_whole = all((folder / name).is_file() for name in (ROWS, POINTS))
-    problem = (
+    checks.require(
+        is_whole,
+        key,
+        folder,
         f"has no {ROWS} beside {POINTS}: give the folder of damian compare, not one of a run or a "
-        "sweep"
+        "sweep",
     )
-    checks.require(is_whole, key, folder, problem)
     check_no_links(folder)
     rows, points = (read_results(folder / name) for name in (ROWS, POINTS))
     return Results(rows, points if LABELS.keys() <= {*points} else NO_RESULTS.points)

@@ -296,8 +296,12 @@ def check_features(config: ObservationConfig) -> None:
     for scope, key in keys.items():
         for name in getattr(config, key):
             found = FEATURES.get(name, f"observation.{key}")
-            problem = f"is a {found.scope} feature, not a {scope} one"
-            checks.require(found.scope == scope, f"observation.{key}", name, problem)
+            checks.require(
+                found.scope == scope,
+                f"observation.{key}",
+                name,
+                f"is a {found.scope} feature, not a {scope} one",
+            )
 
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:

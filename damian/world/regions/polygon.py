@@ -91,14 +91,20 @@ def landing_lattice(
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
     shapely.prepare(polygon)
     inside = lattice[shapely.contains_xy(polygon, lattice)]
-    problem = (
-        f"lays no landing point inside the polygon of {polygon.area:g} m^2; take a shorter one"
+    checks.require(
+        len(inside) > 0,
+        "region.lattice_step",
+        f"{step_m:g} m",
+        f"lays no landing point inside the polygon of {polygon.area:g} m^2; take a shorter one",
     )
-    checks.require(len(inside) > 0, "region.lattice_step", f"{step_m:g} m", problem)
     if n_points is not None:
         remedy = f"lower it, or region.lattice_step ({step_m:g} m)"
-        problem = f"is more than the {len(inside)} inside the polygon: {remedy}"
-        checks.require(n_points <= len(inside), "region.n_landing_points", n_points, problem)
+        checks.require(
+            n_points <= len(inside),
+            "region.n_landing_points",
+            n_points,
+            f"is more than the {len(inside)} inside the polygon: {remedy}",
+        )
     return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
 
 

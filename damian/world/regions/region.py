@@ -95,12 +95,14 @@ def _local_place(key: str, place: Any, region: Region) -> Floats:
     """A place in local metres, [2]."""
     if not isinstance(place, Mapping):
         return to_grid(np.array(place, float) - region.offset)
-    problem = (
+    checks.require(
+        region.origin is not None,
+        key,
+        place,
         f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in "
         "metres, or "
-        "take a region from a FIR table or GeoJSON file"
+        "take a region from a FIR table or GeoJSON file",
     )
-    checks.require(region.origin is not None, key, place, problem)
     return np.stack(to_local(place["lat"], place["lon"], cast(tuple[float, float], region.origin)))
 
 

@@ -80,8 +80,12 @@ def _without_zones(region: Region, config: RegionConfig, rng: np.random.Generato
 
 def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
     """All areas of a map, in local metres of a region."""
-    problem = f"is a map, but {region.name} has no position on Earth: give corners in metres"
-    checks.require(region.origin is not None, "region.zones", path, problem)
+    checks.require(
+        region.origin is not None,
+        "region.zones",
+        path,
+        f"is a map, but {region.name} has no position on Earth: give corners in metres",
+    )
     area = read_area(data_file(path, "region.zones"), every=True)
     origins = cast(tuple[float, float], area.origin), cast(tuple[float, float], region.origin)
 
@@ -107,8 +111,10 @@ def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     source = REGION_SOURCES.get(config.kind, "region.kind")
     found = [_without_zones(centred(region), config, rng) for region in source(config, rng)]
     most = config.initial_conditions
-    problem = "regions: each needs at least one initial condition"
     checks.require(
-        len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem
+        len(found) <= most,
+        "region.initial_conditions",
+        f"{most} for {len(found)}",
+        "regions: each needs at least one initial condition",
     )
     return found
