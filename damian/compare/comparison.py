@@ -190,7 +190,9 @@ class Comparison:
         methods = self._present(task, delay)
         others = [(name, self.policy_of(name)) for name in methods]
         others = [pair for pair in others if pair[1] in (SCRIPT, PLANNER)]
-        flown = [*product(methods, OF_METHOD), *others, *product(methods[:1], SCRIPTED)]
+        beside = [(name, policy) for name in methods[:1] for policy in SCRIPTED]
+        beside = [pair for pair in beside if pair not in others]
+        flown = [*product(methods, OF_METHOD), *others, *beside]
         for method, policy in flown:
             runs = self._runs.get((task, delay, method, policy))
             if runs is None:

@@ -170,6 +170,8 @@ def test_a_script_that_flies_forward_is_a_method_with_a_model_of_the_world():
     assert lines.loc["forward", "regime"] == "world model"
     assert lines.loc["forward", "J_norm"] == pytest.approx(0.8)
     assert lines.loc["script", "return"] == 2.0
+    alone = comparison(rows[-4:-2], {"best": METHODS["best"], "forward": methods["forward"]})
+    assert (alone.table["policy"] == "script").sum() == 1
 
 
 def test_steps_are_counted_to_the_final_training_return_of_the_best_naive_method():
