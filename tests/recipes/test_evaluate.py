@@ -109,7 +109,7 @@ def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
         trained / "best.pt",
         "agents=5",
         "delay.obs=3",
-        worlds=4,
+        num_worlds=4,
         seed=1,
     )
     one, other = (env.rollout(5, policy)[keys.ACTION] for _ in range(2))
