@@ -13,6 +13,9 @@ import pytest
 import torch
 from hypothesis import settings
 
+from damian.common.atomic_files import write_atomically
+from damian.common.plotting import save_figure
+
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # for learning, and for the programs that tests start
 
@@ -45,3 +48,21 @@ def _function(item):
 @pytest.fixture(autouse=True)
 def _same_every_time():
     torch.manual_seed(0)
+
+
+_RENDERED = set()
+
+
+@pytest.fixture
+def few_figures(monkeypatch):
+    """Matplotlib renders a figure of each name once in a process, because that is a quarter of the
+    smallest training; all are made and written as ever."""
+
+    def save(figure, path, dpi):
+        if path.name in _RENDERED:
+            write_atomically(path, b"figure")
+        else:
+            _RENDERED.add(path.name)
+            save_figure(figure, path, dpi)
+
+    monkeypatch.setattr("damian.compare.figures.save_figure", save)

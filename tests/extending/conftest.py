@@ -30,7 +30,7 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def run(folder):
+def run(folder, few_figures):
     """Run a program of the command with overrides; returns its run folder."""
 
     def run_program(*overrides, program="train", name="run"):

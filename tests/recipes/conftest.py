@@ -7,7 +7,7 @@ import pytest
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(tmp_path, monkeypatch, few_figures):
     """Run a program with words in an empty folder; returns its run folder."""
     monkeypatch.chdir(tmp_path)
 

@@ -118,7 +118,7 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
     alone.seed_worlds(seeds[3:4])
     tds = [together.reset(), alone.reset()]
     seen = []
-    for step in range(120):
+    for step in range(60):
         action = torch.randint(24, (5, 3), generator=torch.Generator().manual_seed(step))
         for index, (env, rows) in enumerate(((together, action), (alone, action[3:4]))):
             tds[index] = env.step_and_maybe_reset(tds[index].set(("agents", "action"), rows))[1]
