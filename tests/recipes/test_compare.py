@@ -136,6 +136,7 @@ methods:
 """
 
 
+@pytest.mark.slow
 def test_a_method_starts_from_another_or_imitates_it_and_stored_rows_are_kept(compare, tmp_path):
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "others.yaml").write_text(LEARNING_FROM_OTHERS)

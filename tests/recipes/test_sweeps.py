@@ -67,6 +67,7 @@ def test_a_refused_or_diverged_run_is_a_row_and_the_others_go_on(sweep, capsys, 
     assert f"failed: all/delay.obs--1_learner.lr-0.001: {refused['error']}" in printed.err
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_with_what_is_missing_after_a_kill(sweep, capsys):
     words = ["seed=0,1", "delay.obs=1..3", "frames=160", "checkpoint_every=2"]
     with killed_after(3):  # in the first run
