@@ -12,6 +12,7 @@ from damian import keys
 from damian.baselines.script import script_without_belief
 from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
+from damian.envs.commands import destination
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.forward import ToldWorlds
 from damian.envs.uav_env import UavEnv
@@ -142,7 +143,8 @@ class LatePlanner(Planner):
     def __call__(  # type: ignore[override]
         self, recalled: Tensor, received: Tensor, message: Tensor, mask: Tensor | None = None
     ) -> Tensor:
-        """Actions, [B, N], from what the server has received in the latest steps, and last.
+        """Actions, [B, N], from the messages that the server received: those of the latest steps,
+        and the newest of each UAV.
 
         Where it stands, [B, N, M], and what it may do, [B, N, A], each UAV knows itself.
         """
@@ -160,18 +162,12 @@ class LatePlanner(Planner):
             return self.towards(state.goal, plans[:, back - 1], self.simulation.action_mask(state))
 
         state = self.simulation.flown(recalled, received, now, as_planned)
-        goals = self.planned(state, self.plan(state))
+        goals = destination(self.simulation.candidates, state.goal, self.plan(state))
         self.steps = now
         self.plans = torch.cat([goals.unsqueeze(1), plans[:, :-1]], 1)
-        standing = self.simulation.airspace.point_at(sent.target, state.region)
-        action = self.towards(standing, goals, mask)
+        action = self.towards(self.simulation.bound_for(sent), goals, mask)
         self.milliseconds.append(1000 * (time.perf_counter() - begin))
         return action
-
-    def planned(self, state: State, joint: Tensor) -> Tensor:
-        """The flat ids of the landing points to which actions [B, N] lead, [B, N]."""
-        nearest = gather_rows(self.simulation.candidates.nearest, state.goal)
-        return nearest.gather(-1, joint.unsqueeze(-1)).squeeze(-1)
 
     def towards(self, standing: Tensor, goals: Tensor, mask: Tensor | None) -> Tensor:
         """The actions that lead nearest to the landing points ``goals`` from others, flat ids

@@ -61,7 +61,7 @@ class Method(Settings):
 
     @property
     def has_model(self) -> bool:
-        """Whether it flies with a model of the world, which tells what is not known yet."""
+        """Whether a model of the world predicts late messages while it flies."""
         flown_forward = any(word.startswith("observation.forward=") for word in self.overrides)
         return flown_forward or self.flies == "planner"
 

@@ -1,10 +1,10 @@
-"""What is late, flown forward: copies of the world, made of messages, that step until now."""
+"""Predicts late messages: copies of the world start from old messages and step until now."""
 
 import math
 from collections.abc import Callable
 
 import torch
-from tensordict import NestedKey, TensorDict
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
@@ -150,8 +150,9 @@ class Forward(WorldTransform):
         self.step_keys = [keys.MESSAGE, keys.RECEIVED, keys.RECALLED, keys.OWN_RECALLED]
         self.step_keys += [keys.ACTION_MASK] * masks
 
-    def init_memory(self, tensordict: object) -> Memory:
-        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long)}
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        device = tensordict.get(keys.MESSAGE).device
+        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         n = entries[keys.MESSAGE].shape[1]
@@ -213,7 +214,7 @@ _OF_UAVS = (
 
 
 def _where_told(known: Tensor, told: State, flown: State) -> State:
-    """The state of copies, with the UAVs of which messages are ``known`` [C, N] as these tell."""
+    """The state of copies: ``told`` for UAVs whose messages are ``known`` [C, N], else ``flown``."""
     replaced = {}
     for name in _OF_UAVS:
         replaced[name] = where_rows(known, getattr(told, name), getattr(flown, name))

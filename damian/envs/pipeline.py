@@ -62,8 +62,6 @@ _REPORTED = [
     keys.FORWARD_MASK,
 ]
 """Entries that only the extra ``message`` outputs."""
-_OF_COMMANDS = [keys.REACH]
-"""Entries of which the server node makes the action masks of late commands."""
 _LINKED = [keys.LINKED, keys.LINK_DELAY, keys.HEARD_STOPS]
 """Entries from which UAVs that hear each other directly compute what they observe."""
 
@@ -111,7 +109,7 @@ def make_transforms(
         *_LINKED * (scenario.links.kind == "matrix"),
         *_REPORTED * ("message" not in extras),
         *_STOPS * (not delays.obs.late),
-        *_OF_COMMANDS * scenario.tells_commands,
+        *[keys.REACH] * scenario.tells_commands,  # the server node has read it
     ]
     if remote and dropped:
         transforms.append(Drop(dropped))

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import (
-    distances,
     gather_rows,
     move_attributes,
     tree_map,
@@ -202,11 +201,9 @@ class Simulation:
         latest = messages.trail[..., 0]
         if self.vehicles.instant:
             return latest
-        n_points = self.airspace.max_points
-        region = messages.region(n_points)
-        ground = gather_rows(self.airspace.points, region)
-        nearest = distances(messages.target, ground).argmin(-1)
-        return torch.where(messages.in_flight, nearest + region.unsqueeze(-1) * n_points, latest)
+        region = messages.region(self.airspace.max_points)
+        target = self.airspace.point_at(messages.target, region)
+        return torch.where(messages.in_flight, target, latest)
 
     # The stages of one step, in order.
 
