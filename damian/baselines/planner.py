@@ -14,7 +14,7 @@ from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
 from damian.envs.commands import destination
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.forward import ToldWorlds
+from damian.envs.forward import ForetoldWorlds, ToldWorlds
 from damian.envs.uav_env import UavEnv
 from damian.world.simulation import Simulation
 from damian.world.state import State
@@ -29,8 +29,8 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     have chosen, while the later ones, and all of them in later steps, follow the script. The action
     of the largest sum of team rewards over ``samples`` copies is taken; of equal ones the script's.
     Copies have the state of the world, and draw anew what has not happened yet: gusts, requests and
-    reports. Where sources are and how they will move they know, so that with sources the planner is
-    clairvoyant.
+    reports; no flight is aborted in them, and no UAV fails. Where sources are and how they will
+    move they know, so that with sources the planner is clairvoyant.
 
     Where messages are late (with ``observation.forward``), all UAVs share one plan. It is made
     from the messages that the server holds, in a copy of the world that has flown until now by the
@@ -47,7 +47,8 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     actions = env.uav_env.scenario.actions
     checks.require(actions.kind == "discrete", "policy", "planner", "needs discrete actions")
     if not env.delays.obs.late:
-        planner = Planner(env.uav_env, env.uav_env.simulation, horizon, samples)
+        worlds = ForetoldWorlds(env.uav_env.simulation)
+        planner = Planner(env.uav_env, worlds, horizon, samples)
         return TensorDictModule(planner, [keys.MESSAGE], [keys.ACTION])
     should = "plans from late messages with observation.own=true observation.forward=script"
     told = keys.RECALLED in env.observation_spec.keys(True, True)

@@ -30,17 +30,21 @@ worlds, so many steps ago."""
 _STREAM = counter_rng.number_of("forward")
 
 
-class ToldWorlds(Simulation):
-    """The worlds of a simulation as messages tell of them.
-
-    Nobody knows where sources are, so that nothing is heard there; no request appears that is not
-    known, no flight is aborted and no UAV fails. Gusts are drawn from streams of their own.
-    """
+class ForetoldWorlds(Simulation):
+    """The worlds of a simulation, in which no flight is aborted and no UAV fails."""
 
     foretold = True
 
     def __init__(self, simulation: Simulation) -> None:
         self.__dict__ = simulation.__dict__  # the same tables, also on another device
+
+
+class ToldWorlds(ForetoldWorlds):
+    """The worlds of a simulation as messages tell of them.
+
+    Nobody knows where sources are, so that nothing is heard there, and no request appears that is
+    not known. Gusts are drawn from streams of their own.
+    """
 
     def source_now(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         nowhere = torch.full_like(state.source, torch.inf)

@@ -170,6 +170,11 @@ class MappoConfig(LearnerConfig):
         False,
         "The critic learns values of mean 0 and deviation 1, whatever the scale of the rewards.",
     )
+    credit_executed: bool = setting(
+        True,
+        "Whether a choice earns what follows the execution of its action, if all actions are "
+        "executed equally late; else what follows the choice.",
+    )
     warm_up: int = setting(0, "Updates in which only the critic learns.", low=0, high=checks.STEPS)
     anneal: bool = setting(
         False, "The learning rate and the entropy bonus fall to zero over the run."
@@ -188,8 +193,15 @@ class MappoConfig(LearnerConfig):
             f"{shortest}"
         )
         checks.require(not setup.settle or longest < shortest, "settle", True, should)
+        should = f"needs more than {self.credit_delay(setup)} steps per update (learner.steps)"
+        fits = self.credit_delay(setup) < shortest
+        checks.require(fits, "learner.credit_executed", True, should)
         should = "does not go with model.rnn: hidden states are not recomputed"
         checks.require(not (recurrent and setup.recompute_actor), "corrected", "actor", should)
+
+    def credit_delay(self, setup: LearningSetup) -> int:
+        """Steps after a choice from which on it earns rewards."""
+        return (setup.action_delay or 0) if self.credit_executed else 0
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         return setup.least_buffer if setup.backupdate else None

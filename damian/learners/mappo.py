@@ -90,7 +90,10 @@ class Mappo:
         """Make one update from a batch [B, T]; also logs ``explained_variance`` and
         ``backupdated``."""
         corrected = self.backupdated_batch(batch)
-        add_advantages(corrected, self.critic, self.config)
+        executed = None
+        if delay := self.config.credit_delay(self.setup):
+            corrected, executed = executed_choices(corrected, delay)
+        add_advantages(corrected, self.critic, self.config, executed)
         numbers = self.optimize(corrected)
         self.progress.updates += 1
         self.progress.frames += batch.numel()
@@ -239,14 +242,37 @@ def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tens
     return log_ratio, policy.entropy()
 
 
+def executed_choices(batch: TensorDictBase, delay: int) -> tuple[TensorDictBase, Tensor]:
+    """The choices of a batch [B, T] whose actions have been executed by its end, ``delay`` steps
+    later, [B, T - delay], each with the reward and the end of the episode of that later step.
+
+    Also tells which choices count, [B, T - delay] bool: before the action of the others is
+    executed, their episode has ended.
+    """
+    n_steps = batch.shape[1] - delay
+    done = batch[keys.next_key(keys.DONE)].squeeze(-1)
+    executed = ~done[:, :-1].unfold(1, delay, 1).any(-1)
+    choices = batch[:, :n_steps].copy()
+    for key in map(keys.next_key, (keys.REWARD, keys.DONE, keys.TERMINATED)):
+        choices[key] = batch[key][:, delay:]
+    choices[keys.READY] = choices[keys.READY] & executed.unsqueeze(-1)
+    return choices, executed
+
+
 @torch.no_grad()
-def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: MappoConfig) -> None:
+def add_advantages(
+    batch: TensorDictBase,
+    critic: TensorDictModule,
+    config: MappoConfig,
+    executed: Tensor | None = None,
+) -> None:
     """Write values, advantages and value targets into a batch [B, T], in place.
 
     The return of a decision sums the rewards until the UAV's next decision, k steps later, whose
     value is discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999).
     At the steps between two decisions lambda of the generalised advantage estimate
-    (Schulman et al. 2016) is 1, and the advantage is 0.
+    (Schulman et al. 2016) is 1, and the advantage is 0. Where ``executed`` [B, T] is false
+    (``executed_choices``), there is nothing to learn: the target is the value.
     """
     next_step = cast(TensorDictBase, batch["next"])
     value, next_value = state_values(batch, critic)
@@ -263,6 +289,8 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     advantage, target = generalized_advantage_estimate(
         config.gamma, lmbda, value, next_value, reward, *ends, time_dim=-3
     )
+    if executed is not None:
+        target = torch.where(executed[..., None, None], target, value)
     batch[keys.VALUE_TARGET] = target
     if isinstance(critic.module, NormalizedValue):
         critic.module.norm.update(target.double())

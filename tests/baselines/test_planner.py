@@ -43,9 +43,10 @@ def loop(env, td, horizon):
     return joint
 
 
-def test_the_planner_equals_a_plain_loop():
+@pytest.mark.parametrize("news", ["motion.abort=0", "motion.abort=0.9"])
+def test_the_planner_equals_a_plain_loop_in_which_no_flight_is_aborted(news):
     horizon = 2
-    env = made()
+    env = made(news)
     planner = planner_policy(env, horizon)
     td = env.reset()
     differs = 0

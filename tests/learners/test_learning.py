@@ -16,7 +16,7 @@ from damian import DelayConfig, ScenarioConfig, UavEnv, keys, make_env
 from damian.common.errors import InputError
 from damian.envs.recompute import server_recompute
 from damian.learners.base import divergence
-from damian.learners.mappo import Mappo, MappoConfig, add_advantages
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages, executed_choices
 from damian.models.actor import make_actor
 from damian.models.config import MlpConfig
 from damian.models.critic import make_critic
@@ -84,6 +84,37 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
             assert advantage == pytest.approx(estimate, abs=1e-5)
             compared += 1
     assert compared > 100
+
+
+def test_a_choice_earns_what_follows_the_execution_of_its_action():
+    delay = 2
+    config = MappoConfig(gamma=0.9, lmbda=1.0, normalize_advantage=False)
+    batch, critic = collect("instant", "discrete")
+    choices, executed = executed_choices(batch, delay)
+    add_advantages(choices, critic, config, executed)
+    reward = batch[REWARD].squeeze(-1)
+    done, terminated = (batch["next", key].squeeze(-1) for key in ("done", "terminated"))
+    value = choices["agents", "state_value"].squeeze(-1)
+    next_value = choices["next", "agents", "state_value"].squeeze(-1)
+    target = choices["agents", "value_target"].squeeze(-1)
+    counted = set()
+    for world, t in itertools.product(range(8), range(24 - delay)):
+        counts = not done[world, t : t + delay].any()
+        assert executed[world, t] == counts
+        assert (choices["agents", "ready"][world, t] == counts).all()
+        expected = value[world, t]
+        last = t + delay  # the step that executes the latest choice
+        earned = 0.0
+        while counts:
+            earned += 0.9 ** (last - delay - t) * reward[world, last]
+            if done[world, last] or last == 23:
+                left = 0.9 ** (last - delay - t + 1) * next_value[world, last - delay]
+                expected = earned + left * ~terminated[world, last]
+                break
+            last += 1
+        assert target[world, t].tolist() == pytest.approx(expected.tolist(), abs=1e-5)
+        counted.add(counts)
+    assert counted == {True, False}
 
 
 # How back-updating changes the importance ratios of the first pass.
