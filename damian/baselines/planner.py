@@ -11,7 +11,7 @@ from torch import Tensor
 from damian import keys
 from damian.baselines.script import script_without_belief
 from damian.common import checks, counter_rng
-from damian.common.tensors import gather_rows, tree_map
+from damian.common.tensors import tree_map
 from damian.envs.commands import destination
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.forward import ForetoldWorlds, ToldWorlds
@@ -46,6 +46,8 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     """
     actions = env.uav_env.scenario.actions
     checks.require(actions.kind == "discrete", "policy", "planner", "needs discrete actions")
+    late = env.uav_env.scenario.tells_commands
+    checks.require(not late, "policy", "planner", "plans for actions.command=relative")
     if not env.delays.obs.late:
         worlds = ForetoldWorlds(env.uav_env.simulation)
         planner = Planner(env.uav_env, worlds, horizon, samples)
@@ -53,11 +55,11 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     should = "plans from late messages with observation.own=true observation.forward=script"
     told = keys.RECALLED in env.observation_spec.keys(True, True)
     checks.require(told, "policy", "planner", should)
-    late = LatePlanner(env.uav_env, ToldWorlds(env.uav_env.simulation), horizon, samples)
+    planner = LatePlanner(env.uav_env, ToldWorlds(env.uav_env.simulation), horizon, samples)
     read: list[NestedKey] = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
     if keys.ACTION_MASK in env.observation_spec.keys(True, True):
         read.append(keys.ACTION_MASK)
-    return TensorDictModule(late, read, [keys.ACTION])
+    return TensorDictModule(planner, read, [keys.ACTION])
 
 
 class Planner:
@@ -160,23 +162,13 @@ class LatePlanner(Planner):
         plans = self.plans
 
         def as_planned(state: State, back: int) -> Tensor:
-            return self.towards(state.goal, plans[:, back - 1], self.simulation.action_mask(state))
+            mask = self.simulation.action_mask(state)
+            return self.simulation.towards(state.goal, plans[:, back - 1], mask)
 
         state = self.simulation.flown(recalled, received, now, as_planned)
         goals = destination(self.simulation.candidates, state.goal, self.plan(state))
         self.steps = now
         self.plans = torch.cat([goals.unsqueeze(1), plans[:, :-1]], 1)
-        action = self.towards(self.simulation.bound_for(sent), goals, mask)
+        action = self.simulation.towards(self.simulation.bound_for(sent), goals, mask)
         self.milliseconds.append(1000 * (time.perf_counter() - begin))
         return action
-
-    def towards(self, standing: Tensor, goals: Tensor, mask: Tensor | None) -> Tensor:
-        """The actions that lead nearest to the landing points ``goals`` from others, flat ids
-        [B, N] each."""
-        nearest = gather_rows(self.simulation.candidates.nearest, standing)
-        points = self.simulation.points
-        ways = gather_rows(points, nearest) - gather_rows(points, goals).unsqueeze(-2)
-        left = ways.square().sum(-1)
-        if mask is not None:
-            left = left.where(mask, torch.inf)
-        return left.argmin(-1)

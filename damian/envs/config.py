@@ -194,15 +194,20 @@ class ScenarioConfig(WorldConfig):
             "does not go with observation.belief: no belief is flown forward": bool(
                 self.observation.belief
             ),
-            "does not go with actions.command=absolute: no frame is flown forward": (
-                self.actions.command == "absolute"
-            ),
+            "goes with actions.command=absolute if all commands are discrete and equally late "
+            "(delay.act_hold=max), and motion=instant": forward and not self._frames_follow(),
             "=policy does not go with delay.history: the copies tell no past actions": (
                 forward == "policy" and self.delay.history > 0
             ),
         }
         for problem, wrong in refused.items():
             self.refuse(forward and wrong, "observation.forward", problem)
+
+    def _frames_follow(self) -> bool:
+        """Whether where late commands lead can be flown forward."""
+        simple = self.actions.kind == "discrete" and self.motion.kind == "instant"
+        constant = simple and self.make_delays().act.constant_delay is not None
+        return not self.tells_commands or constant
 
     def make_delays(self) -> "ScenarioDelays":
         """Resolve the laws of all delays to samplers, which reads the files of traces."""

@@ -13,7 +13,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from damian import keys
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
-from damian.common.tensors import tree_map, tree_where, where_rows
+from damian.common.tensors import gather_rows, tree_map, tree_where, where_rows
 from damian.envs.nodes import WorldTransform
 from damian.server.features.base import stack
 from damian.server.server import Server, own_or_others
@@ -82,8 +82,10 @@ class ToldWorlds(ForetoldWorlds):
         state = state._replace(message_sent=since == 0)
         return self.vehicles.resumed(state, since)
 
-    def flown(self, recalled: Tensor, newest: Tensor, now: Tensor, assumed: Assumed) -> State:
-        """The state of C copies ``now`` [C] steps after the reset.
+    def flown(
+        self, recalled: Tensor, newest: Tensor, now: Tensor, assumed: Assumed, ahead: int = 0
+    ) -> State:
+        """The state of C copies ``now`` [C] steps after the reset, and so many steps ``ahead``.
 
         ``recalled`` [C, N, S + 1, M + 1] are the messages of the latest steps, the latest one
         first, each followed by whether it is known; ``newest`` [C, N, M] the newest known of each
@@ -110,7 +112,19 @@ class ToldWorlds(ForetoldWorlds):
             told = self.state_of(self._messages(rows[:, :, back - 1]), region, after)
             following = _where_told(known[:, :, back - 1], told, following)
             state = tree_where(after > 0, following, state)
+        for step in range(ahead):
+            state = self.step(state, assumed(state, -step))
         return state
+
+    def towards(self, standing: Tensor, goals: Tensor, mask: Tensor | None = None) -> Tensor:
+        """The actions that lead nearest to the landing points ``goals`` from others, flat ids
+        [*, N] each."""
+        nearest = gather_rows(self.candidates.nearest, standing)
+        ways = gather_rows(self.points, nearest) - gather_rows(self.points, goals).unsqueeze(-2)
+        left = ways.square().sum(-1)
+        if mask is not None:
+            left = left.where(mask, torch.inf)
+        return left.argmin(-1)
 
     def _messages(self, rows: Tensor) -> Messages:
         return Messages.unpack(rows, self.widths)
@@ -135,24 +149,39 @@ class Forward(WorldTransform):
     that it recalls reach, and steps until now. In each step every UAV does what the messages of
     that step tell, as far as they have arrived, and else what ``assumed`` chooses in the copy.
     Where nothing is random and everybody follows what is assumed, the messages are those that an
-    undelayed server holds.
+    undelayed server holds. If commands are executed ``late`` steps after they are sent, the copies
+    step on until those that are sent now will be, and a UAV does in its own what it has sent.
 
     Args:
         simulation: of the worlds.
+        received_key: key of the packed messages that have arrived.
         masks: also write which actions are legal in the copies.
+        late: delay of absolute commands [steps].
+        hold: action that is executed until the first command arrives.
     """
 
     stage = "server"
 
-    def __init__(self, simulation: Simulation, *, masks: bool = False) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        received_key: NestedKey = keys.RECEIVED,
+        *,
+        masks: bool = False,
+        late: int = 0,
+        hold: int = 0,
+    ) -> None:
         written: list[NestedKey] = [keys.FORWARD, *[keys.FORWARD_MASK] * masks]
         super().__init__([keys.MESSAGE], written)
         self.worlds = ToldWorlds(simulation)
+        self.received_key = received_key
         self.masks = masks
+        self.late = late
+        self.hold = hold
         self.assumed: Assumed | None = None
         """What everybody is assumed to choose; ``DelayedEnv.assume`` hands it in."""
-        self.step_keys = [keys.MESSAGE, keys.RECEIVED, keys.RECALLED, keys.OWN_RECALLED]
-        self.step_keys += [keys.ACTION_MASK] * masks
+        self.step_keys = [keys.MESSAGE, received_key, keys.RECALLED, keys.OWN_RECALLED]
+        self.step_keys += [keys.ACTION_MASK] * masks + [keys.COMMANDS] * (late > 0)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         device = tensordict.get(keys.MESSAGE).device
@@ -176,16 +205,39 @@ class Forward(WorldTransform):
         sent = entries[keys.MESSAGE]
         n_worlds, n = sent.shape[:2]
         recalled = own_or_others(entries[keys.OWN_RECALLED], entries[keys.RECALLED], 2)
-        newest = own_or_others(sent, entries[keys.RECEIVED], 1)
+        newest = own_or_others(sent, entries[self.received_key], 1)
         copies = recalled.flatten(0, 1), newest.flatten(0, 1), now.repeat_interleave(n, 0)
-        state = self.worlds.flown(*copies, self.assumed)
+        assumed = self.assumed
+        if self.late:
+            assumed = self._with_own(assumed, entries[keys.COMMANDS])
+        state = self.worlds.flown(*copies, assumed, self.late)
         flown = state.sent.pack().view(n_worlds, n, n, -1)
-        itself = torch.eye(n, dtype=torch.bool, device=sent.device).unsqueeze(-1)
-        written: Entries = {keys.FORWARD: torch.where(itself, sent.unsqueeze(1), flown)}
+        if not self.late:
+            itself = torch.eye(n, dtype=torch.bool, device=sent.device).unsqueeze(-1)
+            flown = torch.where(itself, sent.unsqueeze(1), flown)
+        written: Entries = {keys.FORWARD: flown}
         if self.masks:
             mask = self.worlds.action_mask(state)
             written[keys.FORWARD_MASK] = mask.view(n_worlds, n, n, -1)
         return {"elapsed": now}, written
+
+    def _with_own(self, assumed: Assumed, commands: Tensor) -> Assumed:
+        """What is assumed of others, and of the observer of each copy what it has sent,
+        ``commands`` [B, N, K, 3]; all hold until the first command arrives."""
+        observer = torch.arange(commands.shape[1], device=commands.device)
+        observer = observer.repeat(len(commands)).unsqueeze(-1)
+        place, _, latest = commands.flatten(0, 1).unbind(-1)
+
+        def choose(state: State, back: int) -> Tensor:
+            actions = assumed(state, back)
+            after = (state.steps + 1).unsqueeze(-1)
+            sent = torch.where(latest == after, place, -1).amax(-1, keepdim=True)
+            own = self.worlds.towards(state.goal.gather(1, observer), sent.clamp(min=0))
+            own = torch.where(sent < 0, actions.gather(1, observer), own)
+            actions = actions.scatter(1, observer, own)
+            return actions.where(after > self.late, self.hold)
+
+        return choose
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         message = observation_spec[keys.MESSAGE].shape

@@ -154,7 +154,7 @@ class ServerNode(WorldTransform):
             written[self.in_keys[0]] = received
         if self.simulation:
             written |= self._in_frames(self.simulation, received, entries, steps)
-        elif self.heard_key:
+        if self.heard_key:
             rows = self.server.with_own_knowledge(entries[self.heard_key], sent.unsqueeze(-3))
             heard = self.server.messages(rows)
             heard_timeline = None
@@ -165,7 +165,7 @@ class ServerNode(WorldTransform):
             written[keys.OBSERVATION] = self.server.observe_each(
                 heard, steps, timeline=heard_timeline
             )
-        elif self.own_key:
+        elif self.own_key and not self.simulation:
             written[keys.OBSERVATION] = self.server.observe_with_own_messages(
                 received,
                 entries[self.own_key],
@@ -189,6 +189,9 @@ class ServerNode(WorldTransform):
         known = (entries.get(key) for key in (keys.BELIEF, keys.OWN_BELIEF, keys.STOPS))
         sent = entries[keys.COMMANDS]
         written = self.server.observe_commanded(received, messages, sent, steps, *known)
+        if self.heard_key:  # flown forward, until the commands will have been executed
+            uav = torch.arange(own.shape[-2], device=own.device)
+            messages = self.server.messages(entries[self.heard_key][..., uav, uav, :])
         frame = simulation.bound_for(messages)
         actions = simulation.config.actions
         if actions.kind == "discrete" and actions.mask:

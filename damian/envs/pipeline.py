@@ -149,7 +149,7 @@ def server_transforms(
     output_messages = "message" in extras
     delayed = delays.obs.late
     links = scenario.links
-    forward = delayed and scenario.observation.forward
+    forward = scenario.observation.forward and (delayed or scenario.tells_commands)
     remembers = (
         server.grid is not None
         or scenario.delay.messages > 0
@@ -212,6 +212,8 @@ def forward_transforms(
     scenario: ScenarioConfig, delays: ScenarioDelays, env: UavEnv, *, masks: bool
 ) -> list[Transform]:
     """What flies late messages forward, and before it what keeps those of the latest steps."""
+    delayed = delays.obs.late
+    held = keys.RECEIVED if delayed else keys.MESSAGE
     steps = scenario.observation.forward_steps
     if not delays.obs.loses:  # what has been sent before has arrived
         steps = min(steps, delays.obs.longest + longest_flight(env.simulation))
@@ -219,12 +221,15 @@ def forward_transforms(
         steps + 1,
         keys.MESSAGE,
         keys.RECALLED,
-        delay_key=keys.DELAY,
+        delay_key=keys.DELAY if delayed else None,
         sent_key=keys.MESSAGE_SENT,
         own_key=keys.OWN_RECALLED,
     )
     masks = masks and scenario.actions.kind == "discrete" and scenario.actions.mask
-    return [recalled, Forward(env.simulation, masks=masks)]
+    late = delays.act.longest if scenario.tells_commands else 0
+    hold = hold_action(scenario.actions)
+    forward = Forward(env.simulation, held, masks=masks, late=late, hold=hold)
+    return [recalled, forward]
 
 
 def remembering_transforms(

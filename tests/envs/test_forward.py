@@ -60,6 +60,34 @@ def test_without_news_the_late_script_flies_as_the_undelayed_one(scenario, delay
         assert expected[after][..., columns].equal(found[after][..., columns])
 
 
+HELD = "actions.command=absolute delay.act_hold=max delay.act=1..2"
+
+
+def targets(env, rollout):
+    return env.server.messages(rollout["next", *keys.MESSAGE]).target
+
+
+@pytest.mark.parametrize("delay", ["delay.obs=0", "delay.obs=1..3"])
+def test_without_news_late_commands_fly_as_undelayed_ones_but_later(delay):
+    undelayed, late = env_of(CROWDED), env_of(f"{CROWDED} {HELD} {delay}", *LATE)
+    expected = targets(undelayed, flown(undelayed, script_policy(undelayed)))
+    found = targets(late, flown(late, script_policy(late)))
+    assert found[:, 2:].equal(expected[:, :-2])
+    assert not found[:, 2:].equal(found[:, :-2])
+
+
+def test_who_flies_late_commands_forward_knows_what_it_has_sent_itself():
+    words = "agents=1 observation.global_features=[coverage,coverage_map]"
+    env = env_of(f"{CROWDED} {HELD} delay.obs=1..3 {words}", *LATE)
+    torch.manual_seed(0)
+    after = after_actions(env, torch.randint(40, (STEPS, WORLDS, 1)))
+    for now, later in zip(after, after[2:], strict=False):
+        forward = env.server.messages(now[keys.FORWARD][:, 0])
+        truth = env.server.messages(later[keys.MESSAGE])
+        assert forward.target.equal(truth.target)
+        assert now[keys.FRAME].equal(truth.trail[..., 0])
+
+
 def test_a_policy_that_everybody_follows_is_flown_forward():
     undelayed = env_of("scenario=tasks/flights")
     late = env_of("scenario=tasks/flights delay.obs=1..3", *LATE)
