@@ -86,8 +86,12 @@ class Prior(nn.Module):
         if self.log:
             self.columns = [layout["belief_gain"].columns]
         else:
-            should = "needs gains: observation.actions=true, or observation.belief=[belief_gain]"
-            checks.require("actions" in layout, "model.prior", True, should)
+            advised = "actions" in layout and "gain" in layout["actions"].entries
+            should = (
+                "needs gains: observation.actions=true observation.advice=true, or "
+                "observation.belief=[belief_gain]"
+            )
+            checks.require(advised, "model.prior", True, should)
             self.columns = [layout["actions"].columns_of(name) for name in FIRST_WEIGHTS]
             first = [*FIRST_WEIGHTS.values()]
         self.weight = nn.Parameter(torch.tensor(first))

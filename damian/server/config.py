@@ -61,6 +61,11 @@ class ObservationConfig(Settings):
         "Whether each actor observes what each discrete action offers: where it leads, the ground, "
         "sources and requests there.",
     )
+    advice: bool = setting(
+        True,
+        "Whether ``actions`` also tells what the script makes of them: new ground in turn, gain and "
+        "choice.",
+    )
     detections: int = setting(
         3, "Number of newest detections of each source that ``detections`` tells.", low=1, high=16
     )

@@ -257,6 +257,13 @@ def test_the_gain_is_of_the_task_and_columns_are_those_of_the_scenario():
     assert [*offers["c"]] == [
         "east", "north", "new", "new to all", "in turn", "others", "gain", "choice", "legal",
     ]  # fmt: skip
+    rolls = ([], ["observation.advice=false"])
+    advised, facts = (
+        observed(*roll(["scenario=delaybench/crowded", *words], 3, policy="script"))
+        for words in rolls
+    )
+    assert [*facts] == ["east", "north", "new", "new to all", "others", "legal"]
+    assert all(advised[name].equal(fact) for name, fact in facts.items())
     torch.testing.assert_close(offers["c"]["gain"], offers["c"]["in turn"], atol=1e-3, rtol=0)
     assert {"time", "source", "own source"} <= {*offers["s"]}
     assert "request" not in offers["s"]

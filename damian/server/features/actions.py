@@ -78,7 +78,7 @@ def columns_of_actions(simulation: Simulation, observation: ObservationConfig) -
         "battery": config.battery.enabled,
         "new": True,
         "new to all": config.agents > 1,
-        "in turn": True,
+        "in turn": observation.advice,
         "source": config.seeks_source,
         "own source": config.seeks_source,
         "request": bool(config.requests.slots),
@@ -86,8 +86,8 @@ def columns_of_actions(simulation: Simulation, observation: ObservationConfig) -
         "request age": bool(config.requests.slots),
         "belief": "belief_gain" in observation.belief,
         "others": config.agents > 1,
-        "gain": True,
-        "choice": True,
+        "gain": observation.advice,
+        "choice": observation.advice,
         "legal": True,
     }
     return tuple(name for name, exists in named.items() if exists)
@@ -316,7 +316,8 @@ def _actions(v: FeatureCache) -> Tensor:
     of open requests, and the age of the oldest in the footprint; the ``belief_gain``; and the
     nearest target of another UAV. ``gain``: what the UAV gains in its task, as a rule of thumb has
     it, less a little for the way; ``choice``: 1 for the legal action of the largest gain;
-    ``legal``: whether the UAV may choose it. What a scenario does not have is left out. In flight,
+    ``legal``: whether the UAV may choose it. ``in turn``, ``gain`` and ``choice`` stand only where
+    ``observation.advice`` is set. What a scenario does not have is left out. In flight,
     actions begin at the destination.
     """
     names = v.table(columns_of_actions)
@@ -334,7 +335,9 @@ def _actions(v: FeatureCache) -> Tensor:
     if "battery" in names:
         level = v.wanted(v.messages.battery).unsqueeze(-1)
         found["battery"] = (level - gather_rows(tables.drain, row)).clamp(0, 100) / 100
-    taken = {"new": own, "in turn": own | v.wanted(v(claimed))}
+    taken = {"new": own}
+    if "in turn" in names:
+        taken["in turn"] = own | v.wanted(v(claimed))
     if "new to all" in names:
         everyone = torch.zeros_like(v(covered)[..., :1, :])
         for one in v(covered).split(1, -2):
@@ -342,12 +345,10 @@ def _actions(v: FeatureCache) -> Tensor:
         taken["new to all"] = everyone
     for name, known in taken.items():
         found[name] = _number(ground & ~known.unsqueeze(-2)) / full
-    gain = found["in turn"]
     if "source" in names:
         close, is_assigned = _closeness(v, *known_sources(v))
         found["source"] = close.amax(-1)
         found["own source"] = (close * is_assigned).amax(-1)
-        gain = v(source_gain) / full if len(tables.inside) else _if_any(found["own source"], gain)
     if "request" in names:
         requests, unserved = known_requests(v.messages)
         place, appeared = requests.split([2, 1], -1)
@@ -358,15 +359,30 @@ def _actions(v: FeatureCache) -> Tensor:
         age = (v.context.now[..., None] - appeared.squeeze(-1)) / v.context.time_scale
         age = age.clamp(0, 1)[..., None, None, :]
         found["request age"] = (age * inside).amax(-1)
-        waits = (-gather_rows(tables.length, standing) / v.radius).exp()
-        gain = _if_any(found["own request"], waits)
     if "belief" in names:
         found["belief"] = v(belief_gain.compute)
-        gain = found["belief"]
     if "others" in names:
         found["others"] = _near_others(v)
-    net = gain - FLIGHT_COST * gather_rows(tables.length, standing) / full
-    found["gain"] = net.clamp(min=-1)
-    best = net.where(allowed, -torch.inf).argmax(-1, keepdim=True)
-    found["choice"] = torch.zeros_like(net).scatter(-1, best, 1.0)
+    if "gain" in names:
+        length = gather_rows(tables.length, standing)
+        net = _script_gain(v, found, full) - FLIGHT_COST * length / full
+        found["gain"] = net.clamp(min=-1)
+        best = net.where(allowed, -torch.inf).argmax(-1, keepdim=True)
+        found["choice"] = torch.zeros_like(net).scatter(-1, best, 1.0)
     return torch.stack([found[name] for name in names], -1)
+
+
+def _script_gain(v: FeatureCache, found: dict[str, Tensor], full: Tensor) -> Tensor:
+    """What each action gains by the script, flights apart, [*, n, A], from the other columns that
+    were ``found``, and the size of a full footprint."""
+    tables = v.table(action_tables)
+    if "belief" in found:
+        return found["belief"]
+    if "request" in found:
+        length = gather_rows(tables.length, v.wanted(v(stands)))
+        return _if_any(found["own request"], (-length / v.radius).exp())
+    if "source" not in found:
+        return found["in turn"]
+    if len(tables.inside):
+        return v(source_gain) / full
+    return _if_any(found["own source"], found["in turn"])
