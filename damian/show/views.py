@@ -141,17 +141,20 @@ class MapView:
         return drawn
 
     def _names(self, frame: Frame) -> list[Any]:
-        """Name UAVs and rings, on the sides away from the line between them."""
+        """Name UAVs and rings on the sides away from the line between them; names at one place lie
+        apart."""
+        uavs = [uav for uav in frame.uavs if uav.chosen]
         drawn: list[Any] = []
-        for uav in frame.uavs:
+        for number, uav in enumerate(uavs):
             true = uav.path[-1, :2]
-            way = true - uav.believed if uav.age > 0 else np.zeros(2)
-            away = way / np.hypot(*way) if way.any() else np.array([0.0, 1.0])
+            east, north = true - uav.believed
+            apart = 2 * np.pi * (number + 0.2) / len(uavs)
+            turn = np.arctan2(north, east) if east or north else apart
             name = _short(uav.id)
-            ring = [(uav.believed, f"{name}, {uav.age:g} s", -away)] if uav.age > 0 else []
-            for place, text, to in [(true, name, away), *ring] if uav.chosen else []:
-                aside = to * [8 + 2.4 * len(text), 13]
-                drawn.append(self.axis.annotate(text, place, aside, color=uav.ink, **_NAME))
+            ring = [(uav.believed, f"{name}, {uav.age:g} s", turn + np.pi)] if uav.age > 0 else []
+            for place, text, to in [(true, name, turn), *ring]:
+                away = ((10 + 2.4 * len(text)) * np.cos(to), 13 * np.sin(to))
+                drawn.append(self.axis.annotate(text, place, away, color=uav.ink, **_NAME))
         return drawn
 
     def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
