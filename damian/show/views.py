@@ -1,16 +1,16 @@
 """A map, into which films and figures draw the frames of an episode."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
-from matplotlib.patches import Patch, Polygon
+from matplotlib.patches import Circle, Patch, Polygon
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
@@ -39,8 +39,6 @@ _CHARGES: dict[str, Any] = {"marker": _BOLT, "color": "#b8860b", "markersize": 9
 """Mark of a place where UAVs charge."""
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
 _ZONE = {"facecolor": "white", "edgecolor": _EDGE, "linewidth": 0.6, "hatch": "////"}
-_CORNERS = 48
-"""Corners of a footprint."""
 ROWS = 20
 """Largest number of UAVs with a row of messages each."""
 _HALO = [withStroke(linewidth=1.8, foreground="white")]
@@ -54,8 +52,6 @@ class MapView:
     def __init__(self, axis: Any, episode: Episode) -> None:
         self.axis = axis
         self.episode = episode
-        turns = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
-        self._circle = episode.radius * np.stack([np.cos(turns), np.sin(turns)], -1)
         self._late = lateness(episode)
         corner, end = limits(episode.region, episode.radius)
         size = max(end - corner) / _CELLS
@@ -64,8 +60,14 @@ class MapView:
         self._covered_at = np.zeros(self._inside.shape)
         self._step = np.inf
         place = [end for row in self._grid for end in (row[0] - size / 2, row[-1] + size / 2)]
-        style = {"extent": place, "origin": "lower", "interpolation": "bilinear", "zorder": 0.4}
-        self._image = axis.imshow(self._covered_at, COVERED, vmin=0, vmax=1, **style)
+        self._image = axis.imshow(
+            self._inside,
+            COVERED,
+            extent=place,
+            origin="lower",
+            interpolation="bilinear",
+            zorder=0.4,
+        )
         draw_region(axis, episode.region, episode.landing_points, episode.radius)
         axis.plot(*_chargers(episode), linestyle="", **_CHARGES)
 
@@ -91,7 +93,8 @@ class MapView:
         if heat:
             corners = [shapely.get_coordinates(part.exterior) for part, _ in heat]
             colours = [HEAT(_NORM(probability)) for _, probability in heat]
-            drawn.append(self._areas(corners, facecolor=colours, edgecolor="none", zorder=0.5))
+            cells = PolyCollection(corners, facecolor=colours, edgecolor="none", zorder=0.5)
+            drawn.append(self.axis.add_collection(cells))
         for place in frame.requests:
             drawn += self._plot(place, "s", "none", INK, markersize=7)
         for place, emits in frame.sources:
@@ -105,10 +108,6 @@ class MapView:
         style = {"zorder": 6, **style}
         return self.axis.plot(*place, marker, color=color, markerfacecolor=fill, **style)
 
-    def _print(self, uav: Uav) -> Floats:
-        """Corners of a footprint, [C, 2]."""
-        return uav.path[-1, :2] + self._circle
-
     def _uav(self, uav: Uav) -> list[Any]:
         """Draw a UAV with its footprint, as a dart that points where it flies, and a line to where
         the server believes it to be.
@@ -118,24 +117,32 @@ class MapView:
         """
         colour = uav.colour if uav.chosen else LATE(self._late(uav.age))
         size = 1.0 if uav.chosen else 0.5
-        inside = to_rgba(colour, 0.26 if uav.spots else 0.07)
-        edge = {"edgecolor": colour, "linewidth": 1.6 * uav.spots or 0.5 * uav.chosen}
-        drawn = [self._areas([self._print(uav)], facecolor=inside, zorder=2, **edge)]
-        parts = list(np.stack([uav.path[:-1, :2], uav.path[1:, :2]], 1))
-        if parts and uav.chosen:
-            fading = np.linspace(0.1, 0.7, len(parts))
-            trail = {"colors": colour, "alpha": fading, "linewidths": 1.6, "zorder": 3}
-            drawn.append(self.axis.add_collection(LineCollection(parts, **trail)))
         true = uav.path[-1, :2]
-        dart = DART.transformed(Affine2D().rotate(-uav.heading))
-        style = {"markersize": 5 + 8 * size, "markeredgecolor": uav.edge, "zorder": 5}
+        footprint = Circle(
+            true,
+            self.episode.radius,
+            facecolor=to_rgba(colour, 0.26 if uav.spots else 0.07),
+            edgecolor=colour,
+            linewidth=1.6 * uav.spots or 0.5 * uav.chosen,
+            zorder=2,
+        )
+        drawn = [self.axis.add_patch(footprint)]
+        if uav.chosen:
+            drawn += self.axis.plot(*uav.path[:, :2].T, color=colour, alpha=0.45, lw=1.6, zorder=3)
         drawn += self.axis.plot(
-            *true, marker=dart, color=colour, markeredgewidth=0.6 * size, **style
+            *true,
+            marker=DART.transformed(Affine2D().rotate(-uav.heading)),
+            color=colour,
+            markersize=5 + 8 * size,
+            markeredgecolor=uav.edge,
+            markeredgewidth=0.6 * size,
+            zorder=5,
         )
         if uav.age > 0:
-            line = {"color": colour, "linewidth": 1.1 * size, "zorder": 3}
-            dots = ":" if uav.chosen else "-"
-            drawn += self.axis.plot(*np.stack([true, uav.believed]).T, dots, **line)
+            way = np.stack([true, uav.believed]).T
+            drawn += self.axis.plot(
+                *way, ":" if uav.chosen else "-", color=colour, lw=size, zorder=3
+            )
             ring = {"markersize": 12 * size, "markeredgewidth": 1.5 * size, "zorder": 4}
             drawn += self._plot(uav.believed, "o", "none", colour, **ring)
         return drawn
@@ -156,9 +163,6 @@ class MapView:
                 away = ((10 + 2.4 * len(text)) * np.cos(to), 13 * np.sin(to))
                 drawn.append(self.axis.annotate(text, place, away, color=uav.ink, **_NAME))
         return drawn
-
-    def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
-        return self.axis.add_collection(PolyCollection(corners, **style))
 
 
 def draw_region(axis: Any, region: Any, points: Floats, radius: float) -> None:

@@ -113,9 +113,7 @@ class Run:
                 )  # those of a policy that is not there any more
             remove_unfinished(folder)
             if config.region.kind != "random":
-                print(
-                    *save_region(config, config.seed, folder / "region.png"), sep="\n", flush=True
-                )
+                print(save_region(config, config.seed, folder / "region.png"), flush=True)
             with timed(folder):
                 self.work(config, folder)
         print(f"results: {folder}")
