@@ -18,7 +18,7 @@ import yaml
 
 from damian.common.errors import InputError
 from damian.common.fields import default_of, rules
-from damian.common.text_files import read_text
+from damian.common.text_files import data_file, read_text
 from damian.compare.config import CompareConfig
 from damian.learners.config import LEARNERS
 
@@ -151,6 +151,12 @@ def check_words(program: str, words: Iterable[str]) -> None:
                 raise InputError(f"{key}: {wrong[0]} is not one of {', '.join(options[key])}")
         elif not (is_known(key, program) or key.startswith(("hydra", "+", "~", "-"))):
             raise InputError(no_such_key(key, program))
+        elif key == "checkpoint" and re.fullmatch(r"(?!null$)[\w/.:-]+", value):
+            folder = Path(data_file(value, key))
+            shipped = (
+                value if folder.exists() else f"damian:{value}"
+            )  # named with the package's own
+            data_file(shipped, f"{key}: {value} holds no config.yaml")
 
 
 def is_known(key: str, program: str) -> bool:

@@ -232,8 +232,10 @@ def _places(comparison: Comparison, undelayed: Sequence[str] = ()) -> list[tuple
 
 
 def _line_of(comparison: Comparison, name: str) -> dict[str, Any]:
-    """Style of the line of a method, with its entry in the legend."""
-    return look(comparison.methods, name) | {"marker": "", "label": name}
+    """Style of the line of a method, with its entry in the legend: only the first six are
+    coloured."""
+    grey = {"color": "0.75"} if [*comparison.methods].index(name) > 5 else {}
+    return look(comparison.methods, name) | {"marker": "", "label": name} | grey
 
 
 def _flown(measure: str) -> str:

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -19,17 +20,17 @@ from damian.common.atomic_files import write_atomically
 from damian.common.plotting import STYLE, save_figure
 from damian.envs.uav_env import UavEnv
 from damian.show.episode import Episode, at_instant, episode_of
-from damian.show.frame import INK, chosen_of, frame_of
-from damian.show.views import MapView, draw_messages, height_of_rows, legend_marks
+from damian.show.frame import INK, chosen_of, frame_of, limits
+from damian.show.views import LATE, ROWS, MapView, draw_messages, lateness, legend_marks
 
 DPI = 100
-WIDTH, HEIGHT = 7.2, 4.6
-"""Width of a film, and height of the map [inches]."""
+WIDTH, MAP, FLAT = 7.2, 4.6, 0.65
+"""Width of a film, longest side of its map [inches], and height over width of a map that is flat."""
 STEPS_PER_SECOND = 4
 """Steps that a film shows in a second."""
 LAST_STEPS = 6
 """Steps for whose time a film shows the last instant."""
-_STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5}
+_STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5, "lines.linewidth": 1.2}
 
 
 def save_film(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
@@ -60,8 +61,7 @@ def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> N
 class Film:
     """Draws the instants of an episode into one figure.
 
-    ``shown`` are the IDs of the UAVs to tell apart; if there are none, all of up to six, or three
-    of more.
+    ``shown`` are the IDs of the UAVs to tell apart; if there are none, all of up to six.
     """
 
     def __init__(self, episode: Episode, shown: Collection[str] = ()) -> None:
@@ -70,28 +70,44 @@ class Film:
         uavs = frame_of(episode, 0, self.chosen).uavs
         self.colours = {uav: uavs[uav].colour for uav in self.chosen}
         with matplotlib.rc_context(_STYLE):
-            rows = height_of_rows(len(self.chosen))
-            low = rows + 1.0
-            size = (WIDTH, round(rows + HEIGHT + 1.4, 1))
+            corner, end = limits(episode.region, episode.radius)
+            aspect = np.divide(*(end - corner)[::-1])
+            flat = aspect < FLAT  # then the charts have room below the map
+            wide = min(MAP, MAP / aspect)
+            rows = 0.3 + 0.15 * (max(episode.n_agents, 4) if episode.n_agents <= ROWS else 8)
+            low = rows + (2.4 if flat else 1.0)
+            high = max(wide * aspect, 2.2 if flat else 3.6)
+            left = 0.65 + wide + 0.4
+            size = (WIDTH, round(low + high + 0.4, 1))
             self.figure = Figure(figsize=size, dpi=DPI)
             FigureCanvasAgg(self.figure)
 
             def axes(*place: float) -> Any:
                 return self.figure.add_axes(tuple(np.divide(place, size * 2)))
 
-            self.view = MapView(axes(0.65, low, 4.5, HEIGHT), episode)
-            self.charts = [axes(5.55, low + up * HEIGHT, 1.45, 0.19 * HEIGHT) for up in (0.33, 0)]
+            self.view = MapView(axes(0.65, low, wide, high), episode)
+            self.charts = [
+                axes(*((at, rows + 1, 2.9, 0.7) if flat else (left, low + up, 7 - left, 0.7)))
+                for at, up in ((0.65, 1.3), (4.1, 0))
+            ]
             self.lanes = axes(0.65, 0.5, 6.35, rows)
-            top = (5.35 / size[0], (low + HEIGHT + 0.1) / size[1])
-            style = {
-                "loc": "upper left",
-                "bbox_to_anchor": top,
-                "frameon": False,
-                "labelspacing": 0.3,
-            }
-            self.figure.legend(handles=legend_marks(episode, len(self.chosen)), **style)
+            top = ((left - 0.15) / size[0], (low + high) / size[1])
+            legend = self.figure.legend(
+                handles=legend_marks(episode),
+                loc="upper left",
+                bbox_to_anchor=top,
+                frameon=False,
+                labelspacing=0.3,
+            )
             self._draw_charts()
             draw_messages(self.lanes, episode, self.colours)
+            self.figure.colorbar(
+                ScalarMappable(lateness(episode), LATE),
+                axes(left, legend.get_window_extent().y0 / DPI - 0.2, 1.4, 0.1),
+                orientation="horizontal",
+                label="late by, or age [s]",
+                ticks=MaxNLocator(4, integer=True),
+            )
         self._moving: list[Any] = []
 
     def draw(self, step: int) -> list[Any]:
@@ -123,25 +139,19 @@ class Film:
         used."""
         episode = self.episode
         used = not np.allclose(episode.battery, episode.battery[:1])
-        title, values = (
-            ("battery [%]", episode.battery) if used else ("age of information [s]", episode.age)
-        )
-        self.charts[0].plot(
-            episode.time, episode.reward.mean(-1).cumsum(), color=INK, linewidth=1.3
-        )
-        if len(self.chosen) < episode.n_agents:  # lines of many UAVs would hide each other
-            title = f"{title.replace(' of information', '')}, grey: all UAVs"
-            step = None if used else "post"
-            ends = (values.min(-1), values.max(-1))
-            self.charts[1].fill_between(episode.time, *ends, color="0.85", step=step, linewidth=0)
+        title = "battery [%]" if used else "age of information [s]"
+        values = episode.battery if used else episode.age
+        drawstyle = "default" if used else "steps-post"
+        self.charts[0].plot(episode.time, episode.reward.mean(-1).cumsum(), color=INK)
+        lines = self.charts[1].plot(episode.time, values, color="0.85", drawstyle=drawstyle)
+        if not self.colours:
+            self.charts[1].plot(episode.time, values.mean(-1), color=INK)
         for uav, colour in self.colours.items():
-            style = {"drawstyle": "default" if used else "steps-post", "linewidth": 1.2}
-            self.charts[1].plot(episode.time, values[:, uav], color=colour, **style)
+            lines[uav].set(color=colour, zorder=3)
         for axis, above in zip(self.charts, ("return so far", title), strict=True):
             axis.set_title(above, loc="left", fontsize=8.5)
             axis.margins(x=0)
-            axis.yaxis.set_major_locator(MaxNLocator(3))
-            axis.xaxis.set_major_locator(MaxNLocator(3))
+            axis.locator_params(nbins=3)
 
     def _now(self, time: float) -> list[Any]:
         """Mark a time in the charts, and cover what comes after it."""

@@ -9,11 +9,12 @@ import numpy as np
 from damian.common.plotting import COLOURS, UAV_COLOURS
 from damian.show.episode import LIKELY, Episode, Floats
 
-TRAIL, SOME = 8, 3
-"""Number of steps whose path is drawn behind a UAV, and of UAVs of many to tell apart if none is
-chosen."""
-INK, OTHER = "#222222", "#95928b"
-"""Colours of texts, and of the UAVs that are not told apart."""
+TRAIL, HOPS = 8, 3
+"""Number of steps whose path is drawn behind a UAV, and behind one that is at once where it flies."""
+INK = "#222222"
+"""Colour of texts, and of messages that are lost."""
+LATENESS = ("#a3b1bb", "#e08a00", "#7a0019")
+"""Colours of what is not late, late, and as late as it gets: the later, the darker."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class Uav:
 class Frame:
     """What is true at an instant, and what the server believes."""
 
+    step: int
     time: float
     """Time since the reset [s]."""
     uavs: list[Uav]
@@ -59,15 +61,14 @@ class Frame:
 
 
 def chosen_of(episode: Episode, shown: Collection[str] = ()) -> list[int]:
-    """Numbers of the UAVs that a picture tells apart: those with these IDs, else all of few, some
-    of many."""
+    """Numbers of the UAVs that a picture tells apart: those with these IDs, else all of few."""
     found = [uav for uav, name in enumerate(episode.ids) if name in shown]
-    return found or [*range(episode.n_agents if episode.n_agents <= len(COLOURS) else SOME)]
+    return found or [*range(episode.n_agents if episode.n_agents <= len(COLOURS) else 0)]
 
 
 def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None) -> Frame:
     """An episode after ``step`` steps, with the numbers of the UAVs to tell apart, or all."""
-    begin = max(step - TRAIL, 0)
+    begin = max(step - (HOPS if episode.instant else TRAIL), 0)
     rank = {
         uav: place
         for place, uav in enumerate(range(episode.n_agents) if chosen is None else chosen)
@@ -80,7 +81,7 @@ def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None)
         Uav(
             id=episode.ids[uav],
             chosen=uav in rank,
-            colour=UAV_COLOURS[rank[uav] % len(UAV_COLOURS)] if uav in rank else OTHER,
+            colour=UAV_COLOURS[rank.get(uav, 0) % len(UAV_COLOURS)],
             ink=UAV_COLOURS[len(COLOURS) + rank.get(uav, 0) % len(COLOURS)],
             edge=("white", INK)[rank.get(uav, 0) // len(UAV_COLOURS) % 2],
             path=episode.position[begin : step + 1, uav],
@@ -92,6 +93,7 @@ def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None)
         for uav in range(episode.n_agents)
     ]
     return Frame(
+        step=step,
         time=float(episode.time[step]),
         uavs=uavs,
         sources=[]
@@ -104,8 +106,9 @@ def frame_of(episode: Episode, step: int, chosen: Collection[int] | None = None)
     )
 
 
-def limits(episode: Episode) -> tuple[Floats, Floats]:
-    """Lower left and upper right corner of what a view shows, east and north [m]."""
-    west, south, east, north = episode.region.bounds
-    margin = max(0.06 * max(east - west, north - south), 0.5 * episode.radius)
+def limits(region: Any, radius: float) -> tuple[Floats, Floats]:
+    """Lower left and upper right corner of what a view of a region shows, with room for footprints,
+    east and north [m]."""
+    west, south, east, north = region.bounds
+    margin = max(0.06 * max(east - west, north - south), 0.5 * radius)
     return np.array([west, south]) - margin, np.array([east, north]) + margin

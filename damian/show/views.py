@@ -1,27 +1,33 @@
 """A map, into which films and figures draw the frames of an episode."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, cast
 
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgba
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
-from matplotlib.patches import Patch
+from matplotlib.patches import Circle, Patch, Polygon
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 
 from damian.show.episode import LIKELY, Episode, Floats
-from damian.show.frame import INK, OTHER, Frame, Uav, limits
+from damian.show.frame import INK, LATENESS, Frame, Uav, limits
 
 HEAT = LinearSegmentedColormap.from_list("belief", [(0.45, 0.2, 0.6, 0.0), (0.45, 0.2, 0.6, 0.75)])
 """Colours of the belief about the sources."""
 _NORM = LogNorm(LIKELY, 1.0)
+LATE = LinearSegmentedColormap.from_list("lateness", LATENESS)
+"""Colours of messages, and of what is known of a UAV, by how late they are."""
+COVERED = LinearSegmentedColormap.from_list("covered", [(0.3, 0.6, 0.5, 0.0), (0.3, 0.6, 0.5, 0.5)])
+"""Colours of the ground that footprints have covered, which fade to ``_FADED`` in ``_FADE`` steps."""
+_FADED, _FADE = 0.25, 4.0
+_CELLS = 250
+"""Cells of the covered ground along the longer side of a map."""
 _BLOWS = Path([[0.0, 1.0], [0.0, -1.0], [-0.4, -0.4], [0.0, -1.0], [0.4, -0.4]], [1, 2, 2, 1, 2])
 """Arrow of a wind from the north."""
 DART = Path([[0.0, 1.0], [0.62, -0.8], [0.0, -0.42], [-0.62, -0.8], [0.0, 1.0]])
@@ -33,10 +39,8 @@ _CHARGES: dict[str, Any] = {"marker": _BOLT, "color": "#b8860b", "markersize": 9
 """Mark of a place where UAVs charge."""
 _LAND, _EDGE, _POINT = "#f5f2ea", "#8a8474", "#cfc8b8"
 _ZONE = {"facecolor": "white", "edgecolor": _EDGE, "linewidth": 0.6, "hatch": "////"}
-_CORNERS = 48
-"""Corners of a footprint."""
-_SMALL = 8.0
-"""Size of the mark of one of many [points]."""
+ROWS = 20
+"""Largest number of UAVs with a row of messages each."""
 _HALO = [withStroke(linewidth=1.8, foreground="white")]
 _NAME: dict[str, Any] = {"fontsize": 7.5, "zorder": 8, "textcoords": "offset points"}
 _NAME |= {"path_effects": _HALO, "ha": "center", "va": "center"}
@@ -47,45 +51,56 @@ class MapView:
 
     def __init__(self, axis: Any, episode: Episode) -> None:
         self.axis = axis
-        self.radius = episode.radius
-        turns = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
-        self._circle = self.radius * np.stack([np.cos(turns), np.sin(turns)], -1)
-        lands = [shapely.get_coordinates(part.exterior) for part in _polygons(episode.region)]
-        self._areas(lands, facecolor=_LAND, edgecolor=_EDGE, linewidth=1.2, zorder=0)
-        self._areas(_zones(episode), zorder=0.6, **_ZONE)
-        axis.plot(*episode.landing_points.T, ".", color=_POINT, markersize=2, zorder=1)
+        self.episode = episode
+        self._late = lateness(episode)
+        corner, end = limits(episode.region, episode.radius)
+        size = max(end - corner) / _CELLS
+        self._grid = [np.arange(*ends, size) for ends in zip(corner, end, strict=True)]
+        self._inside = shapely.contains_xy(episode.region, *np.meshgrid(*self._grid))
+        self._covered_at = np.zeros(self._inside.shape)
+        self._step = np.inf
+        place = [end for row in self._grid for end in (row[0] - size / 2, row[-1] + size / 2)]
+        self._image = axis.imshow(
+            self._inside,
+            COVERED,
+            extent=place,
+            origin="lower",
+            interpolation="bilinear",
+            zorder=0.4,
+        )
+        draw_region(axis, episode.region, episode.landing_points, episode.radius)
         axis.plot(*_chargers(episode), linestyle="", **_CHARGES)
-        (west, south), (east, north) = limits(episode)
-        axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
-        axis.set(xlabel="east [m]", ylabel="north [m]")
-        axis.xaxis.set_major_locator(MaxNLocator(6))
-        axis.yaxis.set_major_locator(MaxNLocator(6))
+
+    def _cover(self, step: int) -> None:
+        """Draw the ground that has been covered up to a step, the latest strongest."""
+        if step < self._step:
+            self._covered_at[:] = -np.inf
+            self._step = -1
+        for instant in range(self._step + 1, step + 1):
+            for place in self.episode.true[instant]:
+                east, north = ((row - at) ** 2 for row, at in zip(self._grid, place, strict=True))
+                near = np.add.outer(north, east) <= self.episode.radius**2
+                self._covered_at[near & self._inside] = instant
+        self._step = step
+        fresh = np.exp((self._covered_at - step) / _FADE)
+        self._image.set_data(np.where(self._covered_at < 0, 0, _FADED + (1 - _FADED) * fresh))
 
     def draw(self, frame: Frame) -> list[Any]:
         """Draw a frame; returns the artists that were drawn."""
+        self._cover(frame.step)
         drawn: list[Any] = []
         heat = [(part, p) for area, p in frame.cells for part in _polygons(area)]
         if heat:
             corners = [shapely.get_coordinates(part.exterior) for part, _ in heat]
             colours = [HEAT(_NORM(probability)) for _, probability in heat]
-            drawn.append(self._areas(corners, facecolor=colours, edgecolor="none", zorder=0.5))
+            cells = PolyCollection(corners, facecolor=colours, edgecolor="none", zorder=0.5)
+            drawn.append(self.axis.add_collection(cells))
         for place in frame.requests:
             drawn += self._plot(place, "s", "none", INK, markersize=7)
         for place, emits in frame.sources:
             drawn += self._plot(place, "*", INK if emits else "white", INK, markersize=13)
-        others = [uav for uav in frame.uavs if not uav.chosen]
-        if others:  # small, and the denser their footprints, the darker
-            shades = [to_rgba(OTHER, 0.3 if uav.spots else 0.09) for uav in others]
-            drawn.append(
-                self._areas(list(map(self._print, others)), facecolor=shades, lw=0, zorder=1.5)
-            )
-            places = np.transpose([uav.path[-1, :2] for uav in others])
-            marks = self.axis.scatter(*places, s=_SMALL**2, color=OTHER, zorder=3.5)
-            turned = [Affine2D().rotate(-uav.heading).scale(0.5) for uav in others]
-            marks.set_paths([DART.transformed(each) for each in turned])
-            drawn.append(marks)
         for uav in frame.uavs:
-            drawn += self._uav(uav) if uav.chosen else []
+            drawn += self._uav(uav)
         return drawn + self._names(frame)
 
     def _plot(self, place: Floats, marker: str, fill: str, color: str, **style: Any) -> list[Any]:
@@ -93,90 +108,108 @@ class MapView:
         style = {"zorder": 6, **style}
         return self.axis.plot(*place, marker, color=color, markerfacecolor=fill, **style)
 
-    def _print(self, uav: Uav) -> Floats:
-        """Corners of a footprint, [C, 2]."""
-        return uav.path[-1, :2] + self._circle
-
     def _uav(self, uav: Uav) -> list[Any]:
-        """Draw a UAV with its path and footprint, as a dart that points where it flies, and a line
-        to where the server believes it to be."""
-        inside = to_rgba(uav.colour, 0.26 if uav.spots else 0.07)
-        edge = {"edgecolor": uav.colour, "linewidth": 1.6 if uav.spots else 0.5}
-        drawn = [self._areas([self._print(uav)], facecolor=inside, zorder=2, **edge)]
-        parts = list(np.stack([uav.path[:-1, :2], uav.path[1:, :2]], 1))
-        if parts:
-            fading = np.linspace(0.1, 0.7, len(parts))
-            trail = {"colors": uav.colour, "alpha": fading, "linewidths": 1.6, "zorder": 3}
-            drawn.append(self.axis.add_collection(LineCollection(parts, **trail)))
+        """Draw a UAV with its footprint, as a dart that points where it flies, and a line to where
+        the server believes it to be.
+
+        One that is told apart has a colour and a path; others are small, and the darker, the older
+        what the server knows of them is.
+        """
+        colour = uav.colour if uav.chosen else LATE(self._late(uav.age))
+        size = 1.0 if uav.chosen else 0.5
         true = uav.path[-1, :2]
-        dart = DART.transformed(Affine2D().rotate(-uav.heading))
-        style = {"markersize": 13, "markeredgecolor": uav.edge, "markeredgewidth": 0.6, "zorder": 5}
-        drawn += self.axis.plot(*true, marker=dart, color=uav.colour, **style)
+        footprint = Circle(
+            true,
+            self.episode.radius,
+            facecolor=to_rgba(colour, 0.26 if uav.spots else 0.07),
+            edgecolor=colour,
+            linewidth=1.6 * uav.spots or 0.5 * uav.chosen,
+            zorder=2,
+        )
+        drawn = [self.axis.add_patch(footprint)]
+        if uav.chosen:
+            drawn += self.axis.plot(*uav.path[:, :2].T, color=colour, alpha=0.45, lw=1.6, zorder=3)
+        drawn += self.axis.plot(
+            *true,
+            marker=DART.transformed(Affine2D().rotate(-uav.heading)),
+            color=colour,
+            markersize=5 + 8 * size,
+            markeredgecolor=uav.edge,
+            markeredgewidth=0.6 * size,
+            zorder=5,
+        )
         if uav.age > 0:
-            line = {"color": uav.colour, "linewidth": 1.1, "zorder": 3}
-            drawn += self.axis.plot(*np.stack([true, uav.believed]).T, ":", **line)
-            ring = {"markersize": 12, "markeredgewidth": 1.5, "zorder": 4}
-            drawn += self._plot(uav.believed, "o", "none", uav.colour, **ring)
+            way = np.stack([true, uav.believed]).T
+            drawn += self.axis.plot(
+                *way, ":" if uav.chosen else "-", color=colour, lw=size, zorder=3
+            )
+            ring = {"markersize": 12 * size, "markeredgewidth": 1.5 * size, "zorder": 4}
+            drawn += self._plot(uav.believed, "o", "none", colour, **ring)
         return drawn
 
     def _names(self, frame: Frame) -> list[Any]:
-        """Name UAVs and rings, each in a direction of its own: names at one place lie apart."""
+        """Name UAVs and rings on the sides away from the line between them; names at one place lie
+        apart."""
         uavs = [uav for uav in frame.uavs if uav.chosen]
         drawn: list[Any] = []
         for number, uav in enumerate(uavs):
+            true = uav.path[-1, :2]
+            east, north = true - uav.believed
+            apart = 2 * np.pi * (number + 0.2) / len(uavs)
+            turn = np.arctan2(north, east) if east or north else apart
             name = _short(uav.id)
-            ring = [(uav.believed, f"{name}, {uav.age:g} s")] if uav.age > 0 else []
-            for half, (place, text) in enumerate([(uav.path[-1, :2], name), *ring]):
-                turn = np.pi * (2 * (number + 0.2) / len(uavs) + half)
-                away = ((10 + 2.4 * len(text)) * np.cos(turn), 13 * np.sin(turn))
+            ring = [(uav.believed, f"{name}, {uav.age:g} s", turn + np.pi)] if uav.age > 0 else []
+            for place, text, to in [(true, name, turn), *ring]:
+                away = ((10 + 2.4 * len(text)) * np.cos(to), 13 * np.sin(to))
                 drawn.append(self.axis.annotate(text, place, away, color=uav.ink, **_NAME))
         return drawn
 
-    def _areas(self, corners: Sequence[Floats], **style: Any) -> Any:
-        return self.axis.add_collection(PolyCollection(corners, **style))
+
+def draw_region(axis: Any, region: Any, points: Floats, radius: float) -> None:
+    """Draw a region with its no-fly zones and landing points, and room for footprints."""
+    for part in _polygons(region):
+        axis.add_patch(Polygon(part.exterior.coords, fc=_LAND, ec=_EDGE, lw=1.2, zorder=0))
+        for hole in part.interiors:
+            axis.add_patch(Polygon(hole.coords, zorder=0.6, **_ZONE))
+    size = np.clip(40 / np.sqrt(max(len(points), 1)), 0.7, 2)
+    axis.plot(*points.T, ".", color=_POINT, markersize=size, zorder=1)
+    (west, south), (east, north) = limits(region, radius)
+    axis.set(xlim=(west, east), ylim=(south, north), aspect="equal", anchor="NW")
+    axis.set(xlabel="east [m]", ylabel="north [m]")
+    axis.locator_params(nbins=5)
 
 
 def draw_messages(axis: Axes, episode: Episode, colours: Mapping[int, str]) -> None:
-    """Draw a row for each of these UAVs, in its colour, with its messages over the time of
-    sending."""
-    dt = _step_of(episode)
-    for row, (uav, colour) in enumerate(colours.items()):
-        sent = np.flatnonzero(episode.sent[:, uav])
-        begin = episode.time[sent]
-        delay = episode.delay[sent, uav]
-        late = delay > 0
-        lost = delay < 0
-        at_once = begin[~lost & ~late]
-        ends = np.stack([begin, begin + np.maximum(delay, 0) * dt], -1)[late]
-        lines = [[(a, row), (b, row)] for a, b in ends]
-        axis.add_collection(LineCollection(lines, colors=colour, linewidths=2.2, alpha=0.55))
-        axis.plot(
-            at_once, np.full(len(at_once), row), ".", color=colour, markersize=3, clip_on=False
-        )
-        axis.plot(ends[:, 1], np.full(len(ends), row), ">", color=colour, markersize=3.5)
-        axis.plot(
-            begin[lost], np.full(lost.sum(), row), "x", color=INK, markersize=4.5, clip_on=False
-        )
-    size = min(8.0, 50 * height_of_rows(len(colours)) / len(colours))
-    axis.set_yticks(
-        range(len(colours)), [_short(episode.names[uav]) for uav in colours], fontsize=size
-    )
-    axis.spines["left"].set_visible(False)
-    axis.tick_params(left=False)
-    axis.set(ylim=(len(colours) - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
-    for label, uav in zip(axis.get_yticklabels(), colours, strict=True):
-        label.set_color(colours[uav])
-    axis.set_xlabel("messages over time [s]: dots arrive at once, bars are late, crosses are lost")
+    """Draw how late the messages of each step are: a row for each UAV, whose name has its colour,
+    or of many how many messages there are."""
+    scale = lateness(episode)
+    late = np.where(episode.lost, 2 * cast(float, scale.vmax), episode.delay * step_of(episode))
+    shown = np.where(episode.sent, late, np.nan).T
+    n_rows = episode.n_agents
+    if n_rows > ROWS:
+        shown = np.sort(shown, axis=0)  # a histogram of each step, in colours
+        axis.set_ylabel("messages")
+        axis.locator_params("y", nbins=3)
+    else:
+        axis.invert_yaxis()
+        axis.hlines(np.arange(1, n_rows), 0, episode.time[-1], "white", linewidth=2)
+        axis.set_yticks(np.arange(n_rows) + 0.5, [*map(_short, episode.names)])
+        for uav, label in enumerate(axis.get_yticklabels()):
+            label.set_color(colours.get(uav, INK))
+    edges = np.append(-step_of(episode), episode.time)
+    axis.pcolormesh(edges, range(n_rows + 1), shown, cmap=LATE.with_extremes(over=INK), norm=scale)
+    axis.set(xlim=(0, max(episode.time[-1], step_of(episode))))
+    axis.set_xlabel("messages over the time of sending [s]; black: lost")
 
 
-def height_of_rows(n_rows: int) -> float:
-    """Height of so many rows of messages [inches]."""
-    return 0.2 + 0.22 * min(n_rows, 8) + 0.14 * min(max(n_rows - 8, 0), 60)
+def lateness(episode: Episode) -> Normalize:
+    """The scale of the colours of what is late [s]: to the longest delay, else to the oldest."""
+    longest = episode.delay.max(initial=0) * step_of(episode) or episode.age.max(initial=0)
+    return Normalize(0, longest or 1.0)
 
 
-def legend_marks(episode: Episode, n_chosen: int | None = None) -> list[Any]:
-    """Entries of a legend that explains what a view draws, with so many UAVs told apart, or all."""
-    others = episode.n_agents - (n_chosen or episode.n_agents)
+def legend_marks(episode: Episode) -> list[Any]:
+    """Entries of a legend that explains what a view draws."""
     marks: list[Any] = [
         _mark("UAV, true", marker=DART, markersize=9),
         _mark(
@@ -186,12 +219,11 @@ def legend_marks(episode: Episode, n_chosen: int | None = None) -> list[Any]:
             markersize=9,
         ),
     ]
-    if others:
-        marks.insert(1, _mark(f"{others} other UAVs", color=OTHER, marker=DART, markersize=_SMALL))
+    marks.append(Patch(label="covered, the latest\nstrongest", fc=COVERED(0.7)))
     if episode.source is not None and episode.has_source:
         for does, style in (("emits", {}), ("silent", {"markerfacecolor": "white"})):
             marks.append(_mark(f"source, {does}", marker="*", color=INK, markersize=11, **style))
-    if _zones(episode):
+    if any(part.interiors for part in _polygons(episode.region)):
         marks.append(Patch(label="no-fly zone", **_ZONE))
     if _chargers(episode).size:
         marks.append(_mark("charging place", **_CHARGES))
@@ -218,13 +250,7 @@ def _polygons(area: Any) -> list[shapely.Polygon]:
     ]
 
 
-def _zones(episode: Episode) -> list[Floats]:
-    """Corners of the holes of the region, which are its no-fly zones, [C, 2] each."""
-    holes = [hole for part in _polygons(episode.region) for hole in part.interiors]
-    return [shapely.get_coordinates(hole) for hole in holes]
-
-
-def _step_of(episode: Episode) -> float:
+def step_of(episode: Episode) -> float:
     """Time between two instants [s]."""
     return float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
 

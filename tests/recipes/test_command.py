@@ -75,7 +75,10 @@ POLICIES = (
             ["train", "delay.obs={law: trace, path: damian:x.csv}"],
             f"delay.obs.path: damian:x.csv {FILES}",
         ),
-        (["train", "checkpoint=nowhere"], "checkpoint: nowhere holds no config.yaml"),
+        (
+            ["train", "checkpoint=nowhere"],
+            f"checkpoint: nowhere holds no config.yaml: damian:nowhere {POLICIES}",
+        ),
         (["fly", "policy=deterministic"], "policy: deterministic needs checkpoint"),
         (["fly", "agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
         (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from episodes import NO_SOURCE, UNKNOWN_SOURCE, crowd, flight
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_rgb, to_rgba
 from PIL import Image
 
 from damian.common.plotting import COLOURS
 from damian.show.film import Film, save_film
-from damian.show.frame import frame_of
+from damian.show.frame import INK, LATENESS, frame_of
 
 
 @pytest.mark.parametrize(
@@ -46,17 +46,60 @@ def shows(film, colour):
     return bool((np.abs(film.frame(0) / 255 - to_rgb(colour)).max(-1) < 0.02).any())
 
 
-@pytest.mark.parametrize(("shown", "told"), [((), ["0", "1", "2"]), (("17", "4"), ["4", "17"])])
-def test_of_many_uavs_only_those_to_tell_apart_have_names_colours_and_rows(shown, told):
+@pytest.mark.parametrize(("shown", "told"), [((), []), (("17", "4"), ["4", "17"])])
+def test_of_many_uavs_only_those_to_tell_apart_have_names_and_colours(shown, told):
     film = Film(crowd(), shown)
     assert [name.get_text() for name in named(film)] == told
-    assert [label.get_text() for label in film.lanes.get_yticklabels()] == [
-        f"UAV {name}" for name in told
-    ]
     colours = [shows(film, colour) for colour in COLOURS[:4]]
     assert colours == [number < len(told) for number in range(4)]
-    labels = [text.get_text() for text in film.figure.legends[0].get_texts()]
-    assert f"{20 - len(told)} other UAVs" in labels
+
+
+def colours_of_messages(film):
+    """The colours of the messages, [R, T + 1, 4], without the grey of those that were not sent."""
+    cells = film.lanes.collections[-1]
+    return cells.to_rgba(cells.get_array())
+
+
+@pytest.mark.parametrize("n_agents", [2, 40])
+def test_messages_are_as_dark_as_they_are_late_and_black_if_they_are_lost(n_agents):
+    delay = np.tile([[0], [2], [1], [-1]], n_agents)
+    few = flight(**_copies(n_agents) | {"delay": delay, "sent": delay > -2})
+    found = colours_of_messages(Film(few))
+    expected = [to_rgba(each) for each in (LATENESS[0], LATENESS[2], LATENESS[1], INK)]
+    np.testing.assert_allclose(found, np.tile([expected], (n_agents, 1, 1)), atol=0.01)
+
+
+def _copies(n_agents):
+    """Columns of so many UAVs, which all stand where the first of a flight does."""
+    columns = "position target battery believed track age reward spotted sent delay"
+    return {
+        name: np.repeat(getattr(flight(), name)[:, :1], n_agents, axis=1)
+        for name in columns.split()
+    }
+
+
+def test_rows_of_many_uavs_are_a_histogram_whose_latest_messages_are_on_top():
+    delay = np.random.default_rng(0).integers(0, 9, (4, 40))
+    film = Film(flight(**_copies(40) | {"delay": delay, "sent": delay >= 0}))
+    np.testing.assert_array_equal(film.lanes.collections[-1].get_array(), 2 * np.sort(delay).T)
+    assert film.lanes.get_ylabel() == "messages"
+
+
+def test_covered_ground_is_drawn_and_fades():
+    position = np.array([[[-100.0, 0, 0]], [[100.0, 0, 0]], [[100.0, 0, 0]], [[100.0, 0, 0]]])
+    film = Film(flight(**_copies(1) | {"position": position}))
+
+    def shade(step, east):
+        film.draw(step)
+        image = film.view.axis.images[0]
+        west, end = image.get_extent()[:2]
+        shades = image.get_array()
+        return shades[len(shades) // 2, int((east - west) / (end - west) * shades.shape[1])]
+
+    assert [shade(0, east) for east in (-100, 100)] == [1, 0]
+    left, right = (shade(3, east) for east in (-100, 100))
+    assert 0.25 < left < 0.8 < right == 1
+    assert [shade(0, east) for east in (-100, 100)] == [1, 0]  # back at the reset
 
 
 def test_uavs_have_their_colours_in_a_gif_too(tmp_path):
@@ -65,10 +108,10 @@ def test_uavs_have_their_colours_in_a_gif_too(tmp_path):
     cells = rng.uniform(-190, 190, (64, 2))
     belief = np.tile(10 ** rng.uniform(-4, -1, 64), (1, 1, 1))
     film = crowd(0, position=places[None], cells=cells, belief=belief)
-    save_film(film, tmp_path / "film.gif")
+    save_film(film, tmp_path / "film.gif", ["0", "1", "2"])
     with Image.open(tmp_path / "film.gif") as picture:
         shown = np.asarray(picture.convert("RGB"), int)
-        drawn = Film(film).frame(0)
+        drawn = Film(film, ["0", "1", "2"]).frame(0)
     for colour in COLOURS[:3]:
         found = (drawn == np.round(np.multiply(to_rgb(colour), 255))).all(-1)
         assert found.any()

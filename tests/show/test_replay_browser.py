@@ -18,6 +18,7 @@ from damian import compose_scenario, make_env
 from damian.baselines.random import random_policy
 from damian.envs.uav_env import EXTRAS
 from damian.show.episode import record
+from damian.show.frame import INK, LATENESS
 from damian.show.replay_page import save_page
 
 pytestmark = pytest.mark.browser
@@ -116,13 +117,14 @@ def opened(browser, tmp_path):
     """Open a page of episodes, and see that the browser has nothing to complain of."""
 
     @contextmanager
-    def open_page(episode):
+    def open_page(episode, keys=("HOME",)):
         save_page([episode], tmp_path / "page.html")
-        resize(browser, 1280)
+        resize(browser, 1280, 1600)
         browser.get((tmp_path / "page.html").as_uri())
         page = Page(browser)
         page.wait(lambda: page.run("return document.documentElement.dataset.ready"))
         page.settle()
+        page.press(*keys)
         yield page
         assert problems(browser) == []
 
@@ -171,7 +173,7 @@ def test_it_plays_pauses_and_ends_with_the_last_instant(opened):
         check_numbers(page, episode, LAST)
         assert page.shown("ended") == "ended"
         assert page.one("#transport .play").get_attribute("aria-label").startswith("play")
-        page.press(" ")
+        page.press(*["ARROW_DOWN"] * 5, " ")
         page.wait(lambda: page.time() < episode.time[-1])
 
 
@@ -277,17 +279,47 @@ def test_a_drag_shows_a_part_of_the_time_which_follows_the_present(opened):
             page.press("a")
 
 
-def test_rows_of_many_uavs_scroll_and_show_shares_of_a_long_time(opened):
-    with opened(
-        crowd(
-            300,
-            cells=np.array([[-9.0, 0], [9, 0]]),
-            belief=np.full((301, 1, 2), 0.5),
-        )
-    ) as page:
+PIXELS = """
+const c = document.querySelector(arguments[0]);
+const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+const wanted = arguments[1].match(/[0-9a-f]{2}/g).map((each) => Number.parseInt(each, 16));
+return new Uint32Array(d.buffer).reduce(
+  (sum, _, i) => sum + wanted.every((value, k) => Math.abs(d[4 * i + k] - value) < 3), 0)
+"""
+"""Number of pixels of a canvas that have a colour."""
+
+
+def test_rows_are_as_dark_as_messages_are_late_and_black_if_they_are_lost(opened):
+    for n_agents, height in ((2, 20), (40, 110)):
+        kinds = np.resize([[0, 0], [2, 2], [4, 4], [-1, -1]], (4, 2)).repeat(n_agents // 2, 1)
+        few = "position target battery believed track age reward spotted"
+        columns = {name: getattr(flight(), name).repeat(n_agents // 2, 1) for name in few.split()}
+        episode = flight(delay=kinds, sent=kinds > -2, **columns)
+        with opened(episode, ("END",)) as page:
+            found = [page.run(PIXELS, "canvas.lanes", each) for each in (*LATENESS[1:], INK)]
+            width = page.one("canvas.lanes").size["width"] / 3
+            assert min(found) > 0.5 * width * height * (n_agents == 2 or 0.8)
+            assert ("all UAVs" in page.one(".note").text) == (n_agents == 40)
+
+
+def test_a_page_opens_where_the_server_is_most_mistaken_with_both_maps(opened):
+    believed = np.tile([[-100.0, 100], [100, 100]], (4, 1, 1))
+    believed[1:3, 0, 0] = [-60, -20]
+    with opened(flight(believed=believed, age=np.ones((4, 2))), ()) as page:
+        assert (page.shown("time"), page.shown("mistaken")) == ("4 s", "believed places 40 m off")
+        maps = [page.one(f"canvas.{name}") for name in ("known", "map")]
+        assert [each.is_displayed() for each in maps] == [True, True]
+        assert maps[0].rect["x"] + maps[0].rect["width"] <= maps[1].rect["x"] + 1
+        before = page.map()
+        page.press("2")  # the believed ones are not on the map of what is true
+        assert page.map() == before
+        page.press("v")
+        assert [each.is_displayed() for each in maps] == [False, True]
+        page.press(" ")
+        page.wait(lambda: page.time() < 4)  # it plays from the start
+
+
+def test_a_belief_has_a_scale(opened):
+    belief = {"cells": np.array([[-9.0, 0], [9, 0]]), "belief": np.full((4, 1, 2), 0.5)}
+    with opened(flight(**belief)) as page:
         assert (page.shown("belief"), page.one(".scale").is_displayed()) == ("belief 1.0 bit", True)
-        notes = [page.one(".note").text, page.press("t") or page.one(".note").text]
-        assert ["more are late" in notes[0], "bars are late" in notes[1]] == [True, True]
-        page.all(".numbers tbody button")[-1].send_keys(" ")
-        page.settle()
-        assert page.run("return document.querySelector('.rows').scrollTop") > 0

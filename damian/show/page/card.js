@@ -29,14 +29,17 @@ export class Card {
     this.view = make(body, "div", "view");
     const [west, south, east, north] = episode.limits;
     this.view.style.setProperty("--aspect", Math.min(Math.max((east - west) / (north - south), 0.8), 2));
-    this.layers = ["map", "space", "marks"].map((name) => make(this.view, "canvas", name));
+    this.layers = ["map", "space", "marks", "known"].map((name) => make(this.view, "canvas", name));
+    for (const side of ["What the server believed", "What was true"]) make(this.view, "p", "side").textContent = side;
     const shown = episode.hasSource ? "UAVs and source" : "UAVs";
     const described = `where ${shown} are in ${episode.title}; the table below has the numbers`;
     for (const canvas of this.layers.slice(0, 2)) describe(canvas, described);
     this.layers[2].setAttribute("aria-hidden", "true");
+    describe(this.layers[3], `where the server believes the UAVs to be in ${episode.title}`);
     this.hint = make(this.view, "p", "hint");
     this.map = new MapView(this.layers[0], episode, likely, zoom);
-    listenToZoom(this.map, zoom, () => player.changed());
+    this.known = new MapView(this.layers[3], episode, likely, zoom, true);
+    for (const map of [this.map, this.known]) listenToZoom(map, zoom, () => player.changed());
     this.#followPointer();
     const messages = make(body, "div", "messages");
     const note = make(messages, "p", "note");
@@ -65,11 +68,19 @@ export class Card {
   /** Draw the time of the page. */
   draw({ layers, view }) {
     const now = this.episode.at(this.player.time);
-    this.view.dataset.view = view;
+    if (this.view.dataset.view !== view) {
+      this.view.dataset.view = this.element.dataset.view = view; // which moves the charts
+      this.resize();
+    }
     if (this.scale) this.scale.hidden = !layers.has("belief");
     if (this.chosen !== this.theme.chosen) this.#showRow();
     if (view === "3d") this.#space()?.draw(now, layers, this.theme);
-    else this.map.draw(now, layers, this.theme);
+    else if (view === "2d") this.map.draw(now, layers, this.theme);
+    else {
+      const without = (...names) => new Set([...layers].filter((name) => !names.includes(name)));
+      this.known.draw(now, without("truth", "messages"), this.theme);
+      this.map.draw(now, without("believed", "belief"), this.theme);
+    }
     this.lanes.draw(now, this.theme);
     for (const chart of this.charts) chart.draw(now);
     this.readout.draw(now, this.theme);
@@ -105,24 +116,25 @@ export class Card {
   #showRow() {
     this.chosen = this.theme.chosen;
     if (this.chosen !== null)
-      this.rows.scrollTop = (this.chosen + 0.5) * this.lanes.row - this.rows.clientHeight / 2;
+      this.rows.scrollTop = this.lanes.top(this.chosen) - this.rows.clientHeight / 2;
   }
 
   /** Say which UAV and which place is under the pointer; a click on a UAV or a ring chooses it. */
   #followPointer() {
     const at = (event) => {
-      const border = this.view.getBoundingClientRect();
+      const border = event.target.getBoundingClientRect();
       return [event.clientX - border.left, event.clientY - border.top];
     };
-    const view = () => (this.view.dataset.view === "3d" ? this.space : this.map);
+    const view = ({ target }) =>
+      this.view.dataset.view === "3d" ? this.space : target === this.known.canvas ? this.known : this.map;
     const uavAt = (event) => {
       const [x, y] = at(event);
       const far = (shown) => Math.hypot(shown.at[0] - x, shown.at[1] - y);
-      const nearest = (view()?.shown ?? []).toSorted((one, other) => far(one) - far(other))[0];
+      const nearest = (view(event)?.shown ?? []).toSorted((one, other) => far(one) - far(other))[0];
       return nearest && far(nearest) < REACH ? nearest.uav : null;
     };
     this.view.addEventListener("pointermove", (event) => {
-      const [place, uav] = [view()?.place(...at(event)), uavAt(event)];
+      const [place, uav] = [view(event)?.place(...at(event)), uavAt(event)];
       const name = uav === null ? "" : `${this.episode.names[uav]}: `;
       this.hint.textContent = place ? name + spoken(place, this.episode.origin) : "";
       this.view.classList.toggle("at-uav", uav !== null);

@@ -13,6 +13,9 @@ export const LAYERS = [
   ["belief", "■", "Belief"],
 ];
 
+/** The views, in the order in which the key V shows them. */
+const VIEWS = { beside: "Side by side", "2d": "2D", "3d": "3D" };
+
 /** Outlines of the buttons of the time, in a square of 16. */
 const ICONS = {
   play: "M4 2.5v11l9.5-5.5z",
@@ -25,7 +28,7 @@ const ICONS = {
 
 /**
  * What the tools set.
- * @typedef {{layers: Set<string>, view: "2d" | "3d"}} Settings
+ * @typedef {{layers: Set<string>, view: "beside" | "2d" | "3d"}} Settings
  */
 
 /** Buttons for the view and the layers. Returns functions by key. */
@@ -45,16 +48,17 @@ export function addTools(parent, settings, hasBelief, changed) {
     shown.push([made, isOn]);
     return made;
   };
-  for (const view of ["2d", "3d"]) {
+  for (const [view, text] of Object.entries(VIEWS)) {
     add(
       views,
-      view.toUpperCase(),
+      text,
       () => settings.view === view,
       () => (settings.view = view),
     ).dataset.view = view;
   }
   const toggle = (name) => settings.layers[settings.layers.has(name) ? "delete" : "add"](name);
-  const keys = { v: () => (settings.view = settings.view === "2d" ? "3d" : "2d") };
+  const names = Object.keys(VIEWS);
+  const keys = { v: () => (settings.view = names[(names.indexOf(settings.view) + 1) % names.length]) };
   LAYERS.forEach(([name, sign, text], i) => {
     const made = add(
       layers,

@@ -31,6 +31,7 @@ export class Episode {
     this.ids = this.position[0].map((_, uav) => String(ids?.[uav] ?? uav));
     this.names = this.ids.map((id) => (ids ? id : `UAV ${id}`));
     this.last = this.time.length - 1;
+    const mean = (row) => row.reduce((sum, each) => sum + each, 0) / row.length;
     this.end = this.time[this.last];
     this.dt = this.last ? this.time[1] - this.time[0] : 1;
     /** Outlines of the region: polygons, each a list of rings [[east, north], ...]. */
@@ -44,7 +45,15 @@ export class Episode {
     this.hasSource = this.source === null || this.source[0].length > 0;
     this.highest = this.position.flat().reduce((most, place) => Math.max(most, place[2]), 0);
     this.messages = this.#messages();
-    const mean = (row) => row.reduce((sum, each) => sum + each, 0) / row.length;
+    const longest = (rows) => rows.flat().reduce((most, each) => Math.max(most, each), 0);
+    /** The longest delay, else the highest age: the end of the scale of what is late [s]. */
+    this.longest = longest(this.delay) * this.dt || longest(this.age) || 1;
+    /** Mean distance between where UAVs are and where the server believes them to be, at each instant [m]. */
+    this.errors = this.believed.map((row, step) =>
+      mean(row.map(([east, north], uav) => Math.hypot(east - this.position[step][uav][0], north - this.position[step][uav][1]))),
+    );
+    /** The instant at which the server is most mistaken, the last one of several. */
+    this.worst = this.errors.findLastIndex((error) => error === Math.max(...this.errors));
     this.meanReward = this.reward.map(mean);
     this.meanAge = this.age.map(mean);
     const terms = Object.entries(this.reward_terms).map(([name, rows]) => [name, rows.map(mean)]);
@@ -70,6 +79,19 @@ export class Episode {
   /** Where a UAV is: east, north, up [m]. Between two instants it is drawn on the straight way. */
   place(uav, { step, share }) {
     return between(this.position, step, share, uav);
+  }
+
+  /** Places of which the server hears at each instant: [[[east, north], ...], ...]. */
+  get heard() {
+    const heard = this.time.map((_, step) => (step ? [] : this.believed[0]));
+    for (const { uav, step, lost } of this.messages)
+      if (!lost) heard[step + this.delay[step][uav]]?.push(this.position[step][uav]);
+    return heard;
+  }
+
+  /** How late is what the server knows of a UAV, as a share of the longest. */
+  late(uav, { step }) {
+    return this.age[step][uav] / this.longest;
   }
 
   /** Where a source is, if it is known: east, north [m]. */

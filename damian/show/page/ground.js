@@ -4,6 +4,8 @@ import { faint } from "page/theme";
 
 /** Colour of a cell in which the source surely is; others are fainter, on a logarithmic scale. */
 export const OPACITY = 0.75;
+/** Opacity of the ground that was ever covered, and of the latest footprints; how much of these fades in a step. */
+const [COVERED, FADE] = [[0.22, 0.4], 0.22];
 /** Mark of a charging place, as in films, in a square of 2. */
 const BOLT = new Path2D("M.2-1-.6 .15H-.05L-.2 1 .6-.15H.05Z");
 
@@ -11,17 +13,19 @@ const BOLT = new Path2D("M.2-1-.6 .15H-.05L-.2 1 .6-.15H.05Z");
 export class Ground {
   #painted = "";
   #covered = { key: "", step: -1 };
+  #masks = [0, 1].map(() => document.createElement("canvas"));
 
   /**
    * @param {import("page/episode").Episode} episode
    * @param {number} likely smallest probability of a cell worth showing
+   * @param {number[][][]} places whose footprints are covered at each instant
    */
-  constructor(episode, likely) {
+  constructor(episode, likely, places = episode.position) {
     this.episode = episode;
+    this.places = places;
     this.likely = likely;
     this.edge = episode.cells ? episode.cellEdge : 0;
     this.canvas = document.createElement("canvas");
-    this.mask = document.createElement("canvas");
   }
 
   /**
@@ -97,25 +101,35 @@ export class Ground {
     context.restore();
   }
 
-  /** Footprints at all instants so far; those that were painted before stay in the mask. */
+  /** Footprints at all instants so far, and again those of late, which fade; painted ones stay in the masks. */
   #coverage(context, frame, step, theme, place) {
     const key = place + theme.dark;
-    let mask = this.mask.getContext("2d");
+    let masks = this.#masks.map((mask) => mask.getContext("2d"));
     if (this.#covered.key !== key || this.#covered.step > step) {
-      mask = sized(this.mask, frame);
+      masks = this.#masks.map((mask) => sized(mask, frame));
       this.#covered = { key, step: -1 };
     }
-    mask.fillStyle = theme.covered;
     for (let instant = this.#covered.step + 1; instant <= step; instant++) {
-      for (const at of this.episode.position[instant]) {
+      masks[1].globalCompositeOperation = "destination-out";
+      masks[1].fillStyle = `rgb(0 0 0 / ${FADE})`;
+      masks[1].fillRect(0, 0, frame.width, frame.height);
+      masks[1].globalCompositeOperation = "source-over";
+      for (const mask of masks) {
+        mask.fillStyle = theme.covered;
         mask.beginPath();
-        mask.arc(...frame.pixel(at), this.episode.radius * frame.scale, 0, 2 * Math.PI);
+        for (const at of this.places[instant]) {
+          const [x, y] = frame.pixel(at);
+          mask.moveTo(x, y);
+          mask.arc(x, y, this.episode.radius * frame.scale, 0, 2 * Math.PI);
+        }
         mask.fill();
       }
     }
     this.#covered.step = step;
-    context.globalAlpha = 0.3;
-    context.drawImage(this.mask, 0, 0);
+    for (const [i, opacity] of COVERED.entries()) {
+      context.globalAlpha = opacity;
+      context.drawImage(this.#masks[i], 0, 0);
+    }
     context.globalAlpha = 1;
   }
 

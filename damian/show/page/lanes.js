@@ -1,19 +1,21 @@
-/** Messages over time: a row for each UAV. Dots arrive at once, bars are late, crosses are lost. */
+/** Messages over time, in the colours of how late they are: a row for each UAV; of many a histogram, and a row
+ * for the chosen one. */
 
 import { listenToDrag } from "page/brush";
 import { fitted } from "page/canvas";
 import { GUTTER, MARGIN } from "page/charts";
-import * as marks from "page/marks";
+import { plain } from "page/marks";
 import { faint } from "page/theme";
 
-/** Height of a row, and of one of many [px]. */
-const [ROW, LOW_ROW] = [20, 15];
-/** Largest number of steps whose messages are drawn one by one, and width of the spans of more [px]. */
-const [MOST, SPAN] = [200, 5];
+/** Height of a row, of one of many, and of the histogram of more than MANY UAVs [px]. */
+const [ROW, LOW_ROW, HISTOGRAM] = [20, 15, 110];
+const MANY = 20;
+/** Least width of a span whose messages have one colour [px]. */
+const SPAN = 4;
+/** Kinds of lateness in a histogram. */
+const KINDS = 9;
 /** Opacity of what is to come. */
 const PALE = 0.25;
-const MARKS = "Messages: dots arrive at once, bars are late, crosses are lost.";
-const SHARES = "Messages: the stronger the colour, the more are late; the higher the bar, the more are lost.";
 
 export class Lanes {
   /**
@@ -25,8 +27,9 @@ export class Lanes {
   constructor(canvas, note, episode, player) {
     Object.assign(this, { canvas, note, episode, player });
     this.picture = document.createElement("canvas");
-    this.row = episode.nAgents <= 8 ? ROW : LOW_ROW;
-    canvas.style.height = `${this.row * episode.nAgents + 8}px`;
+    this.many = episode.nAgents > MANY;
+    this.row = episode.nAgents <= 8 || this.many ? ROW : LOW_ROW;
+    canvas.style.height = `${8 + (this.many ? HISTOGRAM + ROW : this.row * episode.nAgents)}px`;
     const timeAt = (event) => {
       const [from, to] = player.shown;
       const share = (event.offsetX - GUTTER) / (canvas.clientWidth - GUTTER - MARGIN);
@@ -35,13 +38,18 @@ export class Lanes {
     listenToDrag(canvas, timeAt, player);
   }
 
+  /** Upper border of the row of a UAV [px]. */
+  top(uav) {
+    return 4 + (this.many ? HISTOGRAM : uav * this.row);
+  }
+
   /** Draw all messages; what is to come after a time is pale. */
   draw(now, theme) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (!width) return;
     const [from, to] = this.player.shown;
     const x = (time) => GUTTER + ((time - from) * (width - GUTTER - MARGIN)) / (to - from);
-    const y = (uav) => 4 + (uav + 0.5) * this.row;
+    const y = (uav) => this.top(uav) + this.row / 2;
     this.#paint(width, height, x, y, theme);
     const context = fitted(this.canvas, width, height);
     context.globalAlpha = PALE;
@@ -49,7 +57,7 @@ export class Lanes {
     context.globalAlpha = 1;
     context.save();
     context.beginPath();
-    context.rect(GUTTER - 6, 0, x(now.time) - GUTTER + 6 + (now.ended ? MARGIN : 2), height);
+    context.rect(GUTTER - 6, 0, x(now.time) - GUTTER + 6 + (now.ended ? MARGIN : 0.5), height);
     context.clip();
     context.clearRect(0, 0, width, height);
     context.drawImage(this.picture, 0, 0, width, height);
@@ -70,69 +78,72 @@ export class Lanes {
     const key = [width, height, devicePixelRatio, theme.dark, theme.chosen, from, to].join();
     if (key === this.painted) return;
     this.painted = key;
-    const many = to - from > MOST * this.episode.dt;
-    this.note.textContent = many ? SHARES : MARKS;
     const context = fitted(this.picture, width, height);
     context.save();
     context.beginPath();
     context.rect(GUTTER - 5, 0, width - GUTTER - MARGIN + 10, height);
     context.clip();
-    if (many) this.#shares(context, width - GUTTER - MARGIN, x, y, theme);
-    else {
-      const seen = this.episode.messages.filter(
-        (each) => each.sent <= to && !(each.arrives < from && each.sent < from),
-      );
-      for (const message of seen) this.#message(context, message, x, y, theme);
+    const span = Math.max(x(from + this.episode.dt) - GUTTER, SPAN);
+    const spans = new Map();
+    for (const message of this.episode.messages) {
+      const at = Math.floor((x(message.sent - this.episode.dt / 2) - GUTTER) / span);
+      if (at < 0 || at * span > width) continue;
+      const rows = spans.get(at) ?? spans.set(at, new Map()).get(at);
+      const late = message.lost ? -1 : (message.arrives - message.sent) / this.episode.longest;
+      rows.set(message.uav, [...(rows.get(message.uav) ?? []), late]);
+    }
+    for (const [at, rows] of spans) {
+      const left = GUTTER + at * span;
+      if (this.many) this.#stack(context, left, span, [...rows.values()].flat(), theme);
+      for (const [uav, late] of rows)
+        if (!this.many || uav === theme.chosen) this.#cell(context, left, span, this.top(uav), late, theme);
     }
     context.restore();
+    this.#explain(theme);
   }
 
-  /** The shares of messages that are late, and that are lost, in spans of the time. */
-  #shares(context, width, x, y, theme) {
-    const { nAgents, messages } = this.episode;
-    const spans = Math.ceil(width / SPAN);
-    const [sent, late, lost] = [0, 1, 2].map(() => new Uint32Array(nAgents * spans));
-    for (const message of messages) {
-      const span = Math.floor((x(message.sent) - GUTTER) / SPAN);
-      if (span < 0 || span >= spans) continue;
-      const at = message.uav * spans + span;
-      sent[at]++;
-      if (message.lost) lost[at]++;
-      else if (message.arrives > message.sent) late[at]++;
-    }
-    const height = this.row - 2;
-    for (let at = 0; at < sent.length; at++) {
-      if (!sent[at]) continue;
-      const uav = Math.floor(at / spans);
-      const [left, bottom] = [GUTTER + (at % spans) * SPAN, y(uav) + height / 2];
-      context.fillStyle = faint(theme.uav(uav), 0.1 + (0.9 * late[at]) / sent[at]);
-      context.fillRect(left, bottom - height, SPAN, height);
-      const black = (height * lost[at]) / sent[at];
-      context.fillStyle = theme.lost(uav);
-      context.fillRect(left, bottom - black, SPAN, black);
-    }
+  /** The messages of a UAV in a span: their mean lateness, and from below the share of lost ones. */
+  #cell(context, left, span, top, late, theme) {
+    const [heard, height] = [late.filter((each) => each >= 0), this.row - 2];
+    context.fillStyle = theme.lateness(heard.reduce((sum, each) => sum + each, 0) / (heard.length || 1));
+    context.fillRect(left, top + 1, span, height);
+    const black = height * (1 - heard.length / late.length);
+    context.fillStyle = theme.ink;
+    context.fillRect(left, top + 1 + height - black, span, black);
   }
 
-  #message(context, { uav, sent, arrives, lost }, x, y, theme) {
-    const [colour, height] = [theme.uav(uav), y(uav)];
-    const size = Math.min(this.row / 4.5, 4);
-    if (lost) {
-      marks.cross(context, [x(sent), height], theme.lost(uav), 0.8 * size);
-    } else if (arrives === sent) {
-      marks.dot(context, [x(sent), height], size / 2, colour);
-    } else {
-      context.fillStyle = faint(colour, 0.6);
-      const end = x(Math.min(arrives, this.player.end));
-      context.fillRect(x(sent), height - 0.375 * size, end - x(sent), Math.max(0.75 * size, 1));
-      if (arrives <= this.episode.end) marks.arrow(context, [x(arrives), height], size, colour);
-    }
+  /** The shares of the messages in a span by lateness, the latest above, lost ones on top. */
+  #stack(context, left, span, late, theme) {
+    const counts = new Array(KINDS + 1).fill(0);
+    for (const each of late) counts[each < 0 ? KINDS : Math.min(Math.round(each * (KINDS - 1)), KINDS - 1)]++;
+    let bottom = 4 + HISTOGRAM;
+    counts.forEach((count, kind) => {
+      const height = ((HISTOGRAM - 8) * count) / late.length;
+      context.fillStyle = kind === KINDS ? theme.ink : theme.lateness(kind / (KINDS - 1));
+      context.fillRect(left, (bottom -= height), span, height);
+    });
+  }
+
+  /** Say what the colours mean. */
+  #explain(theme) {
+    const bar = document.createElement("span");
+    bar.className = "lateness";
+    bar.style.background = `linear-gradient(to right, ${theme.lates.join(", ")})`;
+    const what = this.many ? "Messages of all UAVs, by lateness" : "Messages, by lateness";
+    const lost = this.episode.messages.some((each) => each.lost) ? "; black: lost" : "";
+    this.note.replaceChildren(`${what}: 0 `, bar, ` ${plain(this.episode.longest)} s${lost}`);
   }
 
   #names(context, y, theme) {
     context.font = "11px system-ui, sans-serif";
     context.textAlign = "right";
     context.textBaseline = "middle";
-    for (let uav = 0; uav < this.episode.nAgents; uav++) {
+    const named = this.many ? [theme.chosen].filter((uav) => uav !== null) : this.episode.ids.keys();
+    if (this.many) {
+      context.fillStyle = theme.muted;
+      context.fillText("all UAVs", GUTTER - 8, 4 + HISTOGRAM / 2, GUTTER - 10);
+    }
+    for (const uav of named) {
       context.fillStyle = theme.text(uav);
       context.fillText(this.episode.names[uav], GUTTER - 8, y(uav), GUTTER - 10);
     }

@@ -14,10 +14,13 @@ const largest = episodes.reduce((one, other) => (other.nAgents > one.nAgents ? o
 const theme = new Theme(replay.colours, largest.nAgents);
 const player = new Player(episodes);
 const zoom = new Zoom();
+const worst = ({ errors, worst: step }) => errors[step];
+const mistaken = episodes.reduce((one, other) => (worst(other) > worst(one) ? other : one));
+player.open(mistaken.time[mistaken.worst]);
 const hasBelief = episodes.some((episode) => episode.belief !== null);
 const settings = {
-  view: "2d",
-  layers: new Set(["truth", "believed", "messages", hasBelief ? "belief" : "covered"]),
+  view: episodes.length > 1 ? "2d" : "beside",
+  layers: new Set(["truth", "believed", hasBelief ? "belief" : "covered", ...(theme.many ? [] : ["messages"])]),
 };
 
 const parent = document.getElementById("episodes");

@@ -13,10 +13,11 @@ export class MapView {
    * @param {import("page/episode").Episode} episode
    * @param {number} likely see Ground
    * @param {import("page/zoom").Zoom} zoom
+   * @param {boolean} believed whether it shows only what the server believes
    */
-  constructor(canvas, episode, likely, zoom) {
-    Object.assign(this, { canvas, episode, zoom });
-    this.ground = new Ground(episode, likely);
+  constructor(canvas, episode, likely, zoom, believed = false) {
+    Object.assign(this, { canvas, episode, zoom, believed });
+    this.ground = new Ground(episode, likely, believed ? episode.heard : episode.position);
     this.places = new Map();
   }
 
@@ -31,7 +32,8 @@ export class MapView {
     this.ground.paint(pixels, now.step, layers, theme);
     context.drawImage(this.ground.canvas, 0, 0, width, height);
     this.frame = new Frame(limits, width, height);
-    if (layers.has("truth")) this.#footprintsAndTrails(context, now, theme);
+    if (layers.has(this.believed ? "believed" : "truth")) this.#footprints(context, now, theme);
+    if (layers.has("truth")) this.#trails(context, now, theme);
     const pixel = (place) => this.frame.pixel(place);
     const { episode, places } = this;
     this.shown = drawMarks({ context, episode, now, layers, theme, pixel, darts: true, rise: 0, places });
@@ -43,18 +45,24 @@ export class MapView {
     return this.frame?.place(x, y);
   }
 
-  #footprintsAndTrails(context, now, theme) {
+  #footprints(context, now, theme) {
     const { episode, frame } = this;
     for (let uav = 0; uav < episode.nAgents; uav++) {
-      const [colour, spotted] = [theme.uav(uav), episode.spotted[now.step][uav]];
+      const colour = theme.mark(uav, episode.late(uav, now));
+      const spotted = episode.spotted[now.step][uav] && !this.believed;
+      const at = this.believed ? episode.believed[now.step][uav] : episode.place(uav, now);
       context.beginPath();
-      context.arc(...frame.pixel(episode.place(uav, now)), episode.radius * frame.scale, 0, 2 * Math.PI);
+      context.arc(...frame.pixel(at), episode.radius * frame.scale, 0, 2 * Math.PI);
       context.fillStyle = faint(colour, spotted ? 0.26 : 0.07);
       context.strokeStyle = faint(colour, spotted ? 1 : theme.tells(uav) ? 0.6 : 0);
       context.lineWidth = spotted ? 2 : 0.8;
       context.fill();
       context.stroke();
     }
+  }
+
+  #trails(context, now, theme) {
+    const { episode, frame } = this;
     context.lineWidth = 2;
     context.lineCap = "round";
     for (const uav of episode.ids.keys()) {

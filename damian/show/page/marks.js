@@ -30,21 +30,21 @@ export function dart(context, [x, y], heading, colour, rim, size = 10) {
 }
 
 /** A ring where the server believes a UAV to be. */
-export function ghost(context, [x, y], colour) {
+export function ghost(context, [x, y], colour, size = 9) {
   context.strokeStyle = colour;
-  context.lineWidth = 2;
+  context.lineWidth = size / 4.5;
   context.beginPath();
-  context.arc(x, y, 9, 0, 2 * Math.PI);
+  context.arc(x, y, size, 0, 2 * Math.PI);
   context.stroke();
 }
 
-/** The dotted way from where a UAV is to where it is believed to be. */
-export function error(context, from, to, colour) {
+/** The way from where a UAV is to where it is believed to be: dotted, but one of many thin. */
+export function error(context, from, to, colour, dotted = true) {
   context.save();
-  context.setLineDash([1.5, 4]);
+  if (dotted) context.setLineDash([1.5, 4]);
   context.lineCap = "round";
   context.strokeStyle = colour;
-  context.lineWidth = 1.6;
+  context.lineWidth = dotted ? 1.6 : 1;
   context.beginPath();
   context.moveTo(...from);
   context.lineTo(...to);

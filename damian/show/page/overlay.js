@@ -44,22 +44,22 @@ export function drawMarks(scene) {
 
 /** A UAV, and its battery if it is used. */
 function drawUav({ context, episode, now, theme, pixel, darts }, uav) {
-  const [at, colour] = [pixel(episode.place(uav, now)), theme.uav(uav)];
+  const [at, colour] = [pixel(episode.place(uav, now)), theme.mark(uav, episode.late(uav, now))];
   const tells = theme.tells(uav);
-  if (darts) marks.dart(context, at, episode.heading(uav, now), colour, theme.rim(uav), tells ? 10 : 7);
+  if (darts) marks.dart(context, at, episode.heading(uav, now), colour, theme.rim(uav), tells ? 10 : 8);
   if (episode.usesBattery && tells) marks.battery(context, at, episode.battery[now.step][uav], colour, theme);
   return { uav, at, key: `dart ${uav}`, text: episode.ids[uav], colour: theme.text(uav) };
 }
 
 /** Where the server believes a UAV to be, if it differs in time from the truth or the truth is not shown. */
 function drawBelieved({ context, episode, now, layers, theme, pixel }, uav) {
-  const [age, colour] = [episode.age[now.step][uav], theme.uav(uav)];
+  const [age, colour] = [episode.age[now.step][uav], theme.mark(uav, episode.late(uav, now))];
   const at = pixel([...episode.believed[now.step][uav], 0]);
   if (layers.has("truth")) {
-    if (age === 0 || !theme.tells(uav)) return undefined;
-    marks.error(context, pixel(episode.place(uav, now)), at, colour);
+    if (age === 0) return undefined;
+    marks.error(context, pixel(episode.place(uav, now)), at, colour, theme.tells(uav));
   }
-  marks.ghost(context, at, colour);
+  marks.ghost(context, at, colour, theme.tells(uav) ? 9 : 5);
   const text = age > 0 ? `${episode.ids[uav]}, ${marks.plain(age)} s` : episode.ids[uav];
   return { uav, at, key: `ring ${uav}`, text, colour: theme.text(uav) };
 }

@@ -77,6 +77,11 @@ export class Player {
     this.changed();
   }
 
+  /** Open the page at a time [s]; playing begins at 0 nevertheless. */
+  open(time) {
+    this.time = this.opening = time;
+  }
+
   /** Go so many instants on, or back. */
   step(count) {
     this.playing = false;
@@ -88,7 +93,8 @@ export class Player {
 
   toggle() {
     this.playing = !this.playing;
-    if (this.playing && this.time >= this.end) this.time = 0;
+    if (this.playing && (this.time >= this.end || this.time === this.opening)) this.time = 0;
+    this.opening = null;
     this.#before = performance.now();
     this.changed();
   }

@@ -58,6 +58,7 @@ export class Readout {
       ["return", `return ${episode.returns[step].toFixed(2)}`],
       ["spots", episode.hasSource ? `${spots} of ${episode.nAgents} spot ${which} source` : ""],
       ["age", `mean age ${episode.meanAge[step].toFixed(1)} s`],
+      ["mistaken", `believed places ${Math.round(episode.errors[step])} m off`],
       ["wind", wind ? `wind ${arrow} ${wind[0].toFixed(1)} m/s from ${Math.round(wind[1])}°` : ""],
       ["belief", episode.belief ? `belief ${episode.entropy(step).toFixed(1)} bit` : ""],
       ["chosen", told.length ? `${episode.names[theme.chosen]}: ${told.join(", ")}` : ""],

@@ -5,6 +5,8 @@ const DARK = matchMedia("(prefers-color-scheme: dark)");
 const LIGHTER = 0.32;
 /** Share of paper that the colours of UAVs get while another one is chosen. */
 const DIM = 0.72;
+/** Colours of what is not late, late, and as late as it gets, as in films. */
+const LATENESS = ["#a3b1bb", "#e08a00", "#7a0019"];
 
 export class Theme {
   /** The UAV that the reader has chosen, whose colours alone are not dim; null if all are the same. */
@@ -45,6 +47,20 @@ export class Theme {
     return this.#dimmed(number, this.uavs[number % this.uavs.length]);
   }
 
+  /** Colour of its marks: of one of many, that of how late is what is known of it, a share of the longest. */
+  mark(number, late) {
+    if (this.tells(number)) return this.uav(number);
+    const colour = this.lateness(late);
+    return this.chosen === null ? colour : mixed(colour, this.paper, DIM);
+  }
+
+  /** Colour of a lateness, a share of the longest. */
+  lateness(share) {
+    const at = Math.min(Math.max(share, 0), 1) * (this.lates.length - 1);
+    const from = Math.min(Math.floor(at), this.lates.length - 2);
+    return mixed(this.lates[from], this.lates[from + 1], at - from);
+  }
+
   /** Colour of its texts: the darker one, on a dark screen the lighter one. */
   text(number) {
     return this.#dimmed(number, this.uavs[(this.dark ? 0 : this.few) + (number % this.few)]);
@@ -57,7 +73,7 @@ export class Theme {
 
   /** Colour of its mark's edge, which tells it from an earlier one of the same colour. */
   rim(number) {
-    if (!this.tells(number)) return this.other;
+    if (!this.tells(number)) return this.paper;
     return Math.floor(number / this.uavs.length) % 2 ? this.#dimmed(number, this.ink) : this.paper;
   }
 
@@ -95,7 +111,8 @@ export class Theme {
     }
     this.dark = DARK.matches;
     this.terms = [0, 1, 2, 3, 4, 5].map((number) => value(`term-${number}`));
-    this.uavs = this.colours.map((colour) => (this.dark ? mixed(colour, "#ffffff", LIGHTER) : colour));
+    const shown = (colour) => (this.dark ? mixed(colour, "#ffffff", LIGHTER) : colour);
+    [this.uavs, this.lates] = [this.colours, LATENESS].map((colours) => colours.map(shown));
   }
 }
 
