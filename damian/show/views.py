@@ -58,7 +58,7 @@ class MapView:
         self._grid = [np.arange(*ends, size) for ends in zip(corner, end, strict=True)]
         self._inside = shapely.contains_xy(episode.region, *np.meshgrid(*self._grid))
         self._covered_at = np.zeros(self._inside.shape)
-        self._step = np.inf
+        self._step = episode.n_steps + 1  # of the ground that is drawn
         place = [end for row in self._grid for end in (row[0] - size / 2, row[-1] + size / 2)]
         self._image = axis.imshow(
             self._inside,
@@ -103,7 +103,7 @@ class MapView:
             drawn += self._uav(uav)
         return drawn + self._names(frame)
 
-    def _plot(self, place: Floats, marker: str, fill: str, color: str, **style: Any) -> list[Any]:
+    def _plot(self, place: Floats, marker: str, fill: str, color: Any, **style: Any) -> list[Any]:
         """Mark a place on the ground, [2]."""
         style = {"zorder": 6, **style}
         return self.axis.plot(*place, marker, color=color, markerfacecolor=fill, **style)
@@ -119,7 +119,7 @@ class MapView:
         size = 1.0 if uav.chosen else 0.5
         true = uav.path[-1, :2]
         footprint = Circle(
-            true,
+            (true[0], true[1]),
             self.episode.radius,
             facecolor=to_rgba(colour, 0.26 if uav.spots else 0.07),
             edgecolor=colour,
