@@ -22,10 +22,7 @@ from damian.world.config import RegionConfig, SourceConfig
 def test_an_environment_reads_a_trace_once(tmp_path):
     delay = DelayConfig(
         obs=trace(tmp_path, 1, 2, 0),
-        act={
-            "law": "uniform",
-            "high": 2,
-        },
+        act="0..2",
         rew=1,
         history=2,
     )

@@ -3,7 +3,7 @@ learns."""
 
 import pytest
 import torch
-from helpers import FLYING, square, walking
+from helpers import FLYING, both_kinds, square, walking
 from torchrl.modules import set_recurrent_mode
 
 from damian import DelayConfig, keys
@@ -17,7 +17,7 @@ from damian.world.config import ActionConfig, MotionConfig
 
 NAME = "predictive_mappo:PredictiveMappoConfig"
 SMALL = MlpConfig(hidden=[16, 8])
-LATE = {"law": "uniform", "low": 0, "high": 3}
+LATE = "0..3"
 
 
 def build(example, kind="discrete", flights=False, act=0, **learner):
@@ -119,7 +119,7 @@ def test_targets_use_nothing_that_has_not_arrived_by_now(example):
     assert not before[2].all()
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@both_kinds
 def test_learning_to_predict_does_not_change_what_the_policy_has_done(example, kind):
     learner, env = build(example, kind)
     batch = collected(learner, env)

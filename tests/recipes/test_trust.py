@@ -154,6 +154,7 @@ def test_stored_words_are_only_shown_and_stored_settings_not_resolved(store, mon
     assert stored_config(Path("run"), "checkpoint").region.path == "${oc.env:SECRET}"
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("name", ["load", "export", "evaluate", "train", "resume"])
 @pytest.mark.parametrize(
     "linked", ["config.yaml", "checkpoint.pt", "replay", "replay/000000.pt", "export"]

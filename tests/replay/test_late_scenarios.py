@@ -21,7 +21,7 @@ from damian.world.config import ActionConfig, MotionConfig, RequestConfig, Sourc
 STEPS = 40
 WORLDS = 4
 LONGEST = 5
-LATE = {"law": "uniform", "low": 0, "high": LONGEST}
+LATE = f"0..{LONGEST}"
 SUMMED = {"reward_window": 3, "reward_discount": 0.7}
 ENDS = ["success", "done", "terminated", "truncated"]
 

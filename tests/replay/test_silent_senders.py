@@ -22,11 +22,7 @@ def truth(env, steps):
 
 def test_the_programs_learn_the_same_rewards_from_flights_in_any_order_of_arrival():
     delay = DelayConfig(
-        obs={
-            "law": "uniform",
-            "low": 0,
-            "high": 4,
-        },
+        obs="0..4",
         order="arrival",
     )
     motion = MotionConfig(kind="polynomial", max_speed=10.0, max_acceleration=2.0)
