@@ -76,7 +76,7 @@ def detection(env, place, ago=0.0, now=9.0):
     return td.set(("agents", "message"), held.pack())
 
 
-@pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
+@pytest.mark.parametrize("actions", [FINE, CONTINUOUS])
 def test_all_uavs_fly_to_the_latest_detection_and_the_uav_that_made_it_stays(actions):
     env = field(actions=actions)
     td = detection(env, [200.0, 200.0])

@@ -64,9 +64,7 @@ of 1e-5 degrees is 1.57 metres long."""
 
 
 @pytest.mark.parametrize("kind", FILES)
-@pytest.mark.parametrize(
-    "copied", [lambda s: s, deepcopy, replace], ids=["same", "deepcopy", "replace"]
-)
+@pytest.mark.parametrize("copied", [lambda s: s, deepcopy, replace])
 def test_a_file_that_was_rewritten_is_read_anew(tmp_path, kind, copied):
     (write, numbers, read), path = FILES[kind], tmp_path / "file.csv"
     told = {"delay": DelayConfig(obs={"law": "trace", "path": str(path)})}

@@ -103,7 +103,6 @@ class FalsifyMessage(Transform):
             "mean": 3,
         },
     ],
-    ids=["constant", "random"],
 )
 def test_a_message_has_no_effect_before_it_arrives(obs, order):
     scenario = everything(episode=KEEPS_GOING, delay=DelayConfig(obs=obs, order=order))

@@ -68,3 +68,18 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
 
 
 # Worlds and seeds.
+
+
+# Worlds and seeds.
+
+
+def test_a_seed_repeats_its_episodes_and_worlds_and_episodes_differ():
+    env = UavEnv(everything(), num_worlds=8)
+    starts = []
+    for seed in (7, 7, 8):
+        env.set_seed(seed)
+        starts.append(env.reset()["state"])
+    assert starts[0].equal(starts[1])
+    assert not starts[0].equal(starts[2])
+    assert len(starts[0].unique(dim=0)) > 3
+    assert not starts[2].equal(env.reset()["state"])

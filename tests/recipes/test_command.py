@@ -46,10 +46,6 @@ def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
 
 
 FILES = "is not one of damian:fir.csv, damian:queue_trace.csv"
-POLICIES = (
-    "is not one of damian:convoy, damian:crowded-any-delay, damian:flights, damian:requests, "
-    "damian:tracking"
-)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +68,6 @@ POLICIES = (
         (["train", "checkpoint=nowhere"], "checkpoint: nowhere holds no config.yaml"),
         (["fly", "policy=deterministic"], "policy: deterministic needs checkpoint"),
         (["fly", "agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
-        (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
         (
             ["train", "resume=nowhere", "agents=4"],
             "agents=4: a resumed run keeps its configuration",

@@ -119,20 +119,9 @@ def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
         damian.load(trained.parent / "nowhere")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (
-            ["model.hidden=[8]"],
-            "model.hidden: the policy was trained with [16], so it cannot fly with [8]",
-        ),
-        (["actions=continuous"], "actions.kind: the policy was trained with 'discrete'"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
-    fly, capsys, tmp_path, overrides, message
-):
-    check_refused(lambda: fly(*overrides), message, capsys)
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path):
+    message = "actions.kind: the policy was trained with 'discrete'"
+    check_refused(lambda: fly("actions=continuous"), message, capsys)
     assert [*tmp_path.glob("*/*")] == []
 
 

@@ -29,7 +29,6 @@ OWN = ["model.shared=false", "source.count=2", "observation.belief=[belief_momen
         HISTORY,
         *(pytest.param(words, marks=pytest.mark.slow) for words in (GRU, CONTINUOUS, BELIEF, OWN)),
     ],
-    ids=["history", "gru", "continuous", "belief", "own"],
 )
 def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path, monkeypatch):
     main(["train", *TRAINED, *words, f"hydra.run.dir={tmp_path / 'run'}"])

@@ -25,7 +25,7 @@ TINY = [*SMALLEST_TRAINING, "logger=csv", "agents=1"]
 
 
 @pytest.fixture
-def sweep(tmp_path, monkeypatch):
+def sweep(tmp_path, monkeypatch, few_figures):
     """Sweep in an empty folder; returns the exit code."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [])

@@ -166,7 +166,7 @@ def test_the_use_case_scenarios_have_the_settings_of_the_reference_data(case):
         assert getattr(config.episode, key) == getattr(golden.episode, key)
 
 
-@pytest.mark.parametrize("overrides", [["delay.obs=2", "aware=belief"], SAC], ids=["belief", "sac"])
+@pytest.mark.parametrize("overrides", [["delay.obs=2", "aware=belief"], SAC])
 def test_the_untrained_actor_of_an_evaluation_is_that_of_the_training_before_its_first_update(
     overrides, tmp_path, monkeypatch
 ):

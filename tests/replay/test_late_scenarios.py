@@ -127,9 +127,11 @@ FLYING = {
     "late messages",
     "late messages, slow server",
     "late and summed rewards",
+    "order of arrival",
     "slow agents, history",
 }
-"""Cases with real flights; in the others UAVs move at once."""
+"""Cases with real flights, in which a UAV is silent for longer than any message takes; in the others
+UAVs move at once."""
 
 
 @pytest.mark.sample(3)
