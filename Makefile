@@ -17,8 +17,9 @@ train: $(VENV)/base
 	  frames=1000000 hydra.run.dir=$(RUN) $(ARGS)
 	$(VENV)/bin/damian evaluate checkpoint=$(RUN) delay.obs=2 # which it was not trained for
 
+# Each of the two takes half of the tests, and of the other's rest when it is done: what a module shares is made once.
 test: $(VENV)/test
-	$(PY) -m pytest -n 2 $(ARGS)
+	$(PY) -m pytest -n 2 --dist worksteal $(ARGS)
 
 # Every test must pass alone and in any order: twice in a random order, then each module by itself.
 test-order: $(VENV)/test
@@ -159,14 +160,17 @@ format: $(VENV)/dev
 	$(VENV)/bin/ruff check --fix .
 
 # An unpinned torch would bring gigabytes of CUDA along.
-$(VENV)/base: pyproject.toml
+$(PY):
 	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/base: pyproject.toml | $(PY)
 	$(PIP) -e . "$(TORCH)"
 	touch $@
 
-$(VENV)/test: $(VENV)/base
+# All at once: each installation of ours builds it anew.
+$(VENV)/test: pyproject.toml | $(PY)
 	$(PIP) -e ".[test]" "$(TORCH)"
-	touch $@
+	touch $(VENV)/base $@
 
 $(VENV)/slow: $(VENV)/test
 	$(PIP) -e ".[slow]" "$(TORCH)"
@@ -176,9 +180,9 @@ $(VENV)/docs: $(VENV)/base
 	$(PIP) -e ".[docs]" "$(TORCH)"
 	touch $@
 
-$(VENV)/dev: $(VENV)/base
+$(VENV)/dev: pyproject.toml | $(PY)
 	$(PIP) -e ".[test,dev]" "$(TORCH)"
-	touch $(VENV)/test $@
+	touch $(VENV)/base $(VENV)/test $@
 
 $(VENV)/package: $(VENV)/base
 	$(PIP) build twine

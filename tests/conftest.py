@@ -11,6 +11,7 @@ from zlib import crc32
 
 import pytest
 import torch
+from hydra._internal.hydra import Hydra
 from hypothesis import settings
 
 from damian.common.atomic_files import write_atomically
@@ -18,6 +19,9 @@ from damian.common.plotting import save_figure
 
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # for learning, and for the programs that tests start
+
+# Hydra composes a whole configuration only to see whether it sets hydra.mode, as none of ours does.
+Hydra.get_mode = lambda *_, **__: None
 
 settings.register_profile("same", derandomize=True, deadline=None, max_examples=50)
 settings.register_profile("deep", deadline=None, max_examples=3000, print_blob=True)

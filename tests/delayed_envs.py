@@ -39,7 +39,7 @@ DELAYS = {
     "slow clocks": {
         "delay": DelayConfig(
             obs=PAPER,
-            act={"law": "uniform", "high": 2},
+            act="0..2",
             history=2,
         ),
         "clock": ClockConfig(agents="2s", server="4s"),

@@ -136,28 +136,16 @@ def server_inputs(case, records):
     flags = [[i in m.after["server"]["spotting_ids"] for i in ids] for m in records]
     number = torch.tensor([m.number for m in records])
     motions = torch.tensor([m.motions for m in records]) + 1
-    messages = Messages(
+    blank = Messages.blank(torch.zeros(*zeros.shape, 2, dtype=torch.long))
+    messages = blank._replace(
         time=zeros + number[:, None],
         position=place,
         target=place,
-        track=zeros,
         battery=zeros + 100,
         spotted=torch.tensor(flags),
-        empty=torch.zeros_like(place[..., 0], dtype=torch.bool),
         motions=motions,
         detected_time=(zeros + detected[:, None])[..., None],
         detected_position=(zeros[..., None] + estimate[:, None])[..., None, :],
-        true_time=place.new_zeros(*place.shape[:-1], 0),
-        true_position=place.new_zeros(*place.shape[:-1], 0, 2),
-        requests=place.new_zeros(*place.shape[:-1], 0, 3),
-        served=place.new_zeros(*place.shape[:-1], 0),
-        serves=place.new_zeros(*place.shape[:-1], 0),
-        executed=place.new_zeros(*place.shape[:-1], 0),
-        announced=place.new_zeros(*place.shape[:-1], 0, 4),
-        trail=torch.zeros(*zeros.shape, 2, dtype=torch.long),
-        landed=torch.zeros(*zeros.shape, 2),
-        events=torch.zeros(*zeros.shape, 2, 0),
-        readings=torch.zeros(*zeros.shape, 0),
     )
     server = ServerContext(
         now=number.float(),

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import everything, sent_messages, walking
+from helpers import both_kinds, both_motions, everything, sent_messages, walking
 
 from damian import DelayConfig, ScenarioConfig, keys, make_env
 from damian.baselines.random import random_policy
@@ -76,7 +76,7 @@ def detection(env, place, ago=0.0, now=9.0):
     return td.set(("agents", "message"), held.pack())
 
 
-@pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
+@pytest.mark.parametrize("actions", [FINE, CONTINUOUS])
 def test_all_uavs_fly_to_the_latest_detection_and_the_uav_that_made_it_stays(actions):
     env = field(actions=actions)
     td = detection(env, [200.0, 200.0])
@@ -212,11 +212,12 @@ def distances(some, others):
     return torch.linalg.vector_norm(some.unsqueeze(1) - others, dim=-1)
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
+@pytest.mark.sample(2)
+@both_kinds
+@both_motions
 @pytest.mark.parametrize("obs", [0, 2])
 def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_other_worlds(
-    kind, motion, obs
+    motion, kind, obs
 ):
     env = make_env(everything(motion, kind, delay=DelayConfig(obs=obs)), 16, extras=["message"])
     policy = script_policy(env)

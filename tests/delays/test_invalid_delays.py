@@ -68,7 +68,7 @@ def test_an_invalid_trace_raises_one_line_that_names_the_file_and_the_line(tmp_p
     assert str(caught.value).startswith(f"{file}: {error}")
 
 
-@pytest.mark.parametrize("user", [Lag, lambda law: Burst(bad=law)], ids=["lag", "burst"])
+@pytest.mark.parametrize("user", [Lag, lambda law: Burst(bad=law)])
 def test_a_law_with_memory_or_context_is_refused_as_an_inner_law(user, tmp_path):
     for law in (trace(tmp_path, 1, 2), Lag(Uniform(1, 5)), Crowd()):
         with pytest.raises(InputError, match="is not a memoryless law"):

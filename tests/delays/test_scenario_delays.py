@@ -22,10 +22,7 @@ from damian.world.config import RegionConfig, SourceConfig
 def test_an_environment_reads_a_trace_once(tmp_path):
     delay = DelayConfig(
         obs=trace(tmp_path, 1, 2, 0),
-        act={
-            "law": "uniform",
-            "high": 2,
-        },
+        act="0..2",
         rew=1,
         history=2,
     )
@@ -67,9 +64,7 @@ of 1e-5 degrees is 1.57 metres long."""
 
 
 @pytest.mark.parametrize("kind", FILES)
-@pytest.mark.parametrize(
-    "copied", [lambda s: s, deepcopy, replace], ids=["same", "deepcopy", "replace"]
-)
+@pytest.mark.parametrize("copied", [lambda s: s, deepcopy, replace])
 def test_a_file_that_was_rewritten_is_read_anew(tmp_path, kind, copied):
     (write, numbers, read), path = FILES[kind], tmp_path / "file.csv"
     told = {"delay": DelayConfig(obs={"law": "trace", "path": str(path)})}

@@ -217,6 +217,7 @@ def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sen
                 ]
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("loss", "sent_key", "hold"), [(0.0, None, False), (0.25, "ready", False), (0.25, None, True)]
 )

@@ -58,7 +58,7 @@ def test_without_any_delay_there_are_no_transforms():
 # Specs and TorchRL's rules.
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @every_delay
 @both_kinds
 @both_motions
@@ -103,7 +103,6 @@ class FalsifyMessage(Transform):
             "mean": 3,
         },
     ],
-    ids=["constant", "random"],
 )
 def test_a_message_has_no_effect_before_it_arrives(obs, order):
     scenario = everything(episode=KEEPS_GOING, delay=DelayConfig(obs=obs, order=order))
@@ -193,7 +192,7 @@ ROUTES["links"] = {
 }
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(4)
 @both_motions
 @both_kinds
 @pytest.mark.parametrize("route", ROUTES)

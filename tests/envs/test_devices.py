@@ -22,11 +22,11 @@ LATE = DelayConfig(
         "law": "geometric",
         "mean": 2,
     },
-    rew={"law": "uniform", "low": 0, "high": 30},
+    rew="0..30",
 )
 LAG = {
     "law": "lag",
-    "lag": {"law": "uniform", "low": 0, "high": 3},
+    "lag": "0..3",
     "update_period": 2,
 }
 LINKS = {
@@ -213,7 +213,7 @@ def test_steps_replayed_as_a_graph_equal_steps(name, no_data, monkeypatch):
     plain = delayed(SCENARIOS[name])
     env = delayed(SCENARIOS[name])
     object.__setattr__(env, "_compiled", compiling.CompiledMethods({}, cuda_graph=True))
-    assert all_same(play(plain, choices(plain, 30)), play(env, choices(plain, 30)))
+    assert all_same(play(plain, choices(plain, 12)), play(env, choices(plain, 12)))
     assert any(function._calls > 3 for function in env._compiled._graphs.values())
 
 

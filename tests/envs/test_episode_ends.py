@@ -1,16 +1,11 @@
 """Ends of episodes (paper, section 4.1), batteries, and the end of the source."""
 
-import copy
-import itertools
-import math
-
 import pytest
 import torch
-from helpers import MOTIONS, act, both_motions, clock, fresh, one_uav, sent_messages, walking
+from helpers import MOTIONS, act, both_motions, fresh, one_uav, sent_messages, walking
 
 from damian.server.config import EpisodeConfig, RewardConfig
-from damian.world.battery import BatteryConfig, charge_gain, flight_drain
-from damian.world.config import MotionConfig
+from damian.world.battery import BatteryConfig, charge_gain
 
 FAR = [[390.0, 10.0]]
 HERE, EAST = [[0.0, 0.0]], [[1.0, 0.25]]
@@ -82,47 +77,6 @@ def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_co
 
 
 # Batteries.
-
-
-def test_the_battery_drain_of_a_flight_does_not_depend_on_the_length_of_a_step():
-    drained = []
-    cost = None
-    for period in ("1s", "0.5s", "0.25s"):
-        battery = BatteryConfig(enabled=True, capacity_kwh=0.1, charging_points=FAR)
-        env = fresh(
-            one_uav(battery=battery, motion=MotionConfig("polynomial"), clock=clock(period))
-        )
-        go(env, EAST)
-        origin, goal = (env.simulation.points[p.item()] for p in (env.state.origin, env.state.goal))
-        length = torch.linalg.vector_norm(goal - origin)
-        cost = flight_drain(env.state.vertical[0, 0], length, battery).item()
-        duration = (2 * env.state.vertical + env.state.cruise).item()
-        levels = [env.state.battery.item()]
-        while not env.simulation.vehicles.on_ground(env.state).all():
-            go(env, HERE)
-            levels.append(env.state.battery.item())
-        assert all(a >= b for a, b in itertools.pairwise(levels))
-        assert len(levels) == math.ceil(duration / env.simulation.dt)
-        go(env, HERE)
-        drained.append(100 - env.state.battery.item())
-    assert cost > 1
-    assert drained == pytest.approx([cost] * 3, abs=1e-3)
-
-
-@both_motions
-def test_a_uav_does_not_fly_to_a_landing_point_beyond_the_reach_of_its_battery(motion):
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.5, charging_points=FAR)
-    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion]))
-    start = copy.deepcopy(env.state)
-    go(env, EAST)
-    length = torch.linalg.vector_norm(
-        env.simulation.points[env.state.goal.item()] - env.simulation.points[start.goal.item()]
-    )
-    cost = flight_drain(env.simulation.vehicles.vertical(env.state)[0], length, battery)
-    for factor, flies in ((0.99, False), (1.01, True)):
-        env.state = start._replace(battery=factor * cost.view(1, 1))
-        go(env, EAST)
-        assert bool((env.state.goal != start.goal).item()) == flies
 
 
 def test_uavs_charge_only_at_charging_points():

@@ -11,7 +11,7 @@ from damian.envs.forward import assumed_policy
 from damian.models.actor import make_actor
 from damian.models.config import SetsConfig
 
-WORLDS, STEPS = 4, 16
+WORLDS, STEPS = 3, 12
 LATE = ["observation.own=true", "observation.forward=script"]
 CROWDED = "scenario=delaybench/crowded"
 CHARGING = f"{CROWDED} motion=polynomial battery=charging battery.capacity_kwh=0.02"
@@ -37,7 +37,7 @@ def same(one, other, *entries):
     ("scenario", "delay"),
     [
         (f"{CROWDED} aware=timeline", "delay.obs=1..4"),
-        (CROWDED, "delay.obs=3 delay.loss=0.2 observation.forward_steps=12"),
+        (CROWDED, "delay.obs=3 delay.loss=0.2 observation.forward_steps=8"),
         (CHARGING, "delay.obs=1..4"),
     ],
 )

@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 from damian import ObservationDelay, keys, make_env
 from damian.delays.config import DelayConfig, LinkConfig
 
-LATE = {"law": "uniform", "low": 1, "high": 4}
+LATE = "1..4"
 EXTRAS = ["message", "reward_terms"]
 
 

@@ -77,7 +77,7 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
 # Clocks.
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     "act",
     [
@@ -88,7 +88,6 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
             "mean": 2,
         },
     ],
-    ids=["none", "2", "random"],
 )
 @pytest.mark.parametrize(
     ("motion", "agents"), [("instant", "3s"), ("polynomial", "1s"), ("polynomial", "3s")]

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import both_motions, everything, play, random_actions
+from helpers import both_kinds, both_motions, everything, play, random_actions
 from sensor_cases import GLOBAL, LOCAL, SENSORS
 from torchrl.envs.utils import check_env_specs
 
@@ -50,7 +50,7 @@ def test_a_reward_term_reads_features_of_any_width_and_range(motion):
         {"delay": DelayConfig(obs=2, history=1), "own": True},
     ],
 )
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@both_kinds
 def test_the_specs_have_the_range_of_every_feature(kind, changed):
     scenario = sensing(**changed)
     scenario.actions.kind = kind

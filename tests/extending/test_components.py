@@ -35,7 +35,7 @@ SENSOR = "sensors=[{sensor: sensor:wind, strength: 3}]"
 
 
 def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
-    first = run(
+    folder = run(
         *TINY,
         *REWARDS,
         *LAW,
@@ -46,19 +46,15 @@ def test_components_of_ones_own_are_trained_with_logged_and_evaluated(run):
         METRIC,
         "aware=backupdate+history",
     )
-    second = run(
-        f"checkpoint={first}", "seed=1", "trust=true", program="evaluate", name="evaluated"
-    )
-    tables = [read_results(folder / "result.csv") for folder in (first, second)]
-    assert all(table["metric:apart"].between(0, 1).all() for table in tables)
-    assert "metric:apart" in (first / "result.md").read_text()
-    with (first / "metrics.csv").open(newline="") as file:
+    assert read_results(folder / "result.csv")["metric:apart"].between(0, 1).all()
+    assert "metric:apart" in (folder / "result.md").read_text()
+    with (folder / "metrics.csv").open(newline="") as file:
         last = list(csv.DictReader(file))[-1]
     assert {"reward/low_battery", "reward/together", "reward/battery"} <= last.keys()
     assert float(last["reward/together"]) > 0
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

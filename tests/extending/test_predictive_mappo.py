@@ -1,9 +1,8 @@
 """The learnt belief: its attention and loss beside slow twins, what it may know, and that it
 learns."""
 
-import pytest
 import torch
-from helpers import FLYING, square, walking
+from helpers import both_kinds, square, walking
 from torchrl.modules import set_recurrent_mode
 
 from damian import DelayConfig, keys
@@ -13,28 +12,30 @@ from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
 from damian.runs.config import LoggerConfig
 from damian.server.config import EpisodeConfig
-from damian.world.config import ActionConfig, MotionConfig
+from damian.world.config import ActionConfig
 
-NAME = "predictive_mappo:PredictiveMappoConfig"
 SMALL = MlpConfig(hidden=[16, 8])
-LATE = {"law": "uniform", "low": 0, "high": 3}
 
 
-def build(example, kind="discrete", flights=False, act=0, **learner):
+def build(example, kind="discrete"):
     """A learner of few prediction steps, and an environment whose messages are up to 3 steps late
     or lost."""
-    few = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
     scenario = square(
         source=walking(),
         actions=ActionConfig(kind=kind),
-        delay=DelayConfig(obs=LATE, act=act, loss=0.1, messages=4),
-        motion=FLYING if flights else MotionConfig(),
+        delay=DelayConfig(obs="0..3", loss=0.1, messages=4),
         episode=EpisodeConfig(max_steps=7),
     )
     config = TrainConfig(
         **vars(scenario),
         learner=example.PredictiveMappoConfig(
-            name=NAME, steps=12, epochs=1, minibatches=2, **(few | learner)
+            name="predictive_mappo:PredictiveMappoConfig",
+            steps=12,
+            epochs=1,
+            minibatches=2,
+            prediction_steps=2,
+            prediction_batch=16,
+            prediction_buffer=200,
         ),
         model=SMALL,
         logger=LoggerConfig(tensorboard=False),
@@ -119,7 +120,7 @@ def test_targets_use_nothing_that_has_not_arrived_by_now(example):
     assert not before[2].all()
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@both_kinds
 def test_learning_to_predict_does_not_change_what_the_policy_has_done(example, kind):
     learner, env = build(example, kind)
     batch = collected(learner, env)

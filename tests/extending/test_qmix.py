@@ -10,6 +10,7 @@ from helpers import everything, learning
 from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
+import damian
 from damian import UavEnv, keys
 from damian.models.config import MlpConfig
 from damian.replay.time_storage import TimeStorage
@@ -23,7 +24,7 @@ def learner_of(example, env, **changed):
 
 
 @pytest.mark.parametrize("mixer", ["qmix", pytest.param("vdn", marks=pytest.mark.slow)])
-def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run, mixer):
+def test_it_is_trained_evaluated_and_resumed_with_its_epsilon(run, mixer):
     words = [
         *TINY,
         "delay.obs=2",
@@ -37,11 +38,7 @@ def test_it_is_trained_resumed_with_its_epsilon_and_flown_in_another_number(run,
         rows = list(csv.DictReader(file))
     assert float(rows[-1]["epsilon"]) == pytest.approx(0.05), "it goes on where it was"
     assert 0 < float(rows[-1]["loss"]) < 10
-    flown = run(f"checkpoint={first}", "agents=4", "trust=true", program="evaluate", name="flown")
-    with (flown / "result.csv").open(newline="") as file:
-        assert {"trained", "trained, deterministic"} <= {
-            row["policy"] for row in csv.DictReader(file)
-        }
+    assert {"trained", "trained, deterministic"} <= {*damian.results(first)["policy"]}
 
 
 def test_the_policy_takes_the_legal_action_of_highest_value_and_explores_among_the_legal_ones(

@@ -25,11 +25,7 @@ def make(agents):
     observation = ObservationConfig(["spotted"], ["talking:heard"], window=WINDOW)
     links = LinkConfig(
         kind="matrix",
-        delay={
-            "law": "uniform",
-            "low": 1,
-            "high": 4,
-        },
+        delay="1..4",
     )
     return make_env(
         ScenarioConfig(agents=agents, observation=observation, links=links),
@@ -94,7 +90,7 @@ ROWS = "learner=extensions:RowsConfig"
 OWN = "observation.own=true"
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("words", "refused"),
     [

@@ -27,7 +27,7 @@ def made(*overrides, **options):
     return UavParallelEnv(compose_scenario(*overrides), **options)
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS)
 def test_gymnasiums_checker_finds_nothing(task, actions, motion, delay):
     overrides = [f"actions={actions}", f"motion={motion}", delay]
@@ -35,7 +35,7 @@ def test_gymnasiums_checker_finds_nothing(task, actions, motion, delay):
     check_env(env.unwrapped, skip_render_check=True)
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(8)
 @pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS)
 def test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys):
     overrides = [
@@ -52,7 +52,7 @@ def test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys)
 
 def test_gymnasiums_environment_is_pettingzoos_of_one_uav():
     scenario = compose_scenario(
-        "scenario=tracking", "agents=1", "delay=paper", "episode.max_steps=12"
+        "scenario=tracking", "agents=1", "delay=paper", "episode.max_steps=8"
     )
     env = UavGymEnv(scenario, seed=3)
     other = UavParallelEnv(scenario, seed=3)
@@ -106,8 +106,8 @@ def test_pettingzoos_environment_does_what_torchrls_does():
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
 def test_every_world_of_the_vector_environment_equals_a_single_one(actions):
     options = {"overrides": [f"actions={actions}", "delay=paper", "episode.max_steps=5"]}
-    vector = gymnasium.make_vec("damian/Spotting-v0", num_envs=3, **options)
-    singles = [gymnasium.make("damian/Spotting-v0", **options) for _ in range(3)]
+    vector = gymnasium.make_vec("damian/Spotting-v0", num_envs=2, **options)
+    singles = [gymnasium.make("damian/Spotting-v0", **options) for _ in range(2)]
     observations, infos = vector.reset(seed=11)
     for world, env in enumerate(singles):
         observation, info = env.reset(seed=11 + world)
@@ -149,11 +149,10 @@ def test_a_picture_shows_what_a_film_of_the_episode_shows():
 def test_what_a_user_can_get_wrong_is_said_in_one_line():
     with pytest.raises(InputError, match=r"agents: 2 is not 1.*UavParallelEnv"):
         gymnasium.make("damian/Spotting-v0", overrides=["agents=2"])
-    with pytest.raises(InputError, match="scenari"):
-        compose_scenario("scenari=tracking")
+    alone = compose_scenario("agents=1")
     with pytest.raises(InputError, match="render_mode: human is not one of rgb_array"):
-        UavGymEnv(compose_scenario("agents=1"), render_mode="human")
-    vector = UavVectorEnv(compose_scenario("agents=1"), 2)
+        UavGymEnv(alone, render_mode="human")
+    vector = UavVectorEnv(alone, 2)
     with pytest.raises(InputError, match="seed"):
         vector.reset(seed=[1, 2])
     vector.reset()

@@ -23,11 +23,7 @@ def learnt(kind="discrete", steps=40):
     """A learner after several batches, all steps that it was given [B, T], and the last transitions
     drawn."""
     delay = DelayConfig(
-        obs={
-            "law": "uniform",
-            "low": 0,
-            "high": LONGEST,
-        },
+        obs=f"0..{LONGEST}",
         history=3,
     )
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))

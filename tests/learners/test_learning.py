@@ -6,21 +6,16 @@ import math
 
 import pytest
 import torch
-from helpers import both_kinds, both_motions, everything, learning
+from helpers import both_motions
 from torch import nn
-from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import StepCounter
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian import DelayConfig, ScenarioConfig, UavEnv, keys, make_env
+from damian import ScenarioConfig, UavEnv, keys, make_env
 from damian.common.errors import InputError
-from damian.envs.recompute import server_recompute
 from damian.learners.base import divergence
-from damian.learners.mappo import Mappo, MappoConfig, add_advantages, executed_choices
+from damian.learners.mappo import MappoConfig, add_advantages, executed_choices
 from damian.models.actor import make_actor
 from damian.models.config import MlpConfig
 from damian.models.critic import make_critic
-from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.server.config import EpisodeConfig, RewardConfig
 from damian.world.config import ActionConfig, MotionConfig, RegionConfig
 
@@ -118,44 +113,6 @@ def test_a_choice_earns_what_follows_the_execution_of_its_action():
 
 
 # How back-updating changes the importance ratios of the first pass.
-
-
-def collect_delayed(kind):
-    """A learner with back-updating, and a batch of several episodes that its actor has flown under
-    delay."""
-    delay = DelayConfig(
-        obs={
-            "law": "uniform",
-            "low": 0,
-            "high": 5,
-        },
-        history=2,
-    )
-    scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
-    env = make_env(scenario, 4, seed=1, extras=["message"])
-    env.append_transform(StepCounter())
-    recompute = server_recompute(env.server, ["reward", "critic"])
-    corrections = corrections_of(env.transform, [keys.GLOBAL_OBSERVATION])
-    storage = BackupdateStorage(40 * 4, recompute, longest=5, corrections=corrections)
-    buffer = TensorDictReplayBuffer(storage=storage)
-    torch.manual_seed(2)
-    config = MappoConfig(minibatches=1, epochs=1)
-    learner = Mappo(env, config, learning(SMALL), buffer)
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        return learner, env.rollout(30, learner.actor, break_when_any_done=False)
-
-
-@both_kinds
-def test_with_backupdating_the_first_importance_ratios_are_one_as_actor_observations_stay(kind):
-    learner, batch = collect_delayed(kind)
-    corrected = learner.backupdated_batch(batch)
-    behaviour = batch["agents", "action_log_prob"]
-    assert corrected["agents", "observation"].equal(batch["agents", "observation"])
-    assert corrected["agents", "action_log_prob"].equal(behaviour)
-    assert corrected["agents", "backupdated"].any()
-    with torch.no_grad():
-        log_prob = learner.actor.get_dist(corrected.clone()).log_prob(batch["agents", "action"])
-    assert (log_prob - behaviour).abs().max() < 1e-4  # computed step by step, and in one batch
 
 
 def test_a_nan_counts_only_if_weights_are_wrong():

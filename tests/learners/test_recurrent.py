@@ -30,7 +30,7 @@ both_kinds_and_motions = pytest.mark.parametrize(
 
 def delayed_env(kind="discrete", motion="instant", worlds=4, **changed):
     """An environment with late messages, and episodes of 9 steps."""
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5})
+    delay = DelayConfig(obs="0..5")
     scenario = everything(
         motion, kind, **({"delay": delay, "episode": EpisodeConfig(max_steps=9)} | changed)
     )

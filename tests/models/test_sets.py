@@ -4,7 +4,7 @@ actor that begins as the script."""
 import pytest
 import torch
 
-from damian import keys, make_env
+from damian import ScenarioConfig, keys, make_env
 from damian.common.errors import InputError
 from damian.models.actor import make_actor
 from damian.models.config import MlpConfig, SetsConfig
@@ -56,12 +56,18 @@ def test_order_and_number_of_rows_change_nothing(n_out):
     torch.testing.assert_close(larger(joined(many, values | empty)), expected)
 
 
+@pytest.fixture(scope="module")
+def crowded():
+    """An environment whose actors observe actions, and three steps in it."""
+    env = make_env(compose_scenario(*CROWDED, "region.initial_conditions=16"), 3, seed=0)
+    return env, env.rollout(3)
+
+
 @pytest.mark.parametrize("model", [SETS, MlpConfig(hidden=[8])])
 @pytest.mark.parametrize("changed", [{}, {"rnn": "gru"}, {"shared": False}], ids=str)
-def test_with_a_prior_an_actor_begins_as_the_script(model, changed):
-    env = make_env(compose_scenario(*CROWDED, "region.initial_conditions=16"), 3, seed=0)
+def test_with_a_prior_an_actor_begins_as_the_script(crowded, model, changed):
+    env, steps = crowded
     actor = make_actor(env, type(model)(hidden=model.hidden, prior=True, **changed))
-    steps = env.rollout(3)
     entries = steps.select(keys.OBSERVATION, keys.ACTION_MASK).clone()
     hidden = torch.randn(3, 3, 4, model.hidden[-1])
     entries[keys.HIDDEN] = hidden
@@ -76,6 +82,6 @@ def test_with_a_prior_an_actor_begins_as_the_script(model, changed):
 
 
 def test_a_prior_without_gains_is_refused():
-    env = make_env(compose_scenario("scenario=delaybench/crowded"), 2)
+    env = make_env(ScenarioConfig(), 2)
     with pytest.raises(InputError, match=r"model\.prior: True needs gains: observation.actions"):
         make_actor(env, SetsConfig(prior=True))

@@ -45,21 +45,13 @@ def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
     assert done.returncode == (2 if "agnts=3" in code else 0)
 
 
-LATE = (
-    "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, 3s..7s)"
-)
 FILES = "is not one of damian:fir.csv, damian:queue_trace.csv"
-POLICIES = (
-    "is not one of damian:convoy, damian:crowded-any-delay, damian:flights, damian:requests, "
-    "damian:tracking"
-)
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["trian"], "trian: no such program; the programs are train, evaluate"),
-        (["train", ""], ": this word is not of the form KEY=VALUE"),
         (["train", "agents"], "agents: this word is not of the form KEY=VALUE"),
         (["train", "+delay.obz=1"], "delay.obz: unknown setting; did you mean delay.obs?"),
         (["train", "num_envs=8"], "num_envs: unknown setting; did you mean worlds?"),
@@ -68,8 +60,6 @@ POLICIES = (
         (["train", "source.speed=3"], "source.speed: 3.0 means nothing with source=static"),
         (["train", "seed=0,1"], "Ambiguous value for argument 'seed=0,1' 1. To use it as a list"),
         (["train", "agents=two"], "agents: two is not a whole number"),
-        (["train", "agents=0"], "agents: 0 is not between 1 and 1000"),
-        (["train", "delay.obs=-1"], f"delay.obs: -1 {LATE}"),
         (["train", "region=geojson"], "region.path: it is missing: region.kind=geojson needs it"),
         (
             ["train", "delay.obs={law: trace, path: damian:x.csv}"],
@@ -81,7 +71,6 @@ POLICIES = (
         ),
         (["fly", "policy=deterministic"], "policy: deterministic needs checkpoint"),
         (["fly", "agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
-        (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
         (
             ["train", "resume=nowhere", "agents=4"],
             "agents=4: a resumed run keeps its configuration",
@@ -133,9 +122,8 @@ RISEN = {"law": "uniform", "low": "3s", "high": "9s", "probability": 0.15}
 @pytest.mark.parametrize(
     ("words", "law"),
     [
-        (["delay=lag", f"delay.obs={UNIFORM}"], yaml.safe_load(UNIFORM)),
         (["delay=paper", f"+delay.obs={UNIFORM}"], yaml.safe_load(UNIFORM)),
-        (["delay=paper", "delay.obs=1..7"], "1..7"),
+        (["links=updown", "delay.obs={law: geometric}", "delay.obs=1..7"], "1..7"),
         (
             ["delay=paper", f"delay.obs={UNIFORM}", "delay.obs.high=9"],
             yaml.safe_load(UNIFORM) | {"high": 9},
@@ -145,10 +133,6 @@ RISEN = {"law": "uniform", "low": "3s", "high": "9s", "probability": 0.15}
 )
 def test_a_law_replaces_the_one_before_it_whole_and_its_fields_change_it(words, law):
     assert cli.settings(*words).delay.obs == law
-    links = cli.settings(
-        "links=updown", "links.delay={law: geometric}", f"links.delay={UNIFORM}"
-    ).links
-    assert links.delay == yaml.safe_load(UNIFORM)
 
 
 @pytest.fixture
@@ -172,7 +156,6 @@ def test_a_law_of_a_scenario_is_not_mixed_with_that_of_a_delay(capsys, mine):
     for more, message in (
         ([], accepted),
         (["delay=paper"], mixed),
-        (["delay=paper", "delay.obs=1..7"], accepted),
         (["delay=paper", f"delay.obs={UNIFORM}"], accepted),
     ):
         with pytest.raises(SystemExit):
@@ -189,7 +172,6 @@ def test_a_range_is_uniform_over_whole_steps():
 def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, mine):
     for text, message in (
         ("agents: 2\n\tseed: 3\n", "mine.yaml"),
-        ("model: {hidden: 8}\n", "error: model.hidden: 8 is not a list"),
         ("model: 8\n", "error: model: 8 is not a section; write model=OPTION, or model.KEY=VALUE"),
         ("agnts: 8\n", "error: agnts: unknown setting; did you mean agents?"),
     ):

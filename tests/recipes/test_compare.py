@@ -221,7 +221,6 @@ methods:
         ),
         (FITS_NOT, ["experiment=mine"], "flown: observation.age: the policy was trained with True"),
     ],
-    ids=["words", "methods", "empty", "fits not"],
 )
 def test_a_mistake_is_one_line_and_leaves_no_folder(
     compare, capsys, tmp_path, text, words, message

@@ -80,10 +80,8 @@ def test_new_overrides_replace_those_of_the_run_and_the_others_apply(fly):
     assert (config.delay.obs, config.seed, config.agents) == (4, 5, 10)
     assert config.source.motion == "dynamic"  # an option replaces what its group sets
     assert (config.episode.max_steps, config.eval_episodes, config.model.hidden) == (10, 8, [16])
-    flown = (damian.results(path).set_index("policy") for path in (folder, fly(folder="trained")))
-    longer, shorter = (rows.at["random", "age"] for rows in flown)
-    assert longer == pytest.approx((1 + 2 + 3 + 7 * 4) / 10, rel=1e-6)
-    assert shorter == 1
+    age = damian.results(folder).set_index("policy").at["random", "age"]
+    assert age == pytest.approx((1 + 2 + 3 + 7 * 4) / 10, rel=1e-6)
 
 
 def test_a_run_that_was_resumed_is_flown_and_begun_with_as_any_other(fly, trained, tmp_path):
@@ -121,20 +119,9 @@ def test_a_loaded_policy_flies_elsewhere_unless_it_does_not_fit(trained):
         damian.load(trained.parent / "nowhere")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (
-            ["model.hidden=[8]"],
-            "model.hidden: the policy was trained with [16], so it cannot fly with [8]",
-        ),
-        (["actions=continuous"], "actions.kind: the policy was trained with 'discrete'"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
-    fly, capsys, tmp_path, overrides, message
-):
-    check_refused(lambda: fly(*overrides), message, capsys)
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path):
+    message = "actions.kind: the policy was trained with 'discrete'"
+    check_refused(lambda: fly("actions=continuous"), message, capsys)
     assert [*tmp_path.glob("*/*")] == []
 
 

@@ -25,7 +25,7 @@ TINY = [*SMALLEST_TRAINING, "logger=csv", "agents=1"]
 
 
 @pytest.fixture
-def sweep(tmp_path, monkeypatch):
+def sweep(tmp_path, monkeypatch, few_figures):
     """Sweep in an empty folder; returns the exit code."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [])
@@ -136,6 +136,7 @@ def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, caps
         index="seed", columns="aware", values="return"
     )
     mean = (trained["backupdate"] - trained["none"]).mean()
+    assert (trained.loc[0] != trained.loc[1]).all(), "another seed, another run"
     (line,) = [line for line in table.splitlines() if line.startswith("| backupdate | trained |")]
     *_, shown, better = line.removesuffix(" |").split(" | ")
     assert float(shown.split()[0]) == pytest.approx(mean, abs=6e-4)

@@ -19,6 +19,7 @@ from damian.models.critic import make_critic
 from damian.recipes import evaluate
 from damian.recipes import train as train_recipe
 from damian.recipes.cli import settings as composed_config
+from damian.recipes.config import TrainConfig
 from damian.recipes.shared.runs import seed_generators, stored_config
 from damian.runs.training_state import load_networks
 
@@ -58,42 +59,18 @@ def trained(tmp_path_factory):
 @pytest.mark.parametrize(
     "overrides",
     [
-        ["scenario=tracking", "motion=polynomial", "agents=2"],
-        ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
-        ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
-        [
-            "delay=paper",
-            "delay.obs.high=9s",
-            "clock.agents=2s",
-            "clock.server=4s",
-            "clock.system=16s",
-        ],
-        ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
-        [
-            "learner=sac",
-            "learner.warm_up=64",
-            "actions=continuous",
-            "motion=polynomial",
-            "aware=backupdate",
-        ],
-        [
-            "learner=sac",
-            "learner.warm_up=64",
-            "learner.updates=1",
-            "delay=paper",
-            "aware=backupdate+history",
-        ],
-        [
-            "actions=continuous",
-            "model=gru",
-            "motion=polynomial",
-            "delay=paper",
-            "aware=backupdate+history",
-        ],
+        "scenario=tracking motion=polynomial agents=2",
+        "scenario=coverage actions=continuous region=random region.pool=2",
+        "delay.obs=3 delay.act=2 delay.rew=1 delay.history=4 delay.loss=0.1",
+        "delay=paper delay.obs.high=9s clock.agents=2s clock.server=4s clock.system=16s",
+        "learner=bpql learner.warm_up=64 learner.updates=1 delay=paper aware=belief",
+        "learner=sac learner.warm_up=64 actions=continuous motion=polynomial aware=backupdate",
+        "learner=sac learner.warm_up=64 learner.updates=1 delay=paper aware=backupdate+history",
+        "actions=continuous model=gru motion=polynomial delay=paper aware=backupdate+history",
     ],
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):
-    folder = run(*TINY, *overrides)
+    folder = run(*TINY, *overrides.split())
     printed = capsys.readouterr().out
     written = {path.name for path in folder.iterdir()}
     assert {"config.yaml", "metrics.csv", "checkpoint.pt", "learning_curve.png"} <= written
@@ -113,17 +90,13 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
 
 def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, capsys):
     same = run(*TINY, folder="same")
-    other = run(*TINY, "seed=1", folder="other")
     before = (same / "metrics.csv").read_text()
     record = json.loads((same / "run.json").read_text())
     assert (trained / "metrics.csv").read_text() == before
-    assert (other / "metrics.csv").read_text() != before
     check_refused(lambda: run(*TINY, "seed=2", folder="same"), "same holds a run already", capsys)
     fewer = (f"resume={same}", "frames=100")
     made = "frames: 100 is fewer than the 256 that the run has made"
     check_refused(lambda: run(*fewer, folder="second"), made, capsys)
-    run(f"resume={same}", "frames=250", folder="second")
-    assert (same / "metrics.csv").read_text() == before, "nothing was left to train"
     run(f"resume={same}", "frames=512", folder="second")
     assert (same / "metrics.csv").read_text().startswith(before)
     assert [row["frames"] for row in metrics(same)] == [128.0, 256.0, 384.0, 512.0]
@@ -133,7 +106,7 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
     assert (
         resumed["resumed"][0]["command"]
-        == f"damian train resume={same} frames=250 hydra.run.dir=second"
+        == f"damian train resume={same} frames=512 hydra.run.dir=second"
     )
 
 
@@ -193,7 +166,7 @@ def test_the_use_case_scenarios_have_the_settings_of_the_reference_data(case):
         assert getattr(config.episode, key) == getattr(golden.episode, key)
 
 
-@pytest.mark.parametrize("overrides", [["delay.obs=2", "aware=belief"], SAC], ids=["belief", "sac"])
+@pytest.mark.parametrize("overrides", [["delay.obs=2", "aware=belief"], SAC])
 def test_the_untrained_actor_of_an_evaluation_is_that_of_the_training_before_its_first_update(
     overrides, tmp_path, monkeypatch
 ):
@@ -230,7 +203,7 @@ def test_the_use_cases_are_learnt_in_500_episodes_by_most_seeds(run, case):
 
 
 def test_long_trainings_are_compiled_unless_the_settings_say_otherwise():
-    assert composed_config("frames=1000000").compiles
-    for words in (["frames=999999"], ["frames=1000000", "compile=false"]):
-        assert not composed_config(*words).compiles
+    assert TrainConfig(frames=1_000_000).compiles
+    assert not TrainConfig(frames=999_999).compiles
+    assert not TrainConfig(frames=1_000_000, compile=False).compiles
     assert not composed_config("frames=1000000", "sensors=[my_package:wind]").compiles

@@ -131,7 +131,7 @@ def check_refuses(start, capsys, message):
 
 @pytest.mark.parametrize("key", SETTINGS)
 def test_no_stored_setting_is_imported_however_it_is_spelt(store, key, capsys):
-    for name in SPELLINGS if key in ("learner.name", "logger.custom") else SPELLINGS[:1]:
+    for name in SPELLINGS if key == "learner.name" else SPELLINGS[:1]:
         store(key, SETTINGS[key](name))
         told = "this run uses code outside DAMIAN (evilmod:X)" if name == "evilmod:X" else ""
         check_refuses(PROGRAMS["load"], capsys, told)
@@ -154,6 +154,7 @@ def test_stored_words_are_only_shown_and_stored_settings_not_resolved(store, mon
     assert stored_config(Path("run"), "checkpoint").region.path == "${oc.env:SECRET}"
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("name", ["load", "export", "evaluate", "train", "resume"])
 @pytest.mark.parametrize(
     "linked", ["config.yaml", "checkpoint.pt", "replay", "replay/000000.pt", "export"]

@@ -21,7 +21,7 @@ from damian.world.config import ActionConfig, MotionConfig, RequestConfig, Sourc
 STEPS = 40
 WORLDS = 4
 LONGEST = 5
-LATE = {"law": "uniform", "low": 0, "high": LONGEST}
+LATE = f"0..{LONGEST}"
 SUMMED = {"reward_window": 3, "reward_discount": 0.7}
 ENDS = ["success", "done", "terminated", "truncated"]
 
@@ -127,9 +127,11 @@ FLYING = {
     "late messages",
     "late messages, slow server",
     "late and summed rewards",
+    "order of arrival",
     "slow agents, history",
 }
-"""Cases with real flights; in the others UAVs move at once."""
+"""Cases with real flights, in which a UAV is silent for longer than any message takes; in the others
+UAVs move at once."""
 
 
 @pytest.mark.sample(3)

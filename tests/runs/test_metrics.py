@@ -241,11 +241,7 @@ def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_nothing_is_lost(loss):
     late = DelayConfig(
-        obs={
-            "law": "uniform",
-            "low": 1,
-            "high": 4,
-        },
+        obs="1..4",
         loss=loss,
     )
     env = make_env(square(delay=late, episode=EpisodeConfig(max_steps=7)), 3, extras=["message"])
@@ -288,7 +284,7 @@ def test_returns_in_hindsight_count_all_that_arrives_and_are_the_true_ones_if_no
 
 def test_tensorboard_shows_numbers_up_to_where_a_run_resumed(tmp_path):
     for resumed, frames in ((0, [10, 20]), (10, [20, 30])):
-        time.sleep(1)  # files are in the order of the seconds in their names
+        time.sleep(resumed / 10)  # files are in the order of the seconds in their names
         log = MetricsLog(tmp_path, to_csv=False, loggers=[TensorBoard(tmp_path, resumed)])
         for each in frames:
             log.add(each, {"loss": float(each + resumed)})

@@ -60,31 +60,3 @@ def test_every_end_of_an_episode_equals_that_of_a_plain_loop(
     ]
     assert list(zip(*(flag.tolist() for flag in ours), strict=True)) == expected
     assert not (ours.terminated & ours.truncated).any()
-
-
-def status_of(spots, empty=False, steps=5, over=False, **ends):
-    """Success, terminated and truncated of one world in which the UAVs spot the source or not."""
-    (_, uavs), *_ = random_worlds(0, len(spots), 0.0, 0.0)
-    for uav, flag in zip(uavs, spots, strict=True):
-        uav.spots = flag
-        uav.empty = empty
-    messages, _ = messages_of([(float(steps), uavs)])
-    config = EpisodeConfig(**ends)
-    ended = status(messages, torch.tensor([steps]), torch.tensor([over]), 1.0, config)
-    return tuple(flag.item() for flag in ended)
-
-
-def test_empty_batteries_or_the_end_of_the_sources_walk_terminate_without_success():
-    ends = {"max_steps": 5, "discharged_share": 0.5}
-    assert status_of([False, False], empty=True, **ends) == (False, True, False)
-    assert status_of(
-        [False],
-        over=True,
-        max_steps=5,
-        end_with_source=True,
-    ) == (False, True, False)
-    assert status_of(
-        [False],
-        over=True,
-        max_steps=None,
-    ) == (False, False, False)

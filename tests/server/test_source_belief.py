@@ -138,8 +138,9 @@ class Flight:
                 torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.sample(2)
 @every_grid
-@pytest.mark.parametrize("own", [False, True], ids=["server", "each UAV"])
+@pytest.mark.parametrize("own", [False, True])
 def test_beliefs_equal_the_slow_twins_for_any_delays_losses_resets_and_pauses(grid, own):
     flight = Flight(grid, n_worlds=2, own=own)
     for i in range(12):

@@ -14,18 +14,14 @@ from damian.world.config import RegionConfig, RequestConfig, SourceConfig
 
 SLOTS = 4
 AGENTS = 3
-UNIFORM = {"law": "uniform", "low": 0, "high": 6}
+UNIFORM = "0..6"
 QUIET = RequestConfig(rate=0.0)
 CASES = {
     "no delay": {},
     "delays beyond the slots, losses": {"delay": DelayConfig(obs=UNIFORM, loss=0.2)},
     "held back": {
         "delay": DelayConfig(
-            obs={
-                "law": "uniform",
-                "low": 0,
-                "high": 2,
-            },
+            obs="0..2",
             hold="max",
         )
     },

@@ -23,11 +23,7 @@ def flown():
     scenario = ScenarioConfig(
         source=source,
         delay=DelayConfig(
-            obs={
-                "law": "uniform",
-                "low": 0,
-                "high": 4,
-            },
+            obs="0..4",
             loss=0.2,
         ),
         observation=ObservationConfig(belief=["belief_moments"]),

@@ -131,7 +131,7 @@ def test_a_belief_knows_what_has_arrived_and_nothing_else(scenario):
 def test_back_updated_beliefs_know_what_has_arrived_since(name):
     env = make_env(SCENARIOS[name], 2, extras=["message"])
     counted = TransformedEnv(env, Compose(StepCounter()))
-    data = counted.rollout(45, break_when_any_done=False)
+    data = counted.rollout(27, break_when_any_done=False)
     recompute = server_recompute(env.server)
     storage = BackupdateStorage(1000, recompute, LONGEST)
     buffer = ReplayBuffer(storage=storage, batch_size=1)

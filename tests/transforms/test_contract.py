@@ -263,7 +263,7 @@ def test_a_copy_made_during_an_episode_continues_like_the_original(case, copied,
 @pytest.mark.sample(8)
 @every_case
 @pytest.mark.parametrize(("n_steps", "used"), [(5, True), (5, False), (0, True)])
-@pytest.mark.parametrize("whole", [True, False], ids=["environment", "transform"])
+@pytest.mark.parametrize("whole", [True, False])
 def test_a_loaded_checkpoint_continues_bit_for_bit(case, whole, n_steps, used):
     env = case.build()
     td = begun(env, n_steps)
@@ -445,7 +445,7 @@ def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(k
 # Seeds.
 
 
-@pytest.mark.parametrize("wrap", [False, True], ids=["one environment", "nested environments"])
+@pytest.mark.parametrize("wrap", [False, True])
 def test_all_streams_of_an_environment_differ(wrap):
     def chain():
         return [

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import clock, play
+from helpers import both_kinds, clock, play
 
 from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.common import counter_rng
@@ -58,15 +58,14 @@ def through_the_air(way, wind, speed):
 @pytest.mark.parametrize("wind", [(7.0, 250.0), (15.0, 30.0)])
 def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
     speed, whence = wind
-    env = UavEnv(replace(WORLD, wind=WindConfig(speed=speed, direction=whence)), 12, seed=1)
+    env = UavEnv(replace(WORLD, wind=WindConfig(speed=speed, direction=whence)), 8, seed=1)
     blows = -speed * math.sin(math.radians(whence)), -speed * math.cos(math.radians(whence))
     env.set_seed(2)
     td = env.reset()
     flown = 0
-    for _ in range(30):
+    for _ in range(20):
         mask = td["agents", "action_mask"]
         stands = env.state
-        points = env.simulation.points
         nearest = env.simulation.candidates.nearest
         ready = env.simulation.vehicles.ready(stands)
         for world, uav in ready.nonzero().tolist():
@@ -97,8 +96,7 @@ def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
             hard = math.sqrt(10 * math.sqrt(3) / 3 * air / HARDEST[uav])
             assert after.cruise[world, uav].item() == pytest.approx(max(fast, hard), rel=1e-5)
             flown += 1
-    assert points.shape[-1] == 2
-    assert flown > 50
+    assert flown > 20
 
 
 def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
@@ -188,11 +186,7 @@ def test_messages_with_a_drawn_loss_are_lost_as_with_this_loss():
     losses = [0.0, 0.3, 0.9]
     law = {
         "law": "lag",
-        "lag": {
-            "law": "uniform",
-            "low": 1,
-            "high": 4,
-        },
+        "lag": "1..4",
     }
     scenarios = [
         replace(
@@ -299,7 +293,7 @@ def test_the_truth_pays_and_ends_as_if_there_were_no_misses_and_false_alarms(end
     assert rewards[0][..., -3:].flatten(0, 1).any(0).all()
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@both_kinds
 def test_a_battery_is_empty_where_it_allows_no_flight_in_this_wind(kind):
     windy = replace(
         WORLD,

@@ -137,26 +137,6 @@ def test_aborted_flights_are_those_of_a_plain_loop(motion, agents):
     assert counts["turned"] > 20
 
 
-def test_flights_are_aborted_as_often_as_set_and_end_at_each_place_as_often():
-    motion = MotionConfig(abort=0.25)
-    start = RegionConfig(
-        kind="vertices", vertices=DENTED, lattice_step=50.0, start_positions=[[300, 100]]
-    )
-    scenario = replace(WORLD, agents=1, motion=motion, region=start, battery=BatteryConfig())
-    env = fresh(scenario, num_worlds=20_000)
-    origin = env.state.goal[0, 0]
-    action = env.simulation.action_mask(env.state)[0, 0].nonzero()[-1]
-    commanded = env.simulation.candidates.nearest[origin, action].item()
-    act(env, action.expand(20_000, 1))
-    ends = Counter(env.state.goal.flatten().tolist())
-    assert ends.pop(commanded) == pytest.approx(15_000, abs=250)
-    near = env.simulation.candidates.distance[origin].isfinite()
-    assert {*ends} == {*env.simulation.candidates.nearest[origin][near].tolist()} - {commanded}
-    assert origin.item() in ends, "holding is one of them"
-    each = sum(ends.values()) / len(ends)
-    assert all(abs(number - each) < 4 * math.sqrt(each) for number in ends.values())
-
-
 @both_motions
 def test_failed_uavs_are_silent_and_stay_where_they_are(motion):
     scenario = replace(aborting(motion), failure=FailureConfig(0.1, duration=10.0))

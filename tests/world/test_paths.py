@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from helpers import clock
+from helpers import both_kinds, clock
 
 from damian import ScenarioConfig, UavEnv
 from damian.world.config import ActionConfig, MotionConfig, RegionConfig
@@ -56,7 +56,7 @@ def test_ways_between_all_landing_points_are_the_shortest_ones(apart):
     assert len(found.pair) < len(pairs), "straight ways need no detour"
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@both_kinds
 def test_no_uav_leaves_the_region_or_enters_a_zone(kind):
     region = RegionConfig(
         kind="vertices", vertices=DENTED, zones=ZONES, zone_margin=5.0, lattice_step=25.0
@@ -68,7 +68,7 @@ def test_no_uav_leaves_the_region_or_enters_a_zone(kind):
     polygon = env.simulation.airspace.regions[0].polygon
     assert len(polygon.interiors) == 2
     env.set_seed(0)
-    flown = env.rollout(120, break_when_any_done=False)["state"]
+    flown = env.rollout(60, break_when_any_done=False)["state"]
     places = flown[..., : 3 * 4].unflatten(-1, (4, 3))[..., :2].flatten(0, -2).double()
     outside = ~shapely.covers(shapely.buffer(polygon, 1e-2), shapely.points(places.numpy()))
     assert not outside.any()

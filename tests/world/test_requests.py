@@ -142,11 +142,7 @@ def test_requests_appear_at_their_rate_anywhere_in_the_region():
 def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
     flying = MotionConfig(kind="polynomial", max_speed=60.0, max_acceleration=40.0)
     late = DelayConfig(
-        obs={
-            "law": "uniform",
-            "low": 0,
-            "high": 4,
-        },
+        obs="0..4",
         loss=0.4,
     )
     asked = scenario(
@@ -202,7 +198,7 @@ def test_late_messages_show_requests_and_pay_services_as_in_a_plain_loop(reach):
 @pytest.mark.parametrize("reach", [None, 100.0])
 def test_the_dispatcher_serves_more_than_chance(reach):
     asked = scenario(requests=RequestConfig(RATE, MOST, range=reach))
-    env = make_env(asked, 64, 0, "cpu", ["message", "state"])
+    env = make_env(asked, 32, 0, "cpu", ["message", "state"])
     returns = []
     for policy in (script_policy(env), None):
         env.set_seed(0)

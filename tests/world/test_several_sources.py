@@ -86,7 +86,7 @@ def test_the_script_finds_more_than_chance():
     told = scenario(
         source, episode=EpisodeConfig(60, all_sources=True), reward=RewardConfig(bonus=1.0)
     )
-    env = make_env(told, 64, 0, "cpu", ["message", "state"])
+    env = make_env(told, 32, 0, "cpu", ["message", "state"])
     found = []
     for policy in (script_policy(env), None):
         env.set_seed(0)
