@@ -45,11 +45,7 @@ def loop(env, alone, td, horizon):
 @pytest.mark.parametrize("news", ["motion.abort=0", "motion.abort=0.9"])
 def test_the_planner_equals_a_plain_loop_in_which_no_flight_is_aborted(news):
     horizon = 2
-<<<<<<< HEAD
-    env = made(news)
-=======
-    env, alone = made(), made(worlds=1)
->>>>>>> tests
+    env, alone = made(news), made(worlds=1)
     planner = planner_policy(env, horizon)
     td = env.reset()
     differs = 0

@@ -46,6 +46,10 @@ def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
 
 
 FILES = "is not one of damian:fir.csv, damian:queue_trace.csv"
+POLICIES = (
+    "is not one of damian:convoy, damian:crowded-any-delay, damian:flights, damian:requests, "
+    "damian:tracking"
+)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +74,7 @@ FILES = "is not one of damian:fir.csv, damian:queue_trace.csv"
             f"checkpoint: nowhere holds no config.yaml: damian:nowhere {POLICIES}",
         ),
         (["fly", "policy=deterministic"], "policy: deterministic needs checkpoint"),
+        (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
         (["fly", "agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
         (
             ["train", "resume=nowhere", "agents=4"],
