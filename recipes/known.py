@@ -151,12 +151,9 @@ def check_words(program: str, words: Iterable[str]) -> None:
                 raise InputError(f"{key}: {wrong[0]} is not one of {', '.join(options[key])}")
         elif not (is_known(key, program) or key.startswith(("hydra", "+", "~", "-"))):
             raise InputError(no_such_key(key, program))
-        elif key == "checkpoint" and re.fullmatch(r"(?!null$)[\w/.:-]+", value):
-            folder = Path(data_file(value, key))
-            shipped = (
-                value if folder.exists() else f"damian:{value}"
-            )  # named with the package's own
-            data_file(shipped, f"{key}: {value} holds no config.yaml")
+        elif key == "checkpoint" and re.fullmatch(r"(?!null$)(damian:)?[\w.-]+", value):
+            if not Path(data_file(value, key)).exists():  # named with the package's own
+                data_file(f"damian:{value}", f"{key}: {value} holds no config.yaml")
 
 
 def is_known(key: str, program: str) -> bool:
