@@ -31,7 +31,6 @@ from damian.runs.checkpoint import digest
 from damian.runs.run_folder import CHECKPOINT, CONFIG, FAILED, RESULTS, check_no_links, locked
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
-from damian.show.region import save_region
 
 from ..cli import EXPECTED, Work, command, options_in, plain, reason, short
 from ..config import TrainConfig
@@ -112,8 +111,6 @@ class Run:
                     missing_ok=True
                 )  # those of a policy that is not there any more
             remove_unfinished(folder)
-            if config.region.kind != "random":
-                print(save_region(config, config.seed, folder / "region.png"), flush=True)
             with timed(folder):
                 self.work(config, folder)
         print(f"results: {folder}")
