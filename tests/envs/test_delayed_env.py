@@ -1,10 +1,21 @@
 """``DelayedEnv``: what holds in a scenario with any delays, losses and clocks, eager and
 compiled."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from delayed_envs import DELAYS, after_steps, choices, delayed, every_delay
-from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, square
+from helpers import (
+    FLYING,
+    KEEPS_GOING,
+    all_same,
+    both_kinds,
+    both_motions,
+    everything,
+    play,
+    square,
+)
 from torchrl.envs import RewardSum, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -202,11 +213,15 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, kin
 
 
 @pytest.mark.parametrize(
-    "route", [pytest.param(r, marks=[pytest.mark.slow] * (r != "everything")) for r in ROUTES]
+    ("make", "route"),
+    [
+        (square, "everything"),
+        *(pytest.param(everything, r, marks=pytest.mark.slow) for r in ROUTES),
+    ],
 )
-def test_a_compiled_step_equals_torchrls_too(route):
-    scenario = everything("polynomial", **ROUTES[route], failure=FailureConfig(0.1))
-    scenario.motion.abort = 0.5
+def test_a_compiled_step_equals_torchrls_too(make, route):
+    scenario = make(**ROUTES[route], failure=FailureConfig(0.1))
+    scenario.motion = replace(FLYING, abort=0.5)
     check_equals_torchrls_way(scenario, delayed(scenario).compile(backend="eager"))
 
 
@@ -236,7 +251,7 @@ def check_equals_torchrls_way(scenario, env):
     one_by_one.append_transform(RewardSum([REWARD], [EPISODE_REWARD]))
     one_by_one.append_transform(StepCounter())
     env.append_transform(EpisodeTotals())  # both in one
-    actions = choices(one_by_one, 18)
+    actions = choices(one_by_one, 10)
     expected = steps_of(one_by_one, actions)
     found = steps_of(env, actions)
     assert any(td["next", "done"].any() and not td["next", "done"].all() for td in expected[::2])

@@ -1,11 +1,13 @@
 """Ends of episodes (paper, section 4.1), batteries, and the end of the source."""
 
+import copy
+
 import pytest
 import torch
 from helpers import MOTIONS, act, both_motions, fresh, one_uav, sent_messages, walking
 
 from damian.server.config import EpisodeConfig, RewardConfig
-from damian.world.battery import BatteryConfig, charge_gain
+from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 
 FAR = [[390.0, 10.0]]
 HERE, EAST = [[0.0, 0.0]], [[1.0, 0.25]]
@@ -77,6 +79,22 @@ def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_co
 
 
 # Batteries.
+
+
+@both_motions
+def test_a_uav_does_not_fly_to_a_landing_point_beyond_the_reach_of_its_battery(motion):
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.5, charging_points=FAR)
+    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion]))
+    start = copy.deepcopy(env.state)
+    go(env, EAST)
+    length = torch.linalg.vector_norm(
+        env.simulation.points[env.state.goal.item()] - env.simulation.points[start.goal.item()]
+    )
+    cost = flight_drain(env.simulation.vehicles.vertical(env.state)[0], length, battery)
+    for factor, flies in ((0.99, False), (1.01, True)):
+        env.state = start._replace(battery=factor * cost.view(1, 1))
+        go(env, EAST)
+        assert bool((env.state.goal != start.goal).item()) == flies
 
 
 def test_uavs_charge_only_at_charging_points():

@@ -18,7 +18,8 @@ CHARGING = f"{CROWDED} motion=polynomial battery=charging battery.capacity_kwh=0
 
 
 def env_of(words, *more):
-    scenario = damian.compose_scenario(*words.split(), "region.initial_conditions=16", *more)
+    small = ("region.initial_conditions=16", "region.lattice_step=60")
+    scenario = damian.compose_scenario(*words.split(), *small, *more)
     env = damian.make_env(scenario, WORLDS, 3, extras=["message"])
     env.assume(assumed_script(env))
     return env

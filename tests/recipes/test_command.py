@@ -189,17 +189,22 @@ def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, mine
     assert "agents: 2.0" in capsys.readouterr().out
 
 
-def test_every_option_is_a_file_that_begins_with_its_launch_line_and_composes():
-    known = groups()
-    for group, options in known.items():
+def test_every_option_is_a_file_that_begins_with_its_launch_line():
+    for group, options in groups().items():
         for option in options:
             lines = (CONF / group / f"{option}.yaml").read_text("utf-8").splitlines()
             (first, *_) = [line for line in lines if not line.startswith("# @package")]
             assert first.startswith("# damian "), (group, option)
-    del known["experiment"]
-    for options in zip_longest(*known.values()):  # one of each group at a time
-        pairs = zip(known, options, strict=True)
-        cli.composed(*[f"{group}={option}" for group, option in pairs if option])
+
+
+TOGETHER = {group: options for group, options in groups().items() if group != "experiment"}
+
+
+@pytest.mark.sample(3)
+@pytest.mark.parametrize("options", [*zip_longest(*TOGETHER.values())])
+def test_options_one_of_each_group_at_a_time_compose(options):
+    pairs = zip(TOGETHER, options, strict=True)
+    cli.composed(*[f"{group}={option}" for group, option in pairs if option])
 
 
 def test_what_a_scenario_says_of_the_learner_gives_way_to_the_command_line():

@@ -126,9 +126,8 @@ def test_of_many_runs_one_that_fails_is_kept_and_the_others_go_on(tmp_path):
 
 
 def test_a_table_shows_differences_to_the_first_value_paired_by_seed(sweep, capsys):
-    assert (
-        sweep("aware=none,backupdate", "delay.obs=1..3", "seed=0,1", "hydra.sweep.dir=sweep") == 0
-    )
+    words = ["aware=none,backupdate", "delay.obs=1..3", "seed=0,1", "frames=32"]
+    assert sweep(*words, "hydra.sweep.dir=sweep") == 0
     table = capsys.readouterr().out.rpartition("results of the sweep")[2]
     assert Path("sweep/figure.png").stat().st_size
     rows = damian.results("sweep")

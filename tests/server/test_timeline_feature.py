@@ -44,6 +44,7 @@ def scenario(own=True, stops=None, **changed):
     return ScenarioConfig(**(sections | changed))
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("stops", [1, None])
 @pytest.mark.parametrize(("name", "own"), [*((name, True) for name in CASES), ("held back", False)])
 def test_a_slot_tells_where_a_uav_stood_then_if_a_message_that_tells_it_has_arrived(
