@@ -152,8 +152,8 @@ def check_words(program: str, words: Iterable[str]) -> None:
         elif not (is_known(key, program) or key.startswith(("hydra", "+", "~", "-"))):
             raise InputError(no_such_key(key, program))
         elif key == "checkpoint" and re.fullmatch(r"(?!null$)(damian:)?[\w.-]+", value):
-            if not Path(data_file(value, key)).exists():  # named with the package's own
-                data_file(f"damian:{value}", f"{key}: {value} holds no config.yaml")
+            shipped = value if Path(data_file(value, key)).exists() else f"damian:{value}"
+            data_file(shipped, f"{key}: {value} holds no config.yaml")  # names the package's own
 
 
 def is_known(key: str, program: str) -> bool:

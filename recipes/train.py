@@ -38,8 +38,8 @@ from damian.runs.metrics_log import MetricsLog, make_loggers
 from damian.runs.processes import Interrupt, end_interrupted
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, TRAINED
 from damian.runs.training_state import RandomState, TrainingState, load_networks
-from damian.show.region import save_region
 from damian.server.components import not_finite
+from damian.show.region import save_region
 
 from . import cli
 from .config import TrainConfig
@@ -75,7 +75,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     hindsight = hindsight_returns(config, env)
     state = TrainingState(folder, learner.components(), collector, clock, buffer, hindsight)
     begin(config, state)
-    if config.region.path:  # what was read of a map
+    if config.region.kind == "geojson":  # what was read of a map
         print(save_region(config, config.seed, folder / "region.png"), flush=True)
     if config.compiles:
         print("compiling: the first update takes up to a minute longer")

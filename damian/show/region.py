@@ -24,7 +24,7 @@ def save_region(config: WorldConfig, seed: int, path: Path) -> str:
     radius = footprint_radius(config.source)
     fitting = area / (np.pi * radius**2)
     told = f"{region.name}: {area / 1e6:.3g} km², {len(points)} landing points, "
-    told += f"room for {fitting:.2g} footprints of {radius:.3g} m"
+    told += f"room for {fitting:.3g} footprints of {radius:.3g} m"
     figure = Figure(layout="constrained")
     axis = figure.subplots()
     draw_region(axis, region.polygon, points, radius)

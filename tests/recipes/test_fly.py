@@ -43,7 +43,7 @@ def test_a_run_folder_holds_configuration_episode_film_and_figure(fly, capsys):
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 10
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == 3
-        assert film.size == (720, 660)
+        assert film.size == (720, 690)
 
 
 @pytest.mark.parametrize(("motion", "crosses"), [("instant", True), ("polynomial", False)])
