@@ -252,9 +252,9 @@ def executed_choices(batch: TensorDictBase, delay: int) -> tuple[TensorDictBase,
     n_steps = batch.shape[1] - delay
     done = batch[keys.next_key(keys.DONE)].squeeze(-1)
     executed = ~done[:, :-1].unfold(1, delay, 1).any(-1)
-    choices = batch[:, :n_steps].copy()
+    choices = cast(TensorDictBase, batch[:, :n_steps]).copy()
     for key in map(keys.next_key, (keys.REWARD, keys.DONE, keys.TERMINATED)):
-        choices[key] = batch[key][:, delay:]
+        choices[key] = cast(Tensor, batch[key])[:, delay:]
     choices[keys.READY] = choices[keys.READY] & executed.unsqueeze(-1)
     return choices, executed
 
