@@ -203,7 +203,7 @@ ROUTES["links"] = {
 }
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(5)
 @both_motions
 @both_kinds
 @pytest.mark.parametrize("route", ROUTES)
