@@ -176,7 +176,7 @@ def options(law):
     return keys | {"dt": DT if type(law) in (Lag, Crowd, Route) else 1.0}
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("order", "loss", "sent_key"), [("generation", 0.0, None), ("arrival", 0.25, "message_sent")]
 )
@@ -247,7 +247,7 @@ def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key
                 sender.begin()
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 def test_every_agent_receives_the_rewards_of_the_twin_and_none_is_lost(law):
     law = (
         Crowd(

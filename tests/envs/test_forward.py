@@ -34,6 +34,7 @@ def same(one, other, *entries):
         assert one[key].equal(other[key])
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("scenario", "delay"),
     [

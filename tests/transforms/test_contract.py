@@ -190,7 +190,7 @@ def test_the_cases_cover_every_exported_transform():
 # Places in which a transform works.
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(4)
 @everywhere
 def test_the_outputs_match_the_specs_and_every_spec_can_do_without_the_batch(case):
     env = case.build()
@@ -260,7 +260,7 @@ def test_a_copy_made_during_an_episode_continues_like_the_original(case, copied,
 # Checkpoints.
 
 
-@pytest.mark.sample(8)
+@pytest.mark.sample(10)
 @every_case
 @pytest.mark.parametrize(("n_steps", "used"), [(5, True), (5, False), (0, True)])
 @pytest.mark.parametrize("whole", [True, False])
@@ -390,7 +390,7 @@ def test_a_reset_of_some_worlds_does_not_change_the_others(case):
 # Memory.
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(6)
 @everywhere
 def test_what_is_written_shares_no_memory_with_the_buffers(case):
     env = case.build()
@@ -432,7 +432,7 @@ IDENTITIES = {
 }
 
 
-@pytest.mark.sample(5)
+@pytest.mark.sample(7)
 @every_kind
 @pytest.mark.parametrize("identity", IDENTITIES.values(), ids=IDENTITIES)
 def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(kind, identity):
