@@ -248,7 +248,7 @@ def test_a_request_is_offered_where_it_is_open():
 
 
 def test_the_gain_is_of_the_task_and_columns_are_those_of_the_scenario():
-    crowded = roll(["scenario=delaybench/crowded"], 3)
+    crowded = roll(["scenario=delaybench/crowded"], 3, policy="script")
     search = roll(SEARCH, 3)
     belief = roll(["scenario=delaybench/tracking", "aware=belief"], 3)
     offers = {
@@ -257,13 +257,10 @@ def test_the_gain_is_of_the_task_and_columns_are_those_of_the_scenario():
     assert [*offers["c"]] == [
         "east", "north", "new", "new to all", "in turn", "others", "gain", "choice", "legal",
     ]  # fmt: skip
-    rolls = ([], ["observation.advice=false"])
-    advised, facts = (
-        observed(*roll(["scenario=delaybench/crowded", *words], 3, policy="script"))
-        for words in rolls
-    )
+    words = ["scenario=delaybench/crowded", "observation.advice=false"]
+    facts = observed(*roll(words, 3, policy="script"))
     assert [*facts] == ["east", "north", "new", "new to all", "others", "legal"]
-    assert all(advised[name].equal(fact) for name, fact in facts.items())
+    assert all(offers["c"][name].equal(fact) for name, fact in facts.items())
     torch.testing.assert_close(offers["c"]["gain"], offers["c"]["in turn"], atol=1e-3, rtol=0)
     assert {"time", "source", "own source"} <= {*offers["s"]}
     assert "request" not in offers["s"]
