@@ -76,7 +76,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     state = TrainingState(folder, learner.components(), collector, clock, buffer, hindsight)
     begin(config, state)
     if config.region.kind == "geojson":  # what was read of a map
-        print(save_region(config, config.seed, folder / "region.png"), flush=True)
+        print(save_region(env.uav_env.simulation, folder / "region.png"), flush=True)
     if config.compiles:
         print("compiling: the first update takes up to a minute longer")
     made = state.progress.frames

@@ -46,18 +46,18 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     """
     actions = env.uav_env.scenario.actions
     checks.require(actions.kind == "discrete", "policy", "planner", "needs discrete actions")
-    late = env.uav_env.scenario.tells_commands
-    checks.require(not late, "policy", "planner", "plans for actions.command=relative")
+    available = env.observation_spec.keys(True, True)
+    relative = keys.COMMANDS not in available
+    checks.require(relative, "policy", "planner", "plans for actions.command=relative")
     if not env.delays.obs.late:
         worlds = ForetoldWorlds(env.uav_env.simulation)
         planner = Planner(env.uav_env, worlds, horizon, samples)
         return TensorDictModule(planner, [keys.MESSAGE], [keys.ACTION])
     should = "plans from late messages with observation.own=true observation.forward=script"
-    told = keys.RECALLED in env.observation_spec.keys(True, True)
-    checks.require(told, "policy", "planner", should)
+    checks.require(keys.RECALLED in available, "policy", "planner", should)
     planner = LatePlanner(env.uav_env, ToldWorlds(env.uav_env.simulation), horizon, samples)
     read: list[NestedKey] = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
-    if keys.ACTION_MASK in env.observation_spec.keys(True, True):
+    if keys.ACTION_MASK in available:
         read.append(keys.ACTION_MASK)
     return TensorDictModule(planner, read, [keys.ACTION])
 

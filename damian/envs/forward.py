@@ -222,8 +222,8 @@ class Forward(WorldTransform):
         return {"elapsed": now}, written
 
     def _with_own(self, assumed: Assumed, commands: Tensor) -> Assumed:
-        """What is assumed of others, and of the observer of each copy what it has sent,
-        ``commands`` [B, N, K, 3]; all hold until the first command arrives."""
+        """The actions in each copy: the observer executes the commands that it has sent, ``commands``
+        [B, N, K, 3], others do what is assumed, and all hold until the first command arrives."""
         observer = torch.arange(commands.shape[1], device=commands.device)
         observer = observer.repeat(len(commands)).unsqueeze(-1)
         place, _, latest = commands.flatten(0, 1).unbind(-1)

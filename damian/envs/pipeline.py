@@ -196,7 +196,7 @@ def server_transforms(
             scenario, server, keys.HEARD_STOPS, keys.LINK_DELAY, group=True
         )
     if forward:
-        transforms += forward_transforms(scenario, delays, env, masks=output_messages)
+        transforms += forward_transforms(scenario, delays, env, held, masks=output_messages)
         heard = keys.FORWARD
     node = ServerNode(
         server,
@@ -209,11 +209,14 @@ def server_transforms(
 
 
 def forward_transforms(
-    scenario: ScenarioConfig, delays: ScenarioDelays, env: UavEnv, *, masks: bool
+    scenario: ScenarioConfig,
+    delays: ScenarioDelays,
+    env: UavEnv,
+    held: NestedKey,
+    *,
+    masks: bool,
 ) -> list[Transform]:
     """What flies late messages forward, and before it what keeps those of the latest steps."""
-    delayed = delays.obs.late
-    held = keys.RECEIVED if delayed else keys.MESSAGE
     steps = scenario.observation.forward_steps
     if not delays.obs.loses:  # what has been sent before has arrived
         steps = min(steps, delays.obs.longest + longest_flight(env.simulation))
@@ -221,7 +224,7 @@ def forward_transforms(
         steps + 1,
         keys.MESSAGE,
         keys.RECALLED,
-        delay_key=keys.DELAY if delayed else None,
+        delay_key=keys.DELAY if delays.obs.late else None,
         sent_key=keys.MESSAGE_SENT,
         own_key=keys.OWN_RECALLED,
     )

@@ -14,7 +14,7 @@ TRAIL, HOPS = 8, 3
 INK = "#222222"
 """Colour of texts, and of messages that are lost."""
 LATENESS = ("#a3b1bb", "#e08a00", "#7a0019")
-"""Colours of what is not late, late, and as late as it gets: the later, the darker."""
+"""Colours of delays: none, medium, and the longest."""
 
 
 @dataclass(frozen=True)

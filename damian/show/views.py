@@ -22,7 +22,7 @@ HEAT = LinearSegmentedColormap.from_list("belief", [(0.45, 0.2, 0.6, 0.0), (0.45
 """Colours of the belief about the sources."""
 _NORM = LogNorm(LIKELY, 1.0)
 LATE = LinearSegmentedColormap.from_list("lateness", LATENESS)
-"""Colours of messages, and of what is known of a UAV, by how late they are."""
+"""Colours of messages by their delay, and of UAVs by the age of the newest message."""
 COVERED = LinearSegmentedColormap.from_list("covered", [(0.3, 0.6, 0.5, 0.0), (0.3, 0.6, 0.5, 0.5)])
 """Colours of the ground that footprints have covered, which fade to ``_FADED`` in ``_FADE`` steps."""
 _FADED, _FADE = 0.25, 4.0

@@ -139,7 +139,7 @@ def test_a_picture_shows_what_a_film_of_the_episode_shows():
     env.reset(seed=0)
     first = env.render()
     env.step(env.action_space.sample())
-    assert first.shape[1:] == (720, 3)
+    assert first.shape == (690, 720, 3)
     assert first.dtype == np.uint8
     assert not np.array_equal(first, env.render())
     env.reset(seed=0)

@@ -112,9 +112,6 @@ def test_a_choice_earns_what_follows_the_execution_of_its_action():
     assert counted == {True, False}
 
 
-# How back-updating changes the importance ratios of the first pass.
-
-
 def test_a_nan_counts_only_if_weights_are_wrong():
     network = nn.Linear(2, 2)
     components = {
