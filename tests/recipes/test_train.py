@@ -97,6 +97,8 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     fewer = (f"resume={same}", "frames=100")
     made = "frames: 100 is fewer than the 256 that the run has made"
     check_refused(lambda: run(*fewer, folder="second"), made, capsys)
+    run(f"resume={same}", "frames=250", folder="second")
+    assert (same / "metrics.csv").read_text() == before, "nothing was left to train"
     run(f"resume={same}", "frames=512", folder="second")
     assert (same / "metrics.csv").read_text().startswith(before)
     assert [row["frames"] for row in metrics(same)] == [128.0, 256.0, 384.0, 512.0]
@@ -106,7 +108,7 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
     assert (
         resumed["resumed"][0]["command"]
-        == f"damian train resume={same} frames=512 hydra.run.dir=second"
+        == f"damian train resume={same} frames=250 hydra.run.dir=second"
     )
 
 
