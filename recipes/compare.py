@@ -77,6 +77,7 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
     for (place, task, held_out), (delay, words) in product(places, delays.items()):
         for name, method in config.chosen("methods").items():
             fits = method.delayed == (delay != NOT_LATE) and _in(method.tasks, task)
+            fits = fits and _in(method.delays, delay)
             if fits and _in(held_out.methods, name) and _in(held_out.delays, delay):
                 overrides = _replaced([*tasks[task], *words], held_out.overrides)
                 runs += _seeds(config, composed, folder / place / delay / name, task, overrides)

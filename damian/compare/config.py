@@ -48,6 +48,9 @@ class Method(Settings):
         choices=("untrained", "script", "planner"),
     )
     tasks: list[str] | None = setting(None, "Tasks that the method does; all of them if not given.")
+    delays: list[str] | None = setting(
+        None, "Delays under which the method runs; all of them if not given."
+    )
     simulator: bool | None = setting(
         None,
         "Whether its training uses what only a simulator knows; if not given, whether ``source`` "
@@ -137,9 +140,11 @@ class Experiment(Settings):
                 "goes with neither policy_of nor delayed=false",
             )
             source = self.methods.get(method.source or "", method)
-            for task in self.tasks if method.tasks is None else method.tasks:
-                options = self.tasks if source.tasks is None else source.tasks
-                checks.one_of(f"{key}.tasks", task, options)
+            for kind in ("tasks", "delays"):
+                every = getattr(self, kind)
+                does, options = (getattr(each, kind) for each in (method, source))
+                for each in every if does is None else does:
+                    checks.one_of(f"{key}.{kind}", each, every if options is None else options)
 
 
 @dataclass

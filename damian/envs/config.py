@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 from damian.common import checks
 from damian.common.fields import Settings, setting
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.server.config import EVENTS, EpisodeConfig, ObservationConfig, RewardConfig
+from damian.server.config import (
+    EVENTS,
+    PENDING,
+    EpisodeConfig,
+    ObservationConfig,
+    RewardConfig,
+)
 from damian.world.config import FOOTPRINT, WorldConfig
 
 if TYPE_CHECKING:
@@ -179,8 +185,12 @@ class ScenarioConfig(WorldConfig):
         for problem, wrong in refused.items():
             self.refuse(absolute and wrong, "actions.command", problem)
         problem = "needs actions.command=absolute and a delay of actions: nothing else is under way"
-        wanted = self.observation.intent and not self.tells_commands
-        self.refuse(wanted, "observation.intent", problem)
+        wanted = {
+            "observation.intent": self.observation.intent,
+            "observation.local_features": PENDING in self.observation.local_features,
+        }
+        for key, asked in wanted.items():
+            self.refuse(asked and not self.tells_commands, key, problem)
 
     def _check_forward(self) -> None:
         forward = self.observation.forward
@@ -231,6 +241,18 @@ class ScenarioConfig(WorldConfig):
     def announced(self) -> int:
         longest = self.make_delays().act.longest if self.observation.intent else 0
         return min(longest, self.observation.carried_stops)
+
+    @property
+    def pending(self) -> int:
+        return self.latest_commands if PENDING in self.observation.local_features else 0
+
+    @property
+    def latest_commands(self) -> int:
+        """Number of a UAV's latest commands that it remembers."""
+        delays = self.make_delays()
+        # At most so many are under way, or have been executed since the message that is known.
+        longest = delays.act.longest + (0 if self.observation.own else delays.obs.longest)
+        return max(min(longest, self.observation.carried_stops), 1)
 
     @property
     def seeks_source(self) -> bool:

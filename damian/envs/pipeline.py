@@ -133,9 +133,7 @@ def action_transforms(
     }
     if not scenario.tells_commands:
         return [ActionDelay(act, keys.ACTION, **options)]
-    # At most so many are under way, or have been executed since the message that is known.
-    longest = act.longest + (0 if scenario.observation.own else delays.obs.longest)
-    n_commands = max(min(longest, scenario.observation.carried_stops), 1)
+    n_commands = scenario.latest_commands
     waits = not simulation.vehicles.instant
     return [CommandDelay(act, simulation.candidates, n_commands, waits=waits, **options)]
 

@@ -9,6 +9,8 @@ from damian.common.fields import Settings, constant, setting
 
 EVENTS = "events"
 """The feature for which messages tell what happened at each stop."""
+PENDING = "pending"
+"""The feature that shows a UAV its own latest commands."""
 
 
 @dataclass

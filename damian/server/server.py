@@ -305,7 +305,12 @@ class Server:
         events = F.pad(messages.events, (0, 0, place.shape[-1], 0))
         there = gather_rows(self._context.points, trail[..., 0])
         moves = n_under_way > 0
+        pending = commands[..., : self._widths.pending, :]
+        leads_to, chosen, _ = pending.unbind(-1)
+        facts = [(chosen - 1) * self.dt, chosen <= messages.executed, torch.ones_like(chosen)]
+        known = torch.cat([gather_rows(self._context.points, leads_to), torch.stack(facts, -1)], -1)
         return messages._replace(
+            pending=known * (chosen > 0).unsqueeze(-1),
             position=torch.where(moves, there, messages.position),
             target=torch.where(moves, there, messages.target),
             trail=trail,

@@ -574,6 +574,11 @@ class WorldConfig(Settings):
         return 0
 
     @property
+    def pending(self) -> int:
+        """Number of its own latest commands that a UAV observes."""
+        return 0
+
+    @property
     def seeks_source(self) -> bool:
         """Whether anything is won by finding a source."""
         return True

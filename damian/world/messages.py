@@ -37,6 +37,8 @@ class Widths(NamedTuple):
     """1 if messages tell which command was executed last."""
     announced: int = 0
     """Number of commands under way of which messages tell, D."""
+    pending: int = 0
+    """Number of latest commands of which a UAV keeps what it knows, P."""
 
 
 ONE_SOURCE = Widths()
@@ -91,6 +93,10 @@ class Messages(NamedTuple):
     announced: Annotated[Tensor, Column(None)]
     """Where the commands under way lead, the newest first, east, north [m], by when they will have
     been executed [s], and 1; zeros for no command, [*, N, D, 4]."""
+    pending: Annotated[Tensor, Column(None)]
+    """What the UAV knows of its own latest commands, the newest first: where each leads, east,
+    north [m], when it was chosen [s], whether it, or a later one, is known to have been executed,
+    and 1; zeros for no command, and in a message that is sent, [*, N, P, 5]."""
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a
     stop."""
@@ -144,6 +150,7 @@ class Messages(NamedTuple):
             true_position=found.true_position.unflatten(-1, (widths.truths, 2)),
             requests=found.requests.unflatten(-1, (widths.requests, 3)),
             announced=found.announced.unflatten(-1, (widths.announced, 4)),
+            pending=found.pending.unflatten(-1, (widths.pending, 5)),
             events=found.events.unflatten(-1, (stops, widths.events)),
         )
 
@@ -183,8 +190,8 @@ class Messages(NamedTuple):
 
 _HINTS = get_type_hints(Messages, include_extras=True)
 _COLUMNS: list[Column] = [hint.__metadata__[0] for hint in _HINTS.values()]
-_ROWS = ("detected_position", "true_position", "requests", "announced", "events")
-"""Fields that have a row for each source, request or stop."""
+_ROWS = ("detected_position", "true_position", "requests", "announced", "pending", "events")
+"""Fields that have a row for each source, request, command or stop."""
 _FIXED = sum(column.width or 0 for column in _COLUMNS)
 """Number of columns of all fields whose number does not depend on the settings; they come first."""
 
@@ -198,5 +205,5 @@ def _variable(widths: Widths) -> list[int]:
     n = widths.sources
     m = widths.requests
     t = widths.truths
-    told = widths.commands, 4 * widths.announced
+    told = widths.commands, 4 * widths.announced, 5 * widths.pending
     return [n, 2 * n, t, 2 * t, 3 * m, m, min(m, 1), *told, widths.readings]

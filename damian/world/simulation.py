@@ -66,6 +66,7 @@ class Simulation:
             n_events,
             int(config.tells_commands),
             config.announced,
+            config.pending,
         )
         regions = regions_of(config.region, rng)
         longest = max(config.actions.distances)
@@ -337,6 +338,7 @@ class Simulation:
             serves=serves,
             executed=sent.executed,
             announced=sent.announced,
+            pending=sent.pending,
             trail=trail,
             landed=landed,
             events=events,

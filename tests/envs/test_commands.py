@@ -29,6 +29,7 @@ from damian.world.landing import action_table
 
 ABSOLUTE = ActionConfig(command="absolute")
 LONG = EpisodeConfig(max_steps=1000)
+OBSERVED = (OBSERVATION, GLOBAL_OBSERVATION)
 WIDE = RegionConfig(
     kind="vertices", vertices=[[0, 0], [600, 0], [600, 600], [0, 600]], lattice_step=40.0
 )
@@ -311,10 +312,47 @@ def test_what_does_not_go_with_absolute_commands_is_refused_in_one_line(changed,
         square(**({"actions": ABSOLUTE} | changed))
 
 
-def test_intents_need_commands_that_are_under_way():
+@pytest.mark.parametrize(
+    "observation", [ObservationConfig(intent=True), ObservationConfig(["place", "pending"])]
+)
+def test_what_tells_of_commands_needs_some_that_are_under_way(observation):
     for late in ({}, {"actions": ABSOLUTE}, {"delay": DelayConfig(act=2)}):
-        with pytest.raises(InputError, match=r"^observation.intent: True needs [^\n]*$"):
-            square(**late, observation=ObservationConfig(intent=True))
+        with pytest.raises(InputError, match=r"^observation[^\n]* needs actions.command[^\n]*$"):
+            square(**late, observation=observation)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_agents_see_their_latest_commands_and_which_are_known_to_be_executed(own):
+    delay = DelayConfig(obs=2, act="1..3", act_loss=0.3)
+    observation = ObservationConfig(["place", "pending"], own=own, stops=8)
+    common = {"region": WIDE, "delay": delay, "observation": observation, "episode": LONG}
+    env = make_env(square(agents=2, **common, actions=ABSOLUTE), 3, extras=["message"])
+    points = env.uav_env.simulation.points
+    half = env.uav_env.simulation.airspace.scale[0] / 2
+    generator = torch.Generator().manual_seed(4)
+    td = env.reset()
+    frames = [td[FRAME]]
+    fates = set()
+    for now in range(1, 20):
+        td = env.step(td.set(ACTION, random_actions(env.uav_env, generator)))["next"]
+        frames.append(td[FRAME])
+        read = {OBSERVATION: "message" if own else "received", GLOBAL_OBSERVATION: "received"}
+        shown = {key: env.layout[key[-1]]["pending"].of(td[key]) for key in OBSERVED}
+        remembered = shown[OBSERVATION].shape[-2]
+        assert remembered == (3 if own else 5)
+        for k in range(min(now, remembered)):
+            number = now - k  # of the command after which an agent's frame was this
+            way = ((points[frames[number]] - points[td[FRAME]]) / half).clamp(-1, 1)
+            for key, value in shown.items():
+                east_north, age, known, exists = value[..., k, :].split([2, 1, 1, 1], -1)
+                assert east_north.allclose(way, atol=1e-5)
+                assert age.allclose(torch.tensor((k + 1) / remembered))
+                assert exists.all()
+                messages = env.uav_env.server.messages(td["agents", read[key]])
+                assert known.bool().equal(messages.executed >= number)
+                fates.update(known.flatten().tolist())
+        assert not any(value[..., now:, :].any() for value in shown.values())
+    assert fates == {0.0, 1.0}
 
 
 @pytest.mark.parametrize(("obs", "act"), [(0, 2), (2, 3), (3, 2)])

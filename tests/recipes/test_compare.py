@@ -235,15 +235,16 @@ def test_a_mistake_is_one_line_and_leaves_no_folder(
 def test_runs_go_seed_by_seed_and_a_held_out_delay_replaces_the_one_of_the_training():
     methods = {
         "best": Method(delayed=False),
-        "naive": Method(naive=True, tasks=["a"]),
+        "naive": Method(naive=True, tasks=["a"], delays=["late"]),
     }
-    methods["flown"] = Method(policy_of="best", tasks=["b"])
+    methods["flown"] = Method(policy_of="best", tasks=["b"], delays=["late"])
     tasks = {task: ["scenario=delaybench/tracking"] for task in ("a", "b")}
     held_out = {
         "six": HeldOut(["delay.obs=6"], ["a"]),
         "burst": HeldOut(["delay=burst"], ["a"]),
     }
-    experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, methods, held_out, first_seed=3)
+    delays = {"late": ["delay.obs=2"], "later": ["delay.obs=4"]}
+    experiment = Experiment(tasks, delays, methods, held_out, first_seed=3)
     config = CompareConfig(experiment, seeds=2)
     runs = plan(config, Path("runs"))
     trains = [run for run in runs if run.work is train]

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
-from damian.server.config import EVENTS, ObservationConfig
+from damian.server.config import EVENTS, PENDING, ObservationConfig
 from damian.server.features.base import FeatureCache, ServerContext, feature
 from damian.server.features.others import OTHERS, four, of_nearest, ways_to_nearest
 from damian.transforms.timeline import told_slots
@@ -114,3 +114,28 @@ def _announced(v: FeatureCache) -> Tensor:
     ways = ways_to_nearest(v, torch.cat([place, exists], -1))
     announced = torch.cat([ways[..., :2], until, ways[..., 2:]], -1)
     return four(announced.flatten(-2)).unflatten(-1, announced.shape[-2:])
+
+
+@feature(
+    "local",
+    [None, 5],
+    low=-1.0,
+    name=PENDING,
+    entries=["east", "north", "age", "executed", "pending"],
+    rows="commands",
+)
+def _pending(v: FeatureCache) -> Tensor:
+    """What a UAV knows of its own latest commands, some of which may be lost or dropped,
+    [*, N, P, 5].
+
+    Of each, the newest first: the way to its place, east and north, as in ``timeline``, how long
+    ago it was chosen, over P steps, whether a message tells that it, or a later one, was executed,
+    and 1.
+    """
+    pending = v.wanted(v.messages.pending)
+    place, chosen, facts = pending.split([2, 1, 2], -1)
+    frame = v.wanted(v.messages.target).unsqueeze(-2)
+    age = (v.context.now[..., None, None, None] - chosen) / (v.context.dt * pending.shape[-2])
+    exists = facts[..., 1:]
+    known = torch.cat([v.scaled(place - frame), age, facts], -1)
+    return (known * exists).clamp(-1, 1)
