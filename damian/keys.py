@@ -127,6 +127,8 @@ STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")
 """The critic's estimate of the return, and the target that it is trained on, [B, N, 1] each."""
 ADVANTAGE = (AGENTS, "advantage")
 """Advantage of the action, [B, N, 1]."""
+TEACHER_ACTION = (AGENTS, "teacher_action")
+"""What a teacher would choose, [B, N]."""
 BACKUPDATED = (AGENTS, "backupdated")
 """Has a late message changed the stored reward of this step, [T, B, N, 1] bool; if only rewards are
 late: has it been credited with a late reward."""

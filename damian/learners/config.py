@@ -179,8 +179,26 @@ class MappoConfig(LearnerConfig):
     anneal: bool = setting(
         False, "The learning rate and the entropy bonus fall to zero over the run."
     )
+    teacher: str | None = setting(
+        None,
+        "Whose choices the policy imitates first: the script's or the planner's, for whom nothing "
+        "is late.",
+        choices=("script", "planner"),
+    )
+    teacher_horizon: int = setting(4, "Steps that a planning teacher looks ahead.", low=1, high=100)
+    imitate: int = setting(
+        50_000, "Environment steps in which the policy does nothing but imitate.", low=1
+    )
+    teacher_fades: int = setting(
+        100_000, "Environment steps after these in which imitation fades.", low=1
+    )
 
     learner: ClassVar[str] = "damian.learners.mappo:Mappo"
+
+    @property
+    def reads(self) -> tuple[str, ...]:  # type: ignore[override]
+        """A teacher reads messages."""
+        return ("message",) if self.teacher else ()
 
     def check(self, setup: LearningSetup) -> None:
         recurrent = setup.model.recurrent
@@ -198,6 +216,9 @@ class MappoConfig(LearnerConfig):
         checks.require(fits, "learner.credit_executed", True, should)
         should = "does not go with model.rnn: hidden states are not recomputed"
         checks.require(not (recurrent and setup.recompute_actor), "corrected", "actor", should)
+        on_time = setup.action_delay == 0
+        should = "knows what to choose where actions are not delayed"
+        checks.require(not self.teacher or on_time, "learner.teacher", self.teacher, should)
 
     def credit_delay(self, setup: LearningSetup) -> int:
         """Steps after a choice from which on it earns rewards."""

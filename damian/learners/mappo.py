@@ -7,6 +7,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torch.distributions import Distribution
 from torch.nn.functional import pad, smooth_l1_loss
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
@@ -15,13 +16,15 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
 from damian.common.compiling import COMPILE_OPTIONS, compiled
+from damian.envs.delayed_env import DelayedEnv
 from damian.learners.base import UNREAD, LearningSetup
 from damian.learners.config import MappoConfig
+from damian.learners.teacher import Teacher
 from damian.models.critic import NormalizedValue, make_critic
 from damian.models.memory import RECURRENT_KEYS
 from damian.replay.backupdate import BackupdateStorage
 
-LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
+LOSSES = ("loss_objective", "loss_entropy", "loss_critic", "loss_teacher")
 """Names of the terms of the loss (``mappo_losses``)."""
 NUMBERS = ("kl", "clip_fraction", "entropy")
 """Names of the further numbers that ``mappo_losses`` returns."""
@@ -77,6 +80,10 @@ class Mappo:
         unread = [keys.ACTION_MASK] if observed else [keys.ACTION_MASK, keys.OBSERVATION]
         self.unread = [*UNREAD, *map(keys.next_key, unread)]
         self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
+        self.teacher = None
+        if config.teacher is not None:
+            worlds = cast(DelayedEnv, env).uav_env
+            self.teacher = Teacher(worlds, config.teacher, config.teacher_horizon)
         # Compiling a recurrent actor, whose loop over time becomes one graph, takes many minutes.
         compiles = setup.compile and not setup.model.recurrent
         self.losses = compiled(self._losses, options=COMPILE_OPTIONS) if compiles else self._losses
@@ -94,6 +101,8 @@ class Mappo:
         if delay := self.config.credit_delay(self.setup):
             corrected, executed = executed_choices(corrected, delay)
         add_advantages(corrected, self.critic, self.config, executed)
+        if self.teacher and self._imitation() > 0:
+            corrected[keys.TEACHER_ACTION] = self.teacher(corrected)
         numbers = self.optimize(corrected)
         self.progress.updates += 1
         self.progress.frames += batch.numel()
@@ -127,8 +136,16 @@ class Mappo:
 
     def _weights_of_losses(self) -> list[float]:
         """Factors of ``LOSSES`` in this update."""
-        moves = float(self.progress.updates >= self.config.warm_up)
-        return [moves, moves * self._left(), 1.0]
+        imitation = self._imitation()
+        moves = float(self.progress.updates >= self.config.warm_up and imitation < 1)
+        return [moves, moves * self._left(), 1.0, imitation]
+
+    def _imitation(self) -> float:
+        """Weight of what the teacher would choose in this update."""
+        if self.teacher is None:
+            return 0.0
+        fades = (self.progress.frames - self.config.imitate) / self.config.teacher_fades
+        return min(max(1 - fades, 0.0), 1.0)
 
     def _left(self) -> float:
         """What is left of the learning rate and of the entropy bonus, a share."""
@@ -159,7 +176,7 @@ class Mappo:
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
         """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
         recurrent = self.setup.model.recurrent
-        read = [*self.loss_keys, *self.critic.in_keys]
+        read = [*self.loss_keys, keys.TEACHER_ACTION, *self.critic.in_keys]
         if recurrent:
             read += RECURRENT_KEYS
         samples = {}
@@ -189,11 +206,12 @@ def mappo_losses(
     critic: TensorDictModule,
     config: MappoConfig,
 ) -> tuple[Tensor, Tensor]:
-    """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names,
+    """Mean terms of the loss on steps [*], named in ``LOSSES``, [4], and what ``NUMBERS`` names,
     [3].
 
     The terms of the loss are the clipped objective of PPO and the entropy (Schulman et al. 2017),
-    over decisions, and the error of the critic, over all steps. The numbers are means over
+    over decisions, the error of the critic, over all steps, and the cross-entropy to what a teacher
+    would choose, over decisions. The numbers are means over
     decisions: an estimate of the Kullback-Leibler divergence from the policy that collected the
     steps (ratio - 1 - log ratio), the share of importance ratios beyond the clipping, and the
     entropy [nats].
@@ -204,7 +222,7 @@ def mappo_losses(
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
-    log_ratio, entropy = policy_terms(steps, actor)
+    policy, log_ratio, entropy = policy_terms(steps, actor)
     ratio = log_ratio.exp()
     advantage = entries[keys.ADVANTAGE].squeeze(-1)
     epsilon = config.clip_epsilon
@@ -216,10 +234,15 @@ def mappo_losses(
     value = critic(steps)[keys.STATE_VALUE]
     target = entries[keys.VALUE_TARGET]
     error = smooth_l1_loss(value / scale, target / scale)
+    imitation = torch.zeros_like(error)
+    if keys.TEACHER_ACTION in entries:
+        likely = policy.log_prob(entries[keys.TEACHER_ACTION])
+        imitation = -(likely * ready).sum() / n_decisions
     losses = [
         -(objective * ready).sum() / n_decisions,
         -config.entropy_coeff * mean_entropy,
         config.critic_coeff * error,
+        imitation,
     ]
     with torch.no_grad():
         divergence = (ratio - 1 - log_ratio) * ready
@@ -230,16 +253,18 @@ def mappo_losses(
     return torch.stack(losses), numbers
 
 
-def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
-    """Log-ratios of importance on steps [*], and entropies of the policies (estimated by one draw
-    if continuous), [*, N]."""
+def policy_terms(
+    steps: TensorDictBase, actor: ProbabilisticActor
+) -> tuple[Distribution, Tensor, Tensor]:
+    """The policies on steps [*], log-ratios of importance, and entropies (estimated by one draw if
+    continuous), [*, N]."""
     with set_recurrent_mode(True):
         policy = actor.get_dist(steps)
     log_ratio = policy.log_prob(steps[keys.ACTION]) - steps[keys.ACTION_LOG_PROB]
     if isinstance(policy, TanhNormal):
         _, log_prob = policy.rsample_and_log_prob()
-        return log_ratio, -log_prob
-    return log_ratio, policy.entropy()
+        return policy, log_ratio, -log_prob
+    return policy, log_ratio, policy.entropy()
 
 
 def executed_choices(batch: TensorDictBase, delay: int) -> tuple[TensorDictBase, Tensor]:

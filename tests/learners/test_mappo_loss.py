@@ -99,10 +99,10 @@ def torchrl_losses(learner, batch):
 
 
 def losses_of(learner, batch, config=None):
-    """The terms of our loss on all steps of a batch [B, T]."""
+    """The terms of our loss on all steps of a batch [B, T], but the teacher's."""
     entries = loss_entries(learner, batch)
     config = config or learner.config
-    return mappo_losses(entries, learner.actor, learner.critic, config)[0]
+    return mappo_losses(entries, learner.actor, learner.critic, config)[0][:3]
 
 
 def with_gradients(learner, losses):
@@ -118,7 +118,7 @@ def with_gradients(learner, losses):
 def test_the_losses_and_their_gradients_are_torchrls(case):
     _, learner, batch = flown(case)
     with torch.no_grad():
-        log_ratio, _ = policy_terms(batch.copy(), learner.actor)
+        _, log_ratio, _ = policy_terms(batch.copy(), learner.actor)
     ready = batch[keys.READY]
     clipped = ((log_ratio.exp() - 1).abs() > CONFIG.clip_epsilon)[ready].float().mean()
     assert 0.2 < clipped < 0.8

@@ -48,7 +48,7 @@ def batches(env, actor, steps, n):
 
 def ratios(learner, batch):
     """Importance ratios in the loss, [B, T, N]."""
-    return policy_terms(batch.clone(), learner.actor)[0].detach().exp()
+    return policy_terms(batch.clone(), learner.actor)[1].detach().exp()
 
 
 @both_kinds_and_motions
