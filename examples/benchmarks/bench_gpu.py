@@ -1,14 +1,16 @@
 """Check that a GPU computes what the CPU computes, then measure worlds of one device
 (``make bench-gpu``).
 
-    python examples/benchmarks/bench_gpu.py
-    (on a GPU: eight minutes at most) python examples/benchmarks/bench_gpu.py --device cpu --worlds
-    64 256  (the same at small sizes)
+    python examples/benchmarks/bench_gpu.py    (on a GPU: eight minutes at most, then long trainings)
+    python examples/benchmarks/bench_gpu.py --device cpu --worlds 64 256 --trainings 64 --frames 1e5
+                                               (the same at small sizes)
 
-The tables are printed as they come and written to runs/bench_gpu.md. No row begins after
-``--minutes``.
+The tables are printed as they come and written to runs/bench_gpu.md. No row of speed begins after
+``--minutes``. Trainings of ``--frames`` steps leave their run folders in runs/bench_gpu.
 """
 
+import subprocess
+import sys
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator
@@ -17,6 +19,7 @@ from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
 
+import pandas as pd
 import torch
 from bench import BARE, WHOLE, delays, policy_for, scenarios, steps_of, table
 from bench_timing import staggered
@@ -38,6 +41,11 @@ MODES = {"CUDA graph": True, "compiled": False}
 RIVALS = {"simple_spread": 1 << 20, "navigation": 1 << 20, "discovery": 1 << 16}
 """Tasks of VMAS, and the most worlds that are measured: with more, discovery takes half a second a
 step."""
+LONG = {
+    "timeline": ["scenario=delaybench/crowded", "aware=timeline"],
+    "sets": ["scenario=tasks/crowded_five", "aware=timeline", "model=sets_large"],
+}
+"""Words of ``damian train`` for long trainings, by name."""
 STEPS = 20
 REPEATS = 3
 
@@ -151,6 +159,22 @@ def trained(worlds: int, device: str) -> tuple[str, ...]:
     return first, f"{worlds:,}", "-", per_second(iterations.__next__, frames, device)
 
 
+def long_training(name: str, worlds: int, options: Namespace) -> tuple[str, ...]:
+    """A row: ``damian train`` from the start of the program to its last evaluation."""
+    folder = Path("runs/bench_gpu") / name
+    words = [*LONG[name], f"worlds={worlds}", f"frames={int(options.frames)}", "compile=true"]
+    words += [f"device={options.device}", "learner.anneal=true", "delay.obs=1..7", "logger=csv"]
+    begin = time.perf_counter()
+    subprocess.run(
+        [Path(sys.executable).with_name("damian"), "train", *words, f"hydra.run.dir={folder}"],
+        check=True,
+    )
+    seconds = f"{time.perf_counter() - begin:.0f}"
+    results = pd.read_csv(folder / "result.csv").set_index("policy")["return"]
+    returns = (f"{results[policy]:.2f}" for policy in ("trained", "script", "untrained"))
+    return name, f"{worlds:,}", f"{int(options.frames):,}", seconds, *returns
+
+
 def jobs(options: Namespace) -> Iterator[tuple[str, int, Callable[[], tuple[str, ...]]]]:
     """What makes each row, the most important first: its name, its number of worlds, and a
     function."""
@@ -213,6 +237,9 @@ def measure(options: Namespace) -> Iterator[str]:
         "a policy in a collector",
     )
     yield table("World steps a second", header, rows)
+    rows = [long_training(name, max(options.trainings), options) for name in LONG]
+    header = ("training", "worlds", "steps", "seconds", "trained", "script", "untrained")
+    yield table("Long trainings, one to seven steps late: true returns", header, rows)
 
 
 if __name__ == "__main__":
@@ -222,6 +249,7 @@ if __name__ == "__main__":
     parser.add_argument(
         "--trainings", type=int, nargs="+", default=[2048, 16384], help="worlds of trainings"
     )
+    parser.add_argument("--frames", type=float, default=1e8, help="steps of long trainings")
     parser.add_argument("--minutes", type=float, default=8.0, help="no row begins later")
     Path("runs").mkdir(exist_ok=True)
     with Path("runs/bench_gpu.md").open("w", encoding="utf-8") as report:

@@ -128,3 +128,38 @@ def test_events_need_a_timeline_and_something_that_happens():
     for changed in ({"observation": ObservationConfig([], ["events"])}, {"requests": QUIET}):
         with pytest.raises(InputError, match=r"has events, which need observation\.timeline"):
             scenario(reward=RewardConfig(coverage=1.0, spotted=0.0), **changed)
+
+
+def test_stops_are_those_of_the_newest_messages_with_how_long_ago_they_were():
+    n_stops = 5
+    observation = ObservationConfig(["place"], ["stops"], window=1, stops=n_stops)
+    case = scenario(observation=observation, delay=DelayConfig(obs=3))
+    env = make_env(case, 4, seed=1, extras=["message"])
+    torch.manual_seed(0)
+    steps = env.rollout(20, break_when_any_done=False)
+    simulation = env.uav_env.simulation
+    points = simulation.airspace.points.flatten(0, 1)
+    after = steps["next"]
+    stops = env.layout["observation"]["stops"].of(after[keys.OBSERVATION])
+    known = env.server.messages(after[keys.RECEIVED])
+    half = env.server.scales(known) / 2
+    for world in range(4):
+        elapsed = 0
+        for t in range(20):
+            elapsed = 0 if after[keys.DONE][world, t] else elapsed + 1
+            if not elapsed:
+                continue
+            now = elapsed * case.clock.dt
+            for i in range(AGENTS):
+                target = known.target[world, t]
+                away = (target - target[i]).norm(dim=-1)
+                others = [j for j in away.argsort(stable=True).tolist() if j != i]
+                for row, j in enumerate(others):
+                    expected = torch.zeros(n_stops, 4)
+                    landed = known.landed[world, t, j]
+                    for k in (landed >= 0).nonzero().flatten():
+                        way = points[known.trail[world, t, j, k]] - target[i]
+                        age = (now - landed[k]) / (2 * n_stops * case.clock.dt)
+                        facts = torch.stack([age, torch.tensor(1.0)]).clamp(max=1)
+                        expected[k] = torch.cat([(way / half[world, t]).clamp(-1, 1), facts])
+                    assert stops[world, t, i, row].allclose(expected, atol=1e-5)

@@ -74,6 +74,32 @@ def _timeline(v: FeatureCache) -> Tensor:
     return four(ways.flatten(-2)).unflatten(-1, ways.shape[-2:])
 
 
+@feature(
+    "global",
+    [OTHERS, None, 4],
+    low=-1.0,
+    name="stops",
+    entries=["east", "north", "age", "known"],
+    rows="others",
+)
+def _stops(v: FeatureCache) -> Tensor:
+    """The ``observation.stops`` latest stops of which the newest messages of the four nearest other
+    UAVs tell, the newest first, [*, N, 4, S, 4].
+
+    Of each: the way to it, east and north, as in ``timeline``, how long ago it was, over 2 S steps,
+    and 1. A timeline has the same places ordered by when they were, and those of older messages.
+    """
+    messages = v.messages
+    places = gather_rows(v.context.points, messages.trail)
+    since = v.context.now[..., None, None] - messages.landed
+    age = since / (2 * messages.trail.shape[-1] * v.context.dt)
+    known = (messages.landed >= 0).to(places.dtype)
+    ways = ways_to_nearest(v, torch.cat([places, known.unsqueeze(-1)], -1))
+    age = of_nearest(v, age.clamp(0, 1) * known).unsqueeze(-1)
+    stops = torch.cat([ways[..., :2], age, ways[..., 2:]], -1)
+    return four(stops.flatten(-2)).unflatten(-1, stops.shape[-2:])
+
+
 def columns_of_events(simulation: Simulation, _: ObservationConfig) -> tuple[str, ...]:
     """What each value of ``events`` is in a scenario."""
     n_sources = len(simulation.sources) * simulation.config.seeks_source
