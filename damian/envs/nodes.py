@@ -185,13 +185,19 @@ class ServerNode(WorldTransform):
         """What UAVs see and may do from where the commands that they have sent will have taken
         them."""
         own = entries[self.own_key] if self.own_key else received
-        messages = self.server.commanded(own, entries[keys.COMMANDS])
-        known = (entries.get(key) for key in (keys.BELIEF, keys.OWN_BELIEF, keys.STOPS))
+        belief, own_belief, timeline = (
+            entries.get(key) for key in (keys.BELIEF, keys.OWN_BELIEF, keys.STOPS)
+        )
         sent = entries[keys.COMMANDS]
-        written = self.server.observe_commanded(received, messages, sent, steps, *known)
+        seen = self.server.observe_all_commanded(received, sent, steps, belief, timeline)
+        written: Entries = {keys.GLOBAL_OBSERVATION: seen}
         if self.heard_key:  # flown forward, until the commands will have been executed
             uav = torch.arange(own.shape[-2], device=own.device)
             messages = self.server.messages(entries[self.heard_key][..., uav, uav, :])
+        else:
+            messages = self.server.commanded(own, sent)
+            known = messages, steps, belief, own_belief, timeline
+            written[keys.OBSERVATION] = self.server.observe_own_commanded(received, *known)
         frame = simulation.bound_for(messages)
         actions = simulation.config.actions
         if actions.kind == "discrete" and actions.mask:

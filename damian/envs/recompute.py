@@ -58,10 +58,15 @@ def server_recompute(
             entries[keys.STOPS] = timeline
         if commanded:
             sent = steps[next_key(keys.COMMANDS)]
+            entries[keys.GLOBAL_OBSERVATION] = server.observe_all_commanded(
+                messages, sent, elapsed, belief, timeline
+            )
+        if commanded and "actor" in corrected:
             known = steps[next_key(keys.MESSAGE)] if server.observation.own else messages
-            known = server.commanded(known, sent)
             beliefs = belief, steps.get(next_key(keys.OWN_BELIEF), None)
-            entries |= server.observe_commanded(messages, known, sent, elapsed, *beliefs, timeline)
+            entries[keys.OBSERVATION] = server.observe_own_commanded(
+                messages, server.commanded(known, sent), elapsed, *beliefs, timeline
+            )
         if own:
             sent = steps[next_key(keys.MESSAGE)]
             own_belief = steps.get(next_key(keys.OWN_BELIEF), None)

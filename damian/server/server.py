@@ -318,33 +318,42 @@ class Server:
             events=events.take_along_dim(index.unsqueeze(-1), -2),
         )
 
-    def observe_commanded(
+    def observe_all_commanded(
+        self,
+        received: Tensor,
+        commands: Tensor,
+        steps: Tensor,
+        belief: Tensor | None = None,
+        timeline: Tensor | None = None,
+    ) -> Tensor:
+        """Observations of the critic from where ``commands`` will have taken UAVs, [*, N, G].
+
+        The critic is a part of learning, which knows what all have sent.
+        """
+        all_sent = self.commanded(received, commands)
+        names = self.observation.critic
+        features = self.features(all_sent, steps, names, belief=belief, timeline=timeline)
+        return stack(features, names)
+
+    def observe_own_commanded(
         self,
         received: Tensor,
         own: Messages,
-        commands: Tensor,
         steps: Tensor,
         belief: Tensor | None = None,
         own_belief: Tensor | None = None,
         timeline: Tensor | None = None,
-    ) -> dict[NestedKey, Tensor]:
-        """Observations of actors and critic from where commands will have taken UAVs, by key.
+    ) -> Tensor:
+        """Observations of actors, who know what they have sent themselves, [*, N, F].
 
-        An actor knows what it has sent itself: ``own`` [*, N] is from ``commanded``. The critic is
-        a part of learning, which knows what all have sent. The other arguments are as in
+        ``own`` [*, N] is from ``commanded``, the other arguments are as in
         ``observe_with_own_messages``.
         """
         if own_belief is None and belief is not None:
             own_belief = belief.unsqueeze(-3)
             own_belief = own_belief.expand(*own_belief.shape[:-3], received.shape[-2], -1, -1)
         known = own.pack(), steps, own_belief, timeline, timeline
-        all_sent = self.commanded(received, commands)
-        names = self.observation.critic
-        features = self.features(all_sent, steps, names, belief=belief, timeline=timeline)
-        return {
-            keys.OBSERVATION: self.observe_with_own_messages(received, *known),
-            keys.GLOBAL_OBSERVATION: stack(features, names),
-        }
+        return self.observe_with_own_messages(received, *known)
 
     def observe_each(
         self,
