@@ -10,6 +10,11 @@ Delays that are drawn from 1 to 7 steps; two hours::
 
     python examples/studies/control.py --jobs 2 --shortest 1 --delay 7 --out runs/control_random
 
+Actions that are executed one to three steps late, too, as they arrive or held for three steps::
+
+    python examples/studies/control.py --shortest 1 --delay 3 --act 3 \
+        --methods history history+held bpql bpql+held --out runs/control_actions
+
 HalfCheetah (``pip install "gymnasium[mujoco]"``); 50 minutes, with ``--shortest 1`` drawn delays::
 
     python examples/studies/control.py --jobs 2 --env HalfCheetah-v5 --steps 30000 --delay 9 \\
@@ -65,10 +70,17 @@ from damian.learners.sac import Sac, SacConfig
 from damian.models.config import MlpConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
-from damian.transforms import ActionHistory, ObservationDelay, ObservationTimeline, set_seed
+from damian.transforms import (
+    ActionDelay,
+    ActionHistory,
+    ObservationDelay,
+    ObservationTimeline,
+    set_seed,
+)
 
 CONSTANT = ("undelayed", "naive", "history", "bpql")
 METHODS = (*CONSTANT, "timeline", "bpql+timeline", "hold", "bpql+hold")
+LATE_ACTIONS = ("history+held", "bpql+held")
 RANDOM_STEPS = 1000  # steps with random actions before the first update
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 BATCH = 256
@@ -93,6 +105,10 @@ class Task(NamedTuple):
     timeline: bool = False
     """Does the actor observe all that has arrived of the latest steps, instead of the newest
     message?"""
+    act: int = 0
+    """Longest delay of an action, drawn from one step on [steps]; 0 for none."""
+    held: bool = False
+    """Is each action executed when it is as old as the oldest may be?"""
     forward: bool = False
     """Does a copy of the environment fly the newest message forward?"""
 
@@ -126,6 +142,8 @@ def make_env(task: Task, worlds: int | None = None) -> TransformedEnv:
         ObservationDelay(law, ["observation"], ["received"], delay_key="delay"),
     ]
     ages = ["age"] * (varies and task.history > 0)
+    if task.act:
+        transforms.append(ActionDelay(Uniform(1, task.act), hold=task.held))
     transforms.append(CatTensors(["received"], "state", del_keys=False))
     read = ["received", *ages]
     if task.timeline:
@@ -222,9 +240,11 @@ def run_method(method: str, seed: int, args: Namespace) -> dict[str, float]:
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     shortest = args.delay if args.shortest is None else args.shortest
-    history = args.delay * (method not in ("undelayed", "naive"))
-    sent = args.delay if "hold" in method else shortest
-    late = Task(args.env, sent, args.delay, history, "timeline" in method)
+    history = (args.delay + args.act) * (method not in ("undelayed", "naive"))
+    words = method.split("+")
+    sent = args.delay if "hold" in words else shortest
+    late = Task(args.env, sent, args.delay, history, "timeline" in method, args.act)
+    late = late._replace(held="held" in method)
     task = Task(args.env) if method == "undelayed" else late
     env = make_env(task)
     set_seed(env, seed)
@@ -235,7 +255,7 @@ def run_method(method: str, seed: int, args: Namespace) -> dict[str, float]:
     flown = {name: late}
     if method == "undelayed":
         flown = {"0": task, name: late}
-        if args.env == Task().name:
+        if args.env == Task().name and not args.act:
             flown[f"{name}, flown forward"] = late._replace(forward=True)
     return {
         name: evaluate_under(each, learner.actor, args.episodes) for name, each in flown.items()
@@ -262,7 +282,9 @@ def table(results: Results, args: Namespace) -> str:
 
 def main(words: list[str] | None = None) -> None:
     """Train, evaluate and print the table."""
-    options = parser("SAC on a control task with late observations.", METHODS, "runs/control")
+    options = parser(
+        "SAC on a control task with late observations.", (*METHODS, *LATE_ACTIONS), "runs/control"
+    )
     options.add_argument(
         "--env", default="Pendulum-v1", help="task of Gymnasium with continuous actions"
     )
@@ -270,6 +292,9 @@ def main(words: list[str] | None = None) -> None:
     options.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
     options.add_argument(
         "--shortest", type=int, help="delays are drawn, from this to --delay [steps]"
+    )
+    options.add_argument(
+        "--act", type=int, default=0, help="longest delay of the actions, drawn from 1 on [steps]"
     )
     options.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
     options.add_argument(
