@@ -4,7 +4,6 @@ script flies on (one-at-a-time rollout; Bertsekas 2021)."""
 import time
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
@@ -56,7 +55,7 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     should = "plans from late messages with observation.own=true observation.forward=script"
     checks.require(keys.RECALLED in available, "policy", "planner", should)
     planner = LatePlanner(env.uav_env, ToldWorlds(env.uav_env.simulation), horizon, samples)
-    read: list[NestedKey] = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
+    read = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
     if keys.ACTION_MASK in available:
         read.append(keys.ACTION_MASK)
     return TensorDictModule(planner, read, [keys.ACTION])

@@ -6,7 +6,6 @@ Every UAV flies to the landing point whose footprint contains the largest total 
 import math
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
@@ -45,7 +44,7 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
     available = env.observation_spec.keys(True, True)
     if keys.FORWARD in available:
         script = ForwardScript(script_without_belief(worlds))
-        forward_keys: list[NestedKey] = [keys.FORWARD, keys.FORWARD_MASK]
+        forward_keys = [keys.FORWARD, keys.FORWARD_MASK]
         forward_keys = [key for key in forward_keys if key in available]
         return TensorDictModule(script, forward_keys, [keys.ACTION])
     believes = worlds.scenario.seeks_source and keys.BELIEF in available
@@ -56,7 +55,7 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
     message = keys.MESSAGE
     if keys.RECEIVED in available:
         message = keys.RECEIVED
-    arguments: dict[str, NestedKey] = {"message": message, "mask": keys.ACTION_MASK}
+    arguments = {"message": message, "mask": keys.ACTION_MASK}
     if script is Searcher:
         arguments |= {"belief": keys.BELIEF, "own_belief": keys.OWN_BELIEF}
     if script is Seeker:

@@ -135,7 +135,7 @@ def default_of(each: "dataclasses.Field[Any]") -> Any:
 def rules(kind: type) -> dict[str, Rule]:
     """The rules of the fields of a dataclass; a field that only changes the default keeps the
     rule."""
-    found: dict[str, Rule] = {}
+    found = {}
     for base in reversed(kind.__mro__):
         for each in getattr(base, "__dataclass_fields__", {}).values():
             if "rule" in each.metadata or each.name not in found:
@@ -157,7 +157,7 @@ def leaves(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 def nested(config: Any) -> dict[str, Any]:
     """Settings as plain data, a mapping for each section, without what ``leaves`` leaves out."""
-    found: dict[str, Any] = {}
+    found = {}
     for key, value in leaves(config):
         set_at(found, key, value)
     return found
@@ -165,7 +165,7 @@ def nested(config: Any) -> dict[str, Any]:
 
 def value_at(values: Mapping[str, Any], key: str) -> Any:
     """A value of nested data by its dotted key; None if there is none."""
-    found: Any = values
+    found = values
     for name in key.split("."):
         found = found.get(name) if isinstance(found, Mapping) else None
     return found

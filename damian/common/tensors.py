@@ -42,7 +42,7 @@ def next_true(flags: Tensor) -> Tensor:
 
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
     """Apply a function to the corresponding tensors of nested named tuples."""
-    values: list[Any] = [
+    values = [
         tree_map(function, *leaf) if hasattr(leaf[0], "_fields") else function(*leaf)
         for leaf in zip(tree, *others, strict=True)
     ]

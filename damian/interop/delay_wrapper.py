@@ -221,8 +221,8 @@ class Delays:
         infos = {}
         for agent in agents:
             parts = self._parts[agent]
-            found: Any = {part: link.held(part) for part in parts}
-            age: Any = {part: link.age[part] for part in parts}
+            found = {part: link.held(part) for part in parts}
+            age = {part: link.age[part] for part in parts}
             if agent in found:
                 found = found[agent]
                 age = age[agent]

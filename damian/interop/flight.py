@@ -95,8 +95,8 @@ class Flight:
             stepped, self._now = self.env.step_and_maybe_reset(self._now)
         else:
             stepped = self.env.step(self._now)
-            self._now = cast(TensorDictBase, step_mdp(stepped))
-        after = cast(TensorDictBase, stepped["next"])
+            self._now = step_mdp(stepped)
+        after = stepped["next"]
         if self.film:
             self.film.add(after)
         return _instant(after), _instant(self._now)
@@ -108,7 +108,7 @@ class Flight:
     def state(self) -> Array:
         """What a central critic observes of the first world, from the messages at the server,
         [N G]."""
-        return cast(Tensor, self._now[keys.GLOBAL_OBSERVATION])[0].flatten().numpy().copy()
+        return self._now[keys.GLOBAL_OBSERVATION][0].flatten().numpy().copy()
 
     def state_space(self) -> Box:
         """The space of ``state``."""

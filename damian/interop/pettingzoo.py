@@ -121,7 +121,7 @@ class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
         dt: float = 1.0,
     ) -> None:
         super().__init__(env)
-        told: ByName = {
+        told = {
             "observation": observation,
             "action": action,
             "reward": reward,

@@ -282,7 +282,7 @@ class BackupdateStorage(TimeStorage):
         keep = begins[n_right:].clone()
         keep[0] |= n_right == 0  # the step before the first one is not among these steps
         step, world = keep.nonzero(as_tuple=True)
-        before: Entries = {}
+        before = {}
         for next_, value in after.items():
             key = unravel_key(next_[1:])
             stored = None if next_ in ENDS else self.steps.get(key, None)

@@ -141,7 +141,7 @@ def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Te
     if not server.rewards_belief:
         return None
     steps = rollout.select(keys.MESSAGE, keys.BELIEF, next_key(keys.MESSAGE), next_key(keys.BELIEF))
-    sent = cast(Tensor, rollout[next_key(keys.MESSAGE_SENT)])
+    sent = rollout[next_key(keys.MESSAGE_SENT)]
     steps[next_key(keys.DELAY)] = sent.long().unsqueeze(-1) - 1  # 0, or -1 where none was sent
     steps[keys.STEP_COUNT] = elapsed.unsqueeze(-1) - 1
     beliefs = beliefs_in_hindsight(server, steps.transpose(0, 1))

@@ -98,9 +98,7 @@ def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Lo
 
     not_linked(folder / "wandb")
     number = uuid5(NAMESPACE_URL, str(folder.resolve())).hex
-    logger: Any = WandbLogger(
-        folder.name, offline, str(folder), number, project, log_env_packages=False
-    )
+    logger = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
     logger.close = import_module("wandb").finish
     return logger
 

@@ -40,11 +40,11 @@ class ReplayMemory:
         if self._buffer is None or not self._buffer.write_count:
             return {"written": 0}
         storage = self._storage
-        written = cast(int, self._buffer.write_count)
+        written = self._buffer.write_count
         oldest = written - len(storage.latest())
         per_file = -(-len(storage.steps) // FILES)
         # Late messages correct rows after these (``BackupdateStorage``).
-        final = written - cast(int, getattr(storage, "longest", -1)) - 1
+        final = written - getattr(storage, "longest", -1) - 1
         files = range(oldest // per_file, max(final // per_file, oldest // per_file))
         for file in {*files} - {*self._files}:
             make_folder(self._folder)
@@ -65,7 +65,7 @@ class ReplayMemory:
             return
         parts = [read_checkpoint(self._path(file), "resume")["rows"] for file in state["files"]]
         rows = torch.cat([to_tensordict(part) for part in (*parts, state["rows"])])  # type: ignore[arg-type]
-        rows = cast(TensorDictBase, rows)[state["oldest"] - state["written"] :]
+        rows = rows[state["oldest"] - state["written"] :]
         storage = self._storage
         if storage.device != "auto":
             rows = rows.to(storage.device)
@@ -85,7 +85,7 @@ class ReplayMemory:
 
     def _rows(self, begin: int, end: int) -> TensorDictBase:
         steps = self._storage.steps
-        return cast(TensorDictBase, steps[torch.arange(begin, end) % len(steps)])
+        return steps[torch.arange(begin, end) % len(steps)]
 
     def _path(self, file: int) -> Path:
         return self._folder / f"{file:06}.pt"

@@ -88,7 +88,7 @@ class MapView:
     def draw(self, frame: Frame) -> list[Any]:
         """Draw a frame; returns the artists that were drawn."""
         self._cover(frame.step)
-        drawn: list[Any] = []
+        drawn = []
         heat = [(part, p) for area, p in frame.cells for part in _polygons(area)]
         if heat:
             corners = [shapely.get_coordinates(part.exterior) for part, _ in heat]
@@ -151,7 +151,7 @@ class MapView:
         """Name UAVs and rings on the sides away from the line between them; names at one place lie
         apart."""
         uavs = [uav for uav in frame.uavs if uav.chosen]
-        drawn: list[Any] = []
+        drawn = []
         for number, uav in enumerate(uavs):
             true = uav.path[-1, :2]
             east, north = true - uav.believed

@@ -336,7 +336,7 @@ class StatefulTransform(Transform):
         for name, new in change[0].items():
             if new is not memory[name]:
                 memory[name] = where_rows(rows, new, memory[name])
-        merged: Entries = {}
+        merged = {}
         for key, new in change[1].items():
             # A later transform that widens an entry restores it itself.
             found = (td.get(key, None) for td in (before, after))

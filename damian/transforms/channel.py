@@ -108,7 +108,7 @@ class Channel(StatefulTransform):
         sent = in_key or ("agents", "observation")
         super().__init__(sent if action_key is None else None, seed=seed)
         self.action_key = None if action_key is None else unravel_key(action_key)
-        self._beside = cast(NestedKey, self.action_key or self.in_keys[0])
+        self._beside = self.action_key or self.in_keys[0]
         should = "is not in a group of agents, as ('agents', 'observation') is"
         in_group = isinstance(self._beside, tuple)
         checks.require(in_group, "in_key", self._beside, should)
@@ -298,7 +298,7 @@ class Channel(StatefulTransform):
         own = memory["contents"].flatten(0, 1).index_select(0, newest)
         held = memory["held"].unflatten(0, (-1, n))
         value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
-        entries: Entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
+        entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
         if self.age_key is not None:
             age = now - time.clamp(min=1)
             entries[self.age_key] = age.to(torch.float32).view(shape)

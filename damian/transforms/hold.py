@@ -100,7 +100,7 @@ class SampleAndHold(StatefulTransform):
         sampled: Tensor,
     ) -> Change:
         """Sample the entries where the mask [M] is true, and output the held values everywhere."""
-        outputs: Entries = {}
+        outputs = {}
         for i, key in enumerate(keys):
             new = self.to_rows(entries[key])
             old = memory[f"{name}_{i}"]

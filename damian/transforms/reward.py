@@ -172,7 +172,7 @@ class RewardDelay(StatefulTransform):
     def _told(self, delay: Tensor, earned: Tensor) -> Entries:
         """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards
         [M, ...]."""
-        entries: Entries = {}
+        entries = {}
         if self.delay_key is not None:
             delays = delay.unsqueeze(-1).clone()
             entries[self.delay_key] = self.from_rows(delays)
@@ -212,7 +212,7 @@ class RewardDelay(StatefulTransform):
         if key in entries:
             earned = entries[key]
         elif earned_key is not None and earned_key in steps.keys(True):
-            earned = cast(Tensor, steps[earned_key])
+            earned = steps[earned_key]
         else:
             raise InputError(
                 f"earned_key: nothing says what {key} was earned: give RewardDelay an earned_key"

@@ -54,7 +54,7 @@ def times(values: Tensor, factor: Value) -> Tensor:
 
 def values_of(config: WorldConfig) -> Values:
     """The values of the settings of a world."""
-    settings: dict[str, Value] = {}
+    settings = {}
     for section in (config.motion, config.battery, config.wind, config.source):
         for name, rule in rules(type(section)).items():
             value = getattr(section, name)

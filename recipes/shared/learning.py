@@ -90,7 +90,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
         [*learner.components()],
         "has no actor, which evaluations load: return {'actor': self.actor, ...}",
     )
-    assume(config, env, cast(TensorDictModuleBase, learner.components()["actor"]))
+    assume(config, env, learner.components()["actor"])
     return learner
 
 
@@ -205,7 +205,7 @@ def ticks(collector: Collector, clock: SystemClock, server: Server) -> Iterator[
         parts.append(part)
         if sum(part.shape[1] for part in parts) < clock.period:
             continue
-        batch = cast(TensorDictBase, torch.cat(parts, 1)) if len(parts) > 1 else part  # type: ignore[arg-type]
+        batch = torch.cat(parts, 1) if len(parts) > 1 else part  # type: ignore[arg-type]
         if clock.change:
             clock.tick(spotting(batch, server))
         parts = []

@@ -163,7 +163,7 @@ def run_settings(given: DictConfig, words: Sequence[str], program: str = "train"
     from_file = any(values.get(key) for key in ("checkpoint", "resume", "journal"))
     with stored_settings([*texts(values)], bool(values["trust"])) if from_file else nullcontext():
         if program == "train" and values["resume"] is not None:
-            config: Any = resumed(short(Path(values["resume"])), values, words)
+            config = resumed(short(Path(values["resume"])), values, words)
         elif values.get("checkpoint") is not None:
             config = with_policy_of(values, words, program)
         else:
@@ -211,7 +211,7 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     """Write the record of words, versions and machine into the run folder, then the settings."""
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    entries: dict[str, Any] = {OVERRIDES: [*config.overrides], SEED: config.seed}
+    entries = {OVERRIDES: [*config.overrides], SEED: config.seed}
     entries |= {"device": device, "threads": config.threads}
     if HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN:
         entries[JOB] = HydraConfig.get().job.num

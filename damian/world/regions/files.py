@@ -172,7 +172,7 @@ def _from_map(path: Path) -> list[_Feature]:
             }
             place = f"features[{len(found)}]"
             if path.suffix.lower() in _KML and shape and _is_picture(properties):
-                geometry: dict[str, Any] = {"type": "picture (GroundOverlay)"}
+                geometry = {"type": "picture (GroundOverlay)"}
             else:
                 geometry = _of_wkb(shape, place)
             found.append(_Feature(place, properties, geometry, about["crs"] or {}))

@@ -75,7 +75,7 @@ def _without_zones(region: Region, config: RegionConfig, rng: np.random.Generato
     checks.require(
         not kept.is_empty, "region.zones", config.zones, f"leave nothing of {region.name}"
     )
-    return replace(region, polygon=cast(Polygon | MultiPolygon, kept))
+    return replace(region, polygon=kept)
 
 
 def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
