@@ -143,7 +143,7 @@ def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
     return name
 
 
-def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+def parameters_of(function: Callable) -> dict[str, inspect.Parameter]:
     """The keyword-only arguments of a function, by name."""
     accepted = inspect.signature(function).parameters
     return {
@@ -151,9 +151,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     }
 
 
-def check_parameters(
-    function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str
-) -> None:
+def check_parameters(function: Callable, given: Mapping[str, Any], path: str, key: str) -> None:
     """Require that ``given`` are the keyword-only arguments of a function; ``path`` names it in
     errors."""
     known = parameters_of(function)

@@ -68,7 +68,7 @@ def regime(methods: Mapping[str, Method], name: str) -> str:
     return SIMULATOR if simulated else LATE_DATA
 
 
-def shown(line: Mapping[Any, Any], name: str) -> str:
+def shown(line: Mapping, name: str) -> str:
     """A value of a line and its interval, if they are known, for people."""
     value, low, high = (line[name + end] for end in ENDS)
     if np.isnan(value):

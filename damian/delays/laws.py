@@ -439,7 +439,7 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
             matrix,
             f"is not N x N, {n} x {n}: a list for each receiver, with an entry for each sender",
         )
-    distinct: list[Any] = []
+    distinct: list = []
     samplers: list[Sampler] = []
     index = []
     for i, j in itertools.product(range(n), range(n)):

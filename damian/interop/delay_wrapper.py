@@ -30,7 +30,7 @@ Sent = dict[int, tuple[Any, float]]
 """Things that were sent, each with a time, by time."""
 
 
-class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class DelayWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """Delays what the agent observes, does and earns, as the transforms do, whatever the spaces
     are.
 
@@ -64,7 +64,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
 
     def __init__(
         self,
-        env: gymnasium.Env[Any, Any],
+        env: gymnasium.Env,
         observation: Any = 0,
         action: Any = 0,
         reward: Any = 0,
@@ -149,7 +149,7 @@ class Delays:
         if self._history:
             self._chosen = {agent: _flat("history", each) for agent, each in acting.items()}
 
-    def space(self, agent: str, space: Space[Any]) -> Space[Any]:
+    def space(self, agent: str, space: Space) -> Space:
         """The space of what an agent is told, whose observations are in ``space``."""
         added = self._added(agent)
         if not added:
@@ -276,7 +276,7 @@ class _Link:
 
     def __init__(self, name: str, senders: Collection[str], told: ByName) -> None:
         loss = told["loss"] if name == "observation" else 0.0
-        laws: list[Any] = [told[name], loss]
+        laws: list = [told[name], loss]
         should = f"is named, but the names are: {listed(filter(None, senders))}"
         for key, given in zip((name, "loss"), laws, strict=True):
             if _by_name(given):
@@ -369,7 +369,7 @@ class _Link:
         return recent
 
 
-def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], Numbers, Numbers]:
+def _flat(key: str, space: Space) -> tuple[Space, Numbers, Numbers]:
     """A space, and the bound and width of each of its D numbers, 0 and 1 if they have no bounds,
     [D]."""
     flat = flatten_space(space)
@@ -389,7 +389,7 @@ def _by_name(given: Any) -> bool:
     return isinstance(given, Mapping) and "law" not in given
 
 
-def _zero(space: Space[Any]) -> Any:
+def _zero(space: Space) -> Any:
     """The action 0 of a space."""
     zeros = create_empty_array(space, 1)
     zero = next(iter(iterate(batch_space(space, 1), zeros)))

@@ -22,7 +22,7 @@ from damian.show.film import LiveFilm
 
 RENDER_MODES = ("rgb_array",)
 METADATA: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 4}
-Array = NDArray[Any]
+Array = NDArray
 
 
 class Instant(NamedTuple):
@@ -66,7 +66,7 @@ class Flight:
         """What an agent observes, [F]."""
         return self._box(keys.OBSERVATION, agent)
 
-    def action_space(self) -> Space[Any]:
+    def action_space(self) -> Space:
         """What an agent chooses: one of A actions, or a distance and a heading in [0, 1]."""
         spec = self.env.full_action_spec[keys.ACTION]
         return (
@@ -142,7 +142,7 @@ def _instant(outputs: TensorDictBase) -> Instant:
     )
 
 
-def actions_in(space: Space[Any], key: str, given: Any) -> Array:
+def actions_in(space: Space, key: str, given: Any) -> Array:
     """Actions as an array of the type of a space; refused if they do not lie in it."""
     found = np.asarray(given).astype(space.dtype, casting="same_kind")
     if not space.contains(found):

@@ -40,12 +40,12 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
             name: self.flight.observation_space(i) for i, name in enumerate(self.possible_agents)
         }
         self.action_spaces = {name: self.flight.action_space() for name in self.possible_agents}
-        self.state_space: Space[Any] = self.flight.state_space()
+        self.state_space: Space = self.flight.state_space()
 
-    def observation_space(self, agent: str) -> Space[Any]:
+    def observation_space(self, agent: str) -> Space:
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Space[Any]:
+    def action_space(self, agent: str) -> Space:
         return self.action_spaces[agent]
 
     def reset(
@@ -139,7 +139,7 @@ class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
             agent: self._delays.space(agent, space) for agent, space in observed.items()
         }
 
-    def observation_space(self, agent: str) -> Space[Any]:
+    def observation_space(self, agent: str) -> Space:
         return self._spaces[agent]
 
     def reset(

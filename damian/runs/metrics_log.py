@@ -125,7 +125,7 @@ class MetricsLog:
         self._loggers = loggers
         self._path = folder / METRICS if to_csv else None
         stored = read_metrics(folder)
-        self.rows: list[dict[Any, Any]] = stored[stored[_FIRST_COLUMN] <= frames].to_dict("records")
+        self.rows: list[dict] = stored[stored[_FIRST_COLUMN] <= frames].to_dict("records")
         self._call("log_hparams", settings or {})
 
     def show(self, frames: int, numbers: Mapping[str, float]) -> None:

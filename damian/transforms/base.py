@@ -552,7 +552,7 @@ def check_order(transforms: Sequence[Transform]) -> None:
             )
 
 
-def leaf_transforms(transform: Transform | None) -> list[Any]:
+def leaf_transforms(transform: Transform | None) -> list:
     """All transforms of a Compose and of the Composes within it, in order; or the one transform."""
     if transform is None:
         return []

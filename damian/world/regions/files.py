@@ -255,7 +255,7 @@ def _fitting(features: list[_Feature], where: str) -> _Feature:
     return found[0]
 
 
-def _polygons(geometry: dict[str, Any]) -> Iterator[list[Any]]:
+def _polygons(geometry: dict[str, Any]) -> Iterator[list]:
     """The rings of each polygon of a geometry, the shell first; those without corners are left
     out."""
     kind = geometry.get("type")
