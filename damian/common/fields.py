@@ -163,19 +163,12 @@ def nested(config: Any) -> dict[str, Any]:
     return found
 
 
-def value_at(values: Mapping[str, Any], key: str) -> Any:
-    """A value of nested data by its dotted key; None if there is none."""
+def value_at(values: Mapping[str, Any], key: str, default: Any = None) -> Any:
+    """A value of nested data by its dotted key; the default if there is none."""
     found = values
     for name in key.split("."):
-        found = found.get(name) if isinstance(found, Mapping) else None
+        found = found.get(name, default) if isinstance(found, Mapping) else default
     return found
-
-
-def has(values: Mapping[str, Any], key: str) -> bool:
-    """Whether nested data have a value, also None, at a dotted key."""
-    section, _, name = key.rpartition(".")
-    found = value_at(values, section) if section else values
-    return isinstance(found, Mapping) and name in found
 
 
 def set_at(values: dict[str, Any], key: str, value: Any) -> None:

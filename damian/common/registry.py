@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
+from pkgutil import resolve_name
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from damian.common import checks
@@ -168,11 +169,9 @@ def check_parameters(function: Callable, given: Mapping[str, Any], path: str, ke
     checks.require(not missing, key, path, f"needs a value for {', '.join(missing)}")
 
 
-def resolved(path: str) -> Any:
-    """The class or function at a path that code names, not a setting; it is imported when it is
-    needed."""
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
+resolved = resolve_name
+"""The class or function at a path that code names, not a setting; it is imported when it is
+needed."""
 
 
 def _import_path(path: str, key: str) -> Any:

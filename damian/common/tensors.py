@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 Tree = TypeVar("Tree", bound=NamedTuple)
 
@@ -49,24 +50,11 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
     return tree._make(values)
 
 
-def to_device(value: Any, device: torch.device) -> Any:
-    """Copy of a tensor, or of nested tuples and mappings of tensors and others, on another
-    device."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if isinstance(value, dict):
-        return {key: to_device(each, device) for key, each in value.items()}
-    if type(value) is tuple:
-        return tuple(to_device(each, device) for each in value)
-    return (
-        value._make(to_device(each, device) for each in value) if hasattr(value, "_make") else value
-    )
-
-
 def move_attributes(owner: object, device: torch.device) -> None:
-    """Move the tensors among an object's attributes to a device, in place."""
-    for name, value in vars(owner).items():
-        setattr(owner, name, to_device(value, device))
+    """Move the tensors among an object's attributes, and in tuples and mappings there, to a
+    device."""
+    moved = tree_map_only(Tensor, lambda each: each.to(device), vars(owner))
+    vars(owner).update(moved)
 
 
 def where_rows(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:

@@ -9,7 +9,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from damian.common.atomic_files import not_linked, remove_unfinished, write_atomically
 from damian.common.devices import keep_freed_memory
 from damian.common.errors import InputError
-from damian.common.fields import filled, has, leaves, nested, set_at, value_at
+from damian.common.fields import filled, leaves, nested, set_at, value_at
 from damian.common.registry import stored_settings
 from damian.common.text_files import read_text, show
 from damian.learners.config import LearnerConfig
@@ -309,11 +309,10 @@ def reach(key: str, program: str) -> set[str]:
     A scenario says nothing of the networks: they are those of the policy.
     """
     known = known_settings(program)
-    found = {key} & known_settings(program).keys()
+    found = {key} & known.keys()
     for written, chosen in options_in(key):
-        found |= {
-            each for each, setting in known.items() if not setting.is_section and has(written, each)
-        }
+        settings = (each for each, setting in known.items() if not setting.is_section)
+        found |= {each for each in settings if value_at(written, each, MISSING) is not MISSING}
         found |= {
             name.removeprefix("override /") for name in chosen if name.startswith("override /")
         }
