@@ -60,6 +60,10 @@ def setting(default: Any, meaning: str = "", unit: str = "", **rule: Any) -> Any
     return field(default=default, metadata=metadata)
 
 
+chance = functools.partial(setting, low=0, high=1)
+"""A field between 0 and 1."""
+
+
 def constant(default: Any, reason: str, **rule: Any) -> Any:
     """A field that is no key: a Python program may set it, but nobody needs to, for the reason
     given."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.common.fields import rules, setting
+from damian.common.fields import chance, rules, setting
 from damian.common.registry import Registry
 from damian.common.text_files import data_file, named, parse_table, read_text
 from damian.delays.config import LONGEST, is_matrix
@@ -169,7 +169,7 @@ class Uniform(Law):
     """Shortest delay: steps, or a time."""
     high: Delay = 0
     """Longest delay, written as ``low`` is."""
-    probability: float = setting(1.0, low=0, high=1)
+    probability: float = chance(1.0)
     """Probability that a message is late at all."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
@@ -225,17 +225,17 @@ class Burst(Law):
     1 and good from t = 2 on: messages sent at t = 0, 1 and 2 arrive at t = 3, 4 and 2.
     """
 
-    enter: float = setting(0.05, low=0, high=1)
+    enter: float = chance(0.05)
     """Probability that a good channel turns bad, per step."""
-    leave: float = setting(0.25, low=0, high=1)
+    leave: float = chance(0.25)
     """Probability that a bad channel turns good, per step."""
     good: Any = 0
     """Law of the delays while the channel is good; it must be memoryless."""
     bad: Any = 5
     """Law of the delays while the channel is bad; it must be memoryless."""
-    good_loss: float = setting(0.0, low=0, high=1)
+    good_loss: float = chance(0.0)
     """Probability that a message is lost while the channel is good."""
-    bad_loss: float = setting(0.5, low=0, high=1)
+    bad_loss: float = chance(0.5)
     """Probability that a message is lost while the channel is bad."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
@@ -287,7 +287,7 @@ class Lag(Law):
     update_period: Delay = 1
     """Time between two draws: steps, a time, or ``episode``: a lag is held until the end of the
     episode."""
-    hold_probability: float = setting(0.0, low=0, high=1)
+    hold_probability: float = chance(0.0)
     """Probability that an update keeps the lag instead of drawing another one."""
     shared: bool = False
     """All agents of a world have the same lags and losses."""

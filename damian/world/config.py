@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from damian.common import checks
-from damian.common.fields import Settings, check_place, constant, rules, setting
+from damian.common.fields import Settings, chance, check_place, constant, rules, setting
 
 RANDOM = ("random",)
 GEOJSON = ("geojson",)
@@ -201,12 +201,10 @@ class MotionConfig(Settings):
     level_separation: float = setting(
         0.5, "Vertical distance between two flight levels.", unit="m", above=0
     )
-    abort: float = setting(
+    abort: float = chance(
         0.0,
         "Probability that a flight ends at another legal landing point than commanded; holding "
         "included.",
-        low=0,
-        high=1,
         each=True,
     )
     options: Any = setting(
@@ -226,9 +224,7 @@ class FailureConfig(Settings):
 
     section = "failure"
 
-    probability: float = setting(
-        0.0, "Probability that a UAV fails in a simulation step.", low=0, high=1
-    )
+    probability: float = chance(0.0, "Probability that a UAV fails in a simulation step.")
     duration: float = setting(
         60.0, "Mean time after which it joins again; each step is as likely.", unit="s", above=0
     )
@@ -279,16 +275,11 @@ class SourceConfig(Settings):
         "constant, or on and off, drawn at each stop (per_stop) or simulation step (per_step).",
         choices=("constant", "per_stop", "per_step"),
     )
-    miss: float = setting(0.0, "Probability that a UAV in reach does not detect it.", low=0, high=1)
-    false_alarm: float = setting(
-        0.0,
-        "Probability that a listening UAV which is out of reach reports a detection.",
-        low=0,
-        high=1,
+    miss: float = chance(0.0, "Probability that a UAV in reach does not detect it.")
+    false_alarm: float = chance(
+        0.0, "Probability that a listening UAV which is out of reach reports a detection."
     )
-    emission_probability: float = setting(
-        0.5, "Probability that it is on, if not constant.", low=0, high=1
-    )
+    emission_probability: float = chance(0.5, "Probability that it is on, if not constant.")
     after_walk: str = setting(
         "loop",
         "After the last stop: go straight back and make the same round again (loop), or stay "
