@@ -178,14 +178,15 @@ class Comparison:
         """
         names = (*self.measured, *COMPARED)
         columns = [name + end for name in names for end in ENDS]
-        return pd.DataFrame(self._lines(), columns=[*LABELLED, *columns])
+        lines = (
+            line
+            for task in self.tasks()
+            for delay in (NOT_LATE, *self.delays(task))
+            for line in self._lines(task, delay)
+        )
+        return pd.DataFrame(lines, columns=[*LABELLED, *columns])
 
-    def _lines(self) -> Iterator[dict[str, Any]]:
-        for task in self.tasks():
-            for delay in (NOT_LATE, *self.delays(task)):
-                yield from self._lines_of(task, delay)
-
-    def _lines_of(self, task: str, delay: str) -> Iterator[dict[str, Any]]:
+    def _lines(self, task: str, delay: str) -> Iterator[dict[str, Any]]:
         scores = self.scores(task, delay)
         methods = self._present(task, delay)
         others = [(name, self.policy_of(name)) for name in methods]

@@ -159,9 +159,8 @@ class Delays:
         checks.require(
             not taken, "observation", listed(taken), "is an entry of it already: rename that"
         )
-        for name, each in added.items():
-            entries[name] = Box(-np.inf, np.inf, each.shape)
-        return Dict(entries)
+        added = {name: Box(-np.inf, np.inf, each.shape) for name, each in added.items()}
+        return Dict(entries | added)
 
     def reset(self, observations: ByName, seed: int | None) -> Told:
         """What agents are told first, and their infos; a seed decides all later delays."""
@@ -363,10 +362,8 @@ class _Link:
     def recent(self, sender: str) -> Sent:
         """What a sender sent lately, and the time until it arrives, by age [steps]."""
         now = self._now
-        recent = {}
-        for time, (thing, due) in self._sent[sender].items():
-            recent[now - time] = thing, due - now
-        return recent
+        sent = self._sent[sender].items()
+        return {now - time: (thing, due - now) for time, (thing, due) in sent}
 
 
 def _flat(key: str, space: Space) -> tuple[Space, Numbers, Numbers]:

@@ -120,9 +120,7 @@ def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, An
     (all)."""
     if worlds is None:
         worlds = np.ones(len(infos["ready"]), bool)
-    found = {}
-    for name, each in infos.items():
-        found[name] = each if name == "is_success" else each[:, 0]
+    found = {name: each if name == "is_success" else each[:, 0] for name, each in infos.items()}
     masks = {f"_{name}": worlds.copy() for name in found}
     return found | masks
 

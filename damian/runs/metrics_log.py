@@ -64,21 +64,15 @@ def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Lo
     return loggers
 
 
-class TensorBoard:
+class TensorBoard(SummaryWriter):
     """Writes TensorBoard events into the run folder; the files that a resumed run adds belong to
     the same."""
 
     def __init__(self, folder: Path, frames: int) -> None:
-        self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
+        super().__init__(str(folder), purge_step=frames + 1 if frames else None)
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
-        self._events.add_scalar(name, value, step)
-
-    def flush(self) -> None:
-        self._events.flush()
-
-    def close(self) -> None:
-        self._events.close()
+        self.add_scalar(name, value, step)
 
 
 def read_logger(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
