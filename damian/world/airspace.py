@@ -8,7 +8,6 @@ import numpy as np
 import shapely
 import torch
 from numpy.typing import NDArray
-from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
 from damian.common import checks
@@ -17,6 +16,7 @@ from damian.world.config import RegionConfig
 from damian.world.paths import Detours, detours
 from damian.world.regions.polygon import (
     RESOLUTION,
+    Area,
     Floats,
     landing_lattice,
     largest_vertex_distance,
@@ -208,7 +208,7 @@ def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: in
     return torch.where(best == _NEVER, -1, ids)
 
 
-def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], n: int) -> Cells:
+def build_cells(lattices: list[Floats], polygons: list[Area], n: int) -> Cells:
     """List the landing points that may be among the n nearest ones of any place in each cell.
 
     The n points nearest to a cell's centre are at most half a diagonal farther from any place in

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from damian.common.tensors import gather_rows
+from damian.world.regions.polygon import Area
 
 _GRID = 321
 """Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact."""
@@ -45,7 +46,7 @@ class FootprintTables(NamedTuple):
 
 
 def build_tables(
-    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],
+    polygons: Sequence[Area],
     points: np.ndarray,
     radius: float,
     words: int = 16,
@@ -67,7 +68,7 @@ def build_tables(
 
 
 def tables_of_all(
-    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],
+    polygons: Sequence[Area],
     points: np.ndarray,
     radii: Sequence[float],
 ) -> FootprintTables:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
-from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
 from damian.world.regions.geodesy import Floats
+from damian.world.regions.polygon import Area
 
 _CONVEX = 1e-9
 """Share of the area of its hull that a polygon without dents may lack."""
@@ -75,9 +75,7 @@ class Detours(NamedTuple):
         return legs.sum(-1).where(leads, torch.inf)
 
 
-def detours(
-    polygons: list[Polygon | MultiPolygon], points: list[Floats], longest: float
-) -> Detours | None:
+def detours(polygons: list[Area], points: list[Floats], longest: float) -> Detours | None:
     """The detours between landing points [L_r, 2] m of each region; None if all ways are straight.
 
     Only pairs are looked at that are at most ``longest`` [m] apart.

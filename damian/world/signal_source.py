@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from damian.world.config import SourceConfig
-from damian.world.regions.polygon import sample_interior
-
-_Polygon = shapely.Polygon | shapely.MultiPolygon
+from damian.world.regions.polygon import Area, sample_interior
 
 _TINY = 1e-9
 _FULL_DISC_ROUNDS = 256
@@ -75,7 +73,7 @@ def drawn_radius(level: Tensor, config: SourceConfig) -> Tensor:
 
 
 def draw_walks(
-    polygon: _Polygon,
+    polygon: Area,
     config: SourceConfig,
     n_walks: int,
     rng: np.random.Generator,
@@ -161,7 +159,7 @@ def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tenso
 
 
 def _draw_stops(
-    polygon: _Polygon, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
+    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Each hotspot [W, H, 2] m followed by its inner points, packed to the left and padded.
 
@@ -186,7 +184,7 @@ def _draw_stops(
 
 
 def _inner_points(
-    polygon: _Polygon, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
+    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
 ) -> np.ndarray:
     """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2]
     metres."""

@@ -16,6 +16,8 @@ from damian.common import checks
 from damian.common.errors import InputError
 from damian.world.regions.geodesy import Floats
 
+Area = Polygon | MultiPolygon
+"""What a region covers, in one part or in several."""
 RESOLUTION = 0.01
 """Distances of landing points that differ by less are not told apart [m]."""
 MAX_CANDIDATES = 5_000_000
@@ -70,14 +72,14 @@ def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: fl
     return _hull(scale * shapely.get_coordinates(hull))
 
 
-def largest_vertex_distance(polygon: Polygon | MultiPolygon) -> float:
+def largest_vertex_distance(polygon: Area) -> float:
     """Largest distance between two vertices [m], by which features divide distances."""
     corners = shapely.get_coordinates(shapely.convex_hull(polygon))
     return max(float(np.hypot(*(corners - corner).T).max()) for corner in corners)
 
 
 def landing_lattice(
-    polygon: Polygon | MultiPolygon, step_m: float, degrees: float, n_points: int | None = None
+    polygon: Area, step_m: float, degrees: float, n_points: int | None = None
 ) -> Floats:
     """Lay a serpentine lattice over the polygon; its points inside the polygon are the landing
     points.
@@ -108,7 +110,7 @@ def landing_lattice(
     return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
 
 
-def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Generator) -> Floats:
+def sample_interior(polygon: Area, n: int, rng: np.random.Generator) -> Floats:
     """Draw points uniformly in the polygon, strictly inside, [n, 2] metres.
 
     First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it

@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 import shapely
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry import Polygon
 
 from damian.common import checks
 from damian.common.registry import Registry
@@ -17,6 +17,7 @@ from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geodesy import Floats, to_latlon, to_local
 from damian.world.regions.polygon import (
+    Area,
     polygon_from_rings,
     polygon_from_vertices,
     random_polygon,
@@ -96,9 +97,7 @@ def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
     return shapely.transform(area.polygon, moved)
 
 
-def _random_zone(
-    polygon: Polygon | MultiPolygon, config: RegionConfig, rng: np.random.Generator
-) -> Polygon:
+def _random_zone(polygon: Area, config: RegionConfig, rng: np.random.Generator) -> Polygon:
     """A random convex zone about a place in the region."""
     zone = random_polygon(rng, config.zone_area, 2 * config.zone_area)
     place = sample_interior(polygon, 1, rng)[0]
