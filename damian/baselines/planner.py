@@ -109,10 +109,9 @@ class Planner:
         n_copies = n_actions * self.samples
         copies = tree_map(lambda each: each.repeat_interleave(n_copies, 0), state)
         copy = torch.arange(len(copies.seed), device=joint.device)
-        stream = torch.full_like(copies.seed, _STREAM)
         # Every action meets the same draws.
         number = copy % self.samples
-        seed = counter_rng.bits64(copies.seed, stream, copies.steps, number)
+        seed = counter_rng.bits64(copies.seed, _STREAM, copies.steps, number)
         copies = copies._replace(seed=seed)
         actions = joint.repeat_interleave(n_copies, 0)
         actions[:, uav] = copy // self.samples % n_actions

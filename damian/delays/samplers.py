@@ -102,14 +102,8 @@ class Sampler(nn.Module, ABC):
         """The delays [M], of which a share ``loss`` is lost, by a draw of its own."""
         if not self.loss:
             return delay
-        draw = _further_draw(streams, clock, _LOSS_DRAW)
+        draw = counter_rng.uniform(streams, clock, _LOSS_DRAW)
         return torch.where(draw < self.loss, self.lost, delay)
-
-
-def _further_draw(streams: Tensor, clock: Tensor, number: int) -> Tensor:
-    """A further random number in [0, 1) of each message, [M]."""
-    counter = torch.full_like(clock, number)
-    return counter_rng.uniform(streams, clock, counter)
 
 
 class TableSampler(Sampler):
@@ -256,7 +250,7 @@ class LossSampler(HeldSampler):
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
-        draw = _further_draw(streams, clock, _LOSS_DRAW)
+        draw = counter_rng.uniform(streams, clock, _LOSS_DRAW)
         read = cast(MessageContext, context).entries
         chance = read["loss"].view_as(draw)
         delay = torch.where(draw < chance, self.lost, delay)
@@ -304,13 +298,11 @@ class LagSampler(Sampler):
         renewed = due
         interval = torch.full_like(streams, self._period)
         if self._hold_probability:
-            draw = _further_draw(streams, clock, _HOLD_DRAW)
+            draw = counter_rng.uniform(streams, clock, _HOLD_DRAW)
             released = draw >= self._hold_probability
             renewed = first | (due & released)
         if self._stagger:
-            counter = torch.full_like(clock, _PHASE_DRAW)
-            bits = counter_rng.bits(streams, clock, counter)
-            phase = bits % self._period
+            phase = counter_rng.bits(streams, clock, _PHASE_DRAW) % self._period
             interval = torch.where(first, 1 + phase, interval)
         drawn, _ = self._lags(streams, clock, lag)
         lag = torch.where(renewed, drawn, lag)
@@ -423,7 +415,7 @@ class LinkSampler(Sampler):
             delay = torch.where(index == k, drawn, delay)
             states.append(new_state)
         if self._loses_on_links:
-            draw = _further_draw(streams, clock, _LINK_LOSS_DRAW)
+            draw = counter_rng.uniform(streams, clock, _LINK_LOSS_DRAW)
             loss = self._loss.repeat(n_worlds)
             delay = torch.where(draw < loss, self.lost, delay)
         return delay, _packed(states)

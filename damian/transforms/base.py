@@ -517,10 +517,8 @@ class StatefulTransform(Transform):
         alike = [other for other in others if (other.in_keys, other.in_keys_inv) == keys]
         place = next((i for i, other in enumerate(alike) if other is self), 0)
         number = counter_rng.number_of(f"{type(self).__name__} {keys[0]} {keys[1]} {place}")
-        name = torch.tensor(number, device=device)
-        streams = counter_rng.bits64(
-            worlds.view(-1, 1), name, torch.arange(n_agents, device=device)
-        )
+        agents = torch.arange(n_agents, device=device)
+        streams = counter_rng.bits64(worlds.view(-1, 1), number, agents)
         return streams_for(sampler, streams.flatten(), n_agents)
 
 

@@ -71,12 +71,10 @@ def appear(
     in seconds.
     """
     seed, episode, step, region = (each.unsqueeze(-1) for each in counters)
-    appears = torch.full_like(step, _APPEARS)
-    share = counter_rng.uniform(seed, appears, episode, step)
+    share = counter_rng.uniform(seed, _APPEARS, episode, step)
     at_least = (share < arrivals.chance) & (step > 0)
     number = at_least.sum(-1, keepdim=True)
-    where = torch.full_like(step, _PLACE)
-    drawn = counter_rng.bits(seed, where, episode, step, arrivals.slots)
+    drawn = counter_rng.bits(seed, _PLACE, episode, step, arrivals.slots)
     n_places = arrivals.places.shape[1]
     row = region * n_places + drawn % n_places
     place = gather_rows(arrivals.places.flatten(0, 1), row)

@@ -516,9 +516,7 @@ class Simulation:
         config = self.sources[number]
         seed = state.seed
         if number:
-            stream = torch.full_like(seed, _SOURCE)
-            source = torch.full_like(seed, number)
-            seed = counter_rng.bits64(seed, stream, source)
+            seed = counter_rng.bits64(seed, _SOURCE, number)
         emits = torch.ones_like(state.source_over)
         if config.motion == "static":
             place = state.source[:, number]

@@ -25,6 +25,7 @@ from damian.world.config import WorldConfig
 from damian.world.landing import displacement
 from damian.world.messages import Messages
 from damian.world.motion import air_length, flight_levels, minimum_time, poses
+from damian.world.news import draw
 from damian.world.regions.region import local_places
 from damian.world.state import State
 from damian.world.values import times, values_of
@@ -346,11 +347,7 @@ class PolynomialFlight(MotionModel):
         """Way of each flight through the air that begins now [m], gusts included, [B, N]."""
         if not self.is_windy:
             return self.airspace.length(state.origin, state.goal)
-        of_gusts = torch.full_like(state.episode, _GUST)
-        numbers = state.seed, of_gusts, state.episode, state.steps
-        seed, *counters = (each.view(-1, 1, 1) for each in numbers)
-        draws = counter_rng.uniform(seed, *counters, self.gusts)
-        size, turn = draws.unbind(-1)
+        size, turn = draw(state, _GUST, self.gusts).unbind(-1)
         # Normal east and north (Box and Muller, 1958).
         standard = (-2 * (1 - size).log()).sqrt()
         size = times(standard, self.values.get("wind.gusts", state.drawn))
