@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 import torch
+from numpy.random import Generator
 from torch import Tensor
 
 from damian.world.config import SourceConfig
@@ -76,7 +77,7 @@ def draw_walks(
     polygon: Area,
     config: SourceConfig,
     n_walks: int,
-    rng: np.random.Generator,
+    rng: Generator,
     start: np.ndarray | None = None,
 ) -> Walk:
     """Draw the walks of ``W = n_walks`` sources in a polygon of local metres, float32 on the CPU.
@@ -159,7 +160,7 @@ def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tenso
 
 
 def _draw_stops(
-    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
+    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Each hotspot [W, H, 2] m followed by its inner points, packed to the left and padded.
 
@@ -184,7 +185,7 @@ def _draw_stops(
 
 
 def _inner_points(
-    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
+    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: Generator
 ) -> np.ndarray:
     """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2]
     metres."""
@@ -214,7 +215,7 @@ def _timed_walk(
     hotspot: np.ndarray,
     n: np.ndarray,
     config: SourceConfig,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Walk:
     """Add waiting times, legs and emission to the stops."""
     shape = hotspot.shape

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import shapely
 import torch
+from numpy.random import Generator
 from torch import Tensor
 
 from damian.common import checks, counter_rng
@@ -606,7 +607,7 @@ def _last_found(
 
 
 def _draw_initial_conditions(
-    config: WorldConfig, airspace: Airspace, rng: np.random.Generator
+    config: WorldConfig, airspace: Airspace, rng: Generator
 ) -> tuple[Tensor, Tensor, tuple[Walk, ...]]:
     """Draw Q initial conditions, the same number for each region, on the CPU.
 
@@ -649,7 +650,7 @@ def _pad(walk: Walk, stops: int) -> Walk:
 
 
 def _draw_starts(
-    config: WorldConfig, airspace: Airspace, region: int, n: int, rng: np.random.Generator
+    config: WorldConfig, airspace: Airspace, region: int, n: int, rng: Generator
 ) -> Tensor:
     """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for
     each."""

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import shapely
+from numpy.random import Generator
 from shapely.geometry import MultiPoint, MultiPolygon, Polygon
 
 from damian.common import checks
@@ -54,7 +55,7 @@ def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polyg
     return polygon
 
 
-def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
+def random_polygon(rng: Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
     """Draw a random convex polygon: the hull of points uniform in the disc of area ``max_area_m2``.
 
     The hull grows by one point at a time until its area reaches ``min_area_m2``; if a thousand
@@ -110,7 +111,7 @@ def landing_lattice(
     return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
 
 
-def sample_interior(polygon: Area, n: int, rng: np.random.Generator) -> Floats:
+def sample_interior(polygon: Area, n: int, rng: Generator) -> Floats:
     """Draw points uniformly in the polygon, strictly inside, [n, 2] metres.
 
     First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it
@@ -151,7 +152,7 @@ def _hull(corners: Floats) -> Polygon:
     return cast(Polygon, MultiPoint(corners).convex_hull)
 
 
-def _disc(rng: np.random.Generator, area_m2: float, n: int) -> Floats:
+def _disc(rng: Generator, area_m2: float, n: int) -> Floats:
     """Draw points [n, 2] uniformly in the disc of the given area about (0, 0)."""
     radius = np.sqrt(area_m2 / np.pi * rng.random(n))
     angle = 2 * np.pi * rng.random(n)

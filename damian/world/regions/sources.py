@@ -7,6 +7,7 @@ from typing import cast
 
 import numpy as np
 import shapely
+from numpy.random import Generator
 from shapely.geometry import Polygon
 
 from damian.common import checks
@@ -25,7 +26,7 @@ from damian.world.regions.polygon import (
 )
 from damian.world.regions.region import Region, centred, to_local_places
 
-RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]
+RegionSource = Callable[[RegionConfig, Generator], list[Region]]
 """From the settings and a random generator to the regions; each episode flies over one of them."""
 
 REGION_SOURCES = Registry[RegionSource](
@@ -35,27 +36,27 @@ REGION_SOURCES = Registry[RegionSource](
 
 
 @REGION_SOURCES.register("random")
-def _random_regions(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+def _random_regions(config: RegionConfig, rng: Generator) -> list[Region]:
     polygons = [random_polygon(rng, config.min_area, config.max_area) for _ in range(config.pool)]
     return [Region(polygon, f"random region {i}") for i, polygon in enumerate(polygons)]
 
 
 @REGION_SOURCES.register("vertices")
-def _region_of_vertices(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+def _region_of_vertices(config: RegionConfig, rng: Generator) -> list[Region]:
     return [Region(polygon_from_vertices(config.vertices, "region.vertices"), "vertices region 0")]
 
 
 @REGION_SOURCES.register("fir")
-def _region_of_fir_table(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+def _region_of_fir_table(config: RegionConfig, rng: Generator) -> list[Region]:
     return [read_fir(data_file(config.path, "region.path"), config.id)]
 
 
 @REGION_SOURCES.register("geojson")
-def _region_of_map(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+def _region_of_map(config: RegionConfig, rng: Generator) -> list[Region]:
     return [read_area(data_file(config.path, "region.path"), config.index, config.where)]
 
 
-def _without_zones(region: Region, config: RegionConfig, rng: np.random.Generator) -> Region:
+def _without_zones(region: Region, config: RegionConfig, rng: Generator) -> Region:
     """The region without the zones where nobody lands or flies, which become holes of it or cut its
     edge."""
     if not config.zones:
@@ -97,7 +98,7 @@ def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
     return shapely.transform(area.polygon, moved)
 
 
-def _random_zone(polygon: Area, config: RegionConfig, rng: np.random.Generator) -> Polygon:
+def _random_zone(polygon: Area, config: RegionConfig, rng: Generator) -> Polygon:
     """A random convex zone about a place in the region."""
     zone = random_polygon(rng, config.zone_area, 2 * config.zone_area)
     place = sample_interior(polygon, 1, rng)[0]
@@ -105,7 +106,7 @@ def _random_zone(polygon: Area, config: RegionConfig, rng: np.random.Generator) 
     return shapely.transform(zone, lambda corners: place + scale * corners)
 
 
-def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+def regions_of(config: RegionConfig, rng: Generator) -> list[Region]:
     """Read the region from its file or vertices, or draw ``pool`` random regions."""
     source = REGION_SOURCES.get(config.kind, "region.kind")
     found = [_without_zones(centred(region), config, rng) for region in source(config, rng)]
