@@ -188,8 +188,7 @@ class Seeker:
         real = self.real[region].unsqueeze(1)
         gain = gain.where(real, -torch.inf)
         flown = distances(held.target, ground)
-        goal = (gain - FLIGHT_COST * flown).argmax(-1)
-        goal_place = _places_at(ground, goal)
+        goal_place = _places_at(ground, (gain - FLIGHT_COST * flown).argmax(-1))
         left = distances(goal_place, ground)
         if self.actions.kind == "discrete":
             # A UAV that the server has last heard of at its takeoff stands on its target when it
@@ -307,8 +306,7 @@ class Searcher(Seeker):
         chance = chance.scatter(-1, here, stays)
         chance = chance.masked_fill(self.taken(known), 0.0)
         ground = self.points[region]
-        flown = distances(own.target, ground)
-        near = flown <= self.from_others(known, ground)
+        near = distances(own.target, ground) <= self.from_others(known, ground)
         probable = chance.amax(-1, keepdim=True) >= PROBABLE
         chance = torch.where(probable | near, chance, 0.0)
         highest = chance.amax(-1, keepdim=True)
@@ -329,8 +327,7 @@ class Searcher(Seeker):
         point = known.trail[..., :1] % self.n_points
         nowhere = point.new_zeros(*point.shape[:2], self.n_points)
         stands = nowhere.scatter(-1, point, 1)
-        everyone = stands.sum(1, keepdim=True)
-        return everyone > stands
+        return stands.sum(1, keepdim=True) > stands
 
 
 class Coverer(Seeker):
@@ -365,8 +362,7 @@ class Coverer(Seeker):
             if mask is not None:
                 legal = mask[:, uav : uav + 1]
             if own_message is not None:
-                itself = (uavs == uav).unsqueeze(-1)
-                packed = torch.where(itself, own_message, message)
+                packed = torch.where((uavs == uav).unsqueeze(-1), own_message, message)
                 own = self.unpack(packed)
             action, claims = self.choose_new(own, uav, claimed, near, legal)
             actions.append(action)
@@ -405,8 +401,7 @@ class Rescuer(Coverer):
         heard_places = known.detected_position * heard.unsqueeze(-1)
         place = heard_places.sum(1) / times
         goal, assigned = _goal_of(uav, known.target, place, heard.any(1))
-        searched = self.searched(known, uav)
-        goal = where_rows(assigned, goal, searched)
+        goal = where_rows(assigned, goal, self.searched(known, uav))
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         close = (-from_goal / self.radius).exp()
@@ -436,16 +431,14 @@ class Dispatcher(Rescuer):
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         requests, unserved = known_requests(known)
-        places = requests[..., :2]
-        goal, assigned = _goal_of(uav, known.target, places, unserved)
+        goal, assigned = _goal_of(uav, known.target, requests[..., :2], unserved)
         alone = _only(known, uav)
         other = alone.target[:, 0]
         if not self.hears_all:
             other = self.searched(known, uav)
         goal = where_rows(assigned, goal, other)
         region = self.region_of(known)
-        from_goal = distances(goal.unsqueeze(1), self.points[region])
-        inside = from_goal <= self.radius
+        inside = distances(goal.unsqueeze(1), self.points[region]) <= self.radius
         action, _ = self.choose_landing(alone, inside.float(), region, mask)
         return action, claimed
 

@@ -235,8 +235,7 @@ class Comparison:
             of[method] = (task, delay, method, self.policy_of(method))
         none = pd.DataFrame({self.score: []}, dtype=float)
         found = {name: self._runs.get(run, none)[self.score] for name, run in of.items()}
-        scores = pd.DataFrame(found).sort_index()
-        return scores * sign_of(self.score)
+        return pd.DataFrame(found).sort_index() * sign_of(self.score)
 
     def _present(self, task: str, delay: str) -> list[str]:
         """Methods that have a finished run of a task under a delay."""
@@ -260,8 +259,7 @@ class Comparison:
         found |= _estimates(["J_norm"], _norms, array)
         if rivals and not is_rival:
             _, _, *of_rivals, own = array
-            strongest = max(of_rivals, key=np.mean)
-            found |= improvement(own, strongest)
+            found |= improvement(own, max(of_rivals, key=np.mean))
             if not np.isnan(recovery(array)):
                 found |= _estimates(["recovery"], lambda drawn: recovery(drawn, 0.0), array)
         return found

@@ -132,8 +132,7 @@ class Delays:
         self._observations = _Link("observation", observed, told)
         self.actions = _Link("action", acting, told)
         self._rewards = _Link("reward", acting, told)
-        all_arrive = not self._rewards.sampler.loses
-        checks.require(all_arrive, "reward", told["reward"], LOSES)
+        checks.require(not self._rewards.sampler.loses, "reward", told["reward"], LOSES)
         needed = self.actions.sampler.late or self._history
         default = dict(told["default"])
         for agent, space in acting.items():
@@ -174,8 +173,7 @@ class Delays:
         agents = self._agents(observations)
         self.present |= {*agents}
         self._observations.begin(observations)
-        defaults = {agent: self._default[agent] for agent in agents}
-        self.actions.begin(defaults)
+        self.actions.begin({agent: self._default[agent] for agent in agents})
         self._rewards.begin(dict.fromkeys(agents, 0.0))
         return self._told(agents)
 
@@ -291,8 +289,7 @@ class _Link:
         self.sampler: Sampler = samplers[0]
         if len(samplers) > 1:
             index = torch.tensor([distinct.index(law) for law in each])
-            no_loss = torch.zeros(len(index))
-            self.sampler = LinkSampler(samplers, index, no_loss)
+            self.sampler = LinkSampler(samplers, index, torch.zeros(len(index)))
         self._line = DelayLine(self.sampler, "generation")
         before_step = name == "action"
         self._contexts = ContextReader(self.sampler, None, dt, name, before_step=before_step)
@@ -355,8 +352,7 @@ class _Link:
 
     def held(self, sender: str) -> Any:
         """What is held of a sender."""
-        time = self._now - self.age[sender]
-        thing, _ = self._sent[sender][time]
+        thing, _ = self._sent[sender][self._now - self.age[sender]]
         return copy.deepcopy(thing)
 
     def recent(self, sender: str) -> Sent:

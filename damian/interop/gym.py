@@ -67,8 +67,7 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         """Which discrete actions are legal now, [A] bool; all of them if nothing is masked."""
         space = cast(gymnasium.spaces.Discrete, self.action_space)
         info = row(self._infos, 0, 0)
-        mask = info.get("action_mask", np.ones(space.n))
-        return mask.astype(bool)
+        return info.get("action_mask", np.ones(space.n)).astype(bool)
 
 
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):

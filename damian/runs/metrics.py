@@ -88,8 +88,7 @@ def evaluation(rollout: TensorDictBase, server: Server, metrics: Sequence[str] =
     found.returns = flights.true.returns.cpu()
     for name in dict.fromkeys((*BUILT_IN, *metrics)):
         with naming_errors(f"metric {name}"):
-            metric = METRICS.get(name, "metrics")
-            values = torch.as_tensor(metric.compute(flights))
+            values = torch.as_tensor(METRICS.get(name, "metrics").compute(flights))
             found[name] = values.float().mean().item()
     return found
 
@@ -144,8 +143,7 @@ def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Te
     sent = rollout[next_key(keys.MESSAGE_SENT)]
     steps[next_key(keys.DELAY)] = sent.long().unsqueeze(-1) - 1  # 0, or -1 where none was sent
     steps[keys.STEP_COUNT] = elapsed.unsqueeze(-1) - 1
-    beliefs = beliefs_in_hindsight(server, steps.transpose(0, 1))
-    return beliefs.transpose(0, 1)
+    return beliefs_in_hindsight(server, steps.transpose(0, 1)).transpose(0, 1)
 
 
 def _up_to_first_end(ended: Tensor) -> Tensor:

@@ -103,8 +103,7 @@ class SampleAndHold(StatefulTransform):
         outputs = {}
         for i, key in enumerate(keys):
             new = self.to_rows(entries[key])
-            old = memory[f"{name}_{i}"]
-            held = where_rows(sampled, new, old)
+            held = where_rows(sampled, new, memory[f"{name}_{i}"])
             memory = memory | {f"{name}_{i}": held}
             outputs[key] = self.from_rows(held).clone()  # the memory keeps the held values
         return memory, outputs

@@ -209,8 +209,7 @@ class ObservationTimeline(StatefulTransform):
 
     def _written(self, memory: Memory) -> Entries:
         """The timeline, from the memory."""
-        arrived = memory["due"] <= 0
-        found = [self._timeline(memory, arrived)]
+        found = [self._timeline(memory, memory["due"] <= 0)]
         if len(self.out_keys) > 1:
             sent = memory["sent"].unsqueeze(-1)
             found.append(torch.cat([memory["kept"] * sent, sent.to(memory["kept"].dtype)], -1))

@@ -192,8 +192,7 @@ def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: in
     place = ((target - corner) / side).long()
     column, row = place.clamp(min=0).minimum(shape - 1).unbind(-1)
     cell = first + row * shape[:, 0] + column
-    used = gather_rows(cells.row, cell)
-    point = gather_rows(cells.point, used).long()
+    point = gather_rows(cells.point, gather_rows(cells.row, cell)).long()
     base = region * points.shape[1]
     flat = point.clamp(min=0) + base.unsqueeze(-1)
     way = gather_rows(points.flatten(0, 1), flat) - target.unsqueeze(1)

@@ -143,9 +143,7 @@ def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Te
     [*]."""
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
-    tiny = torch.finfo(peak.dtype).tiny
-    duration = length / peak.clamp_min(tiny) + ramp
-    return ramp, duration
+    return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp
 
 
 def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:

@@ -46,9 +46,7 @@ def to_local(
 
 def _by_bearing(length: Floats, bearing: Floats) -> tuple[Floats, Floats]:
     """Parts east and north of lengths [*] in the directions of bearings [*] rad."""
-    east = length * np.sin(bearing)
-    north = length * np.cos(bearing)
-    return east, north
+    return length * np.sin(bearing), length * np.cos(bearing)
 
 
 def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
