@@ -106,8 +106,7 @@ def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "del
 _NO_STEPS = "is neither a number of steps >= 0 (3) nor a time (3s, 2min)"
 _NO_DELAY = (
     "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, "
-    "3s..7s), a "
-    "distribution ({law: geometric, mean: 2}; in Python Geometric(2)) or a function"
+    "3s..7s), a distribution ({law: geometric, mean: 2}; in Python Geometric(2)) or a function"
 )
 
 

@@ -178,8 +178,7 @@ class BackupdateStorage(TimeStorage):
             "max_size",
             self.max_size,
             f"is too little for batches of {len(data)} steps and delays of up to {self.longest} "
-            "steps: "
-            f"{needs} steps of {n_worlds} worlds need {needs * n_worlds}",
+            f"steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}",
         )
         for name, key in delays.items():
             takes = f"steps, but a {name} takes {int(data[key].max())} steps"

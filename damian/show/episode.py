@@ -75,8 +75,7 @@ class Episode:
     source: Annotated[
         Floats | None,
         "positions of the sources, none if the task has none: east, north [m]; null if nobody "
-        "knows them, "
-        "[T + 1, K, 2]",
+        "knows them, [T + 1, K, 2]",
     ]
     emits: Annotated[Flags | None, "whether each source emits; null if nobody knows it, [T + 1, K]"]
     sent: Annotated[

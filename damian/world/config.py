@@ -74,8 +74,7 @@ class RegionConfig(Settings):
     zones: Any = setting(
         [],
         "No-fly zones: a list of the corners of each (places, as those of a source), a map, or the "
-        "number of "
-        "random ones.",
+        "number of random ones.",
     )
     zone_area: float = setting(2500.0, "Area of a random zone.", unit="m^2", above=0)
     zone_margin: float = setting(0.0, "Distance that UAVs keep from zones.", unit="m", low=0)
@@ -506,8 +505,7 @@ class WorldConfig(Settings):
     randomise: dict[str, Any] = setting(
         {},
         "Settings that are drawn for each world and episode, such as {wind.speed: [0, 6]}: from a "
-        "range, or "
-        "from a list of more than two values; [6] is always 6.",
+        "range, or from a list of more than two values; [6] is always 6.",
     )
     sensors: list[Any] = setting(
         [],

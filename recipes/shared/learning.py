@@ -104,9 +104,8 @@ def require_delayed_talk(config: TrainConfig, env: DelayedEnv, learner: Learner)
     known = "observation.own=true" if own else f"links={links}"
     should = (
         f"has an actor that reads other UAVs' rows, which with {known} hold what each knows at "
-        "once: attend "
-        "over blocks of a UAV's own row (docs/extending.md), or give learner.talks=true to let "
-        "UAVs talk so"
+        "once: attend over blocks of a UAV's own row (docs/extending.md), or give "
+        "learner.talks=true to let UAVs talk so"
     )
     with own_code(config.learner):
         talk = undelayed_talk(learner.actor, env)

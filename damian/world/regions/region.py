@@ -99,8 +99,7 @@ def _local_place(key: str, place: Any, region: Region) -> Floats:
         key,
         place,
         f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in "
-        "metres, or "
-        "take a region from a FIR table or GeoJSON file",
+        "metres, or take a region from a FIR table or GeoJSON file",
     )
     return np.stack(to_local(place["lat"], place["lon"], cast(tuple[float, float], region.origin)))
 
