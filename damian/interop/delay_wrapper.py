@@ -75,7 +75,7 @@ class DelayWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         default: Any = None,
         dt: float = 1.0,
     ) -> None:
-        told: dict[str, Any] = {
+        told: ByName = {
             "observation": observation,
             "action": action,
             "reward": reward,
@@ -95,15 +95,13 @@ class DelayWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._delays = Delays(observed, {"": env.action_space}, told)
         self.observation_space = self._delays.space("", space)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict]:
+    def reset(self, *, seed: int | None = None, options: ByName | None = None) -> tuple[Any, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
         observed = observation if self._in_parts else {"": observation}
         told, more = self._delays.reset(observed, seed)
         return told[""], info | more[""]
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, ByName]:
         executed = self._delays.act({"": action})[""]
         observation, reward, terminated, truncated, info = self.env.step(executed)
         ended = [""] if terminated or truncated else []

@@ -23,6 +23,8 @@ from damian.show.film import LiveFilm
 RENDER_MODES = ("rgb_array",)
 METADATA: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 4}
 Array = NDArray
+Infos = dict[str, Any]
+"""What Gymnasium tells beside an observation, by name."""
 
 
 class Instant(NamedTuple):
@@ -150,7 +152,7 @@ def actions_in(space: Space, key: str, given: Any) -> Array:
     return found
 
 
-def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:
+def row(infos: dict[str, Array], world: int, agent: int) -> Infos:
     """The infos of one UAV, copied; flags are Python's: Gymnasium's vector environments know no
     others."""
     found = {

@@ -49,7 +49,7 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
         return self.action_spaces[agent]
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
+        self, seed: int | None = None, options: ByName | None = None
     ) -> tuple[ByName, ByName]:
         instant = self.flight.reset(seed)
         self.agents = [*self.possible_agents]

@@ -19,6 +19,8 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 
+Stored = dict[str, Any]
+"""What a ``state_dict`` returns, and a checkpoint holds."""
 _PLAIN = (bool, int, float, str, bytes, torch.Size, torch.device, torch.dtype, type(None))
 
 
@@ -29,7 +31,7 @@ def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
     write_atomically(path, buffer.getvalue())
 
 
-def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
+def read_checkpoint(path: Path, key: str) -> Stored:
     """Read a checkpoint, with all tensors on the CPU."""
     try:
         # torch does not compare checksums, so that a changed bit would be a silently wrong weight.

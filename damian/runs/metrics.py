@@ -17,7 +17,7 @@ from damian.envs.recompute import beliefs_in_hindsight
 from damian.keys import next_key
 from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage
-from damian.runs.checkpoint import to_tensordict
+from damian.runs.checkpoint import Stored, to_tensordict
 from damian.runs.measures import BUILT_IN, METRICS
 from damian.server.server import Server
 
@@ -192,11 +192,11 @@ class EpisodeLog:
         self._known = [*map(_latest, self._known, ended)]
         self.finished += int(done.sum())
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         hindsight = self.hindsight.state_dict() if self.hindsight else None
         return {"finished": self.finished, "known": self._known, "hindsight": hindsight}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         self.finished = state["finished"]
         self._known = state["known"]
         if self.hindsight:
@@ -288,11 +288,11 @@ class HindsightReturns:
         storage: Any = super(BackupdateStorage, self.storage) if corrected else self.storage
         storage.set(index % n_rows, steps)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         rows = self.storage.steps[self.storage.latest()] if self._written else None
         return {"rows": rows, "waiting": self._waiting, "running": self._running}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         self._waiting = int(state["waiting"])
         self._running = state["running"]
         if state["rows"] is not None:

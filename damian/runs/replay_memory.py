@@ -2,7 +2,7 @@
 written once."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from damian.common.atomic_files import make_folder, remove_unfinished
 from damian.replay.time_storage import TimeStorage
-from damian.runs.checkpoint import read_checkpoint, to_tensordict, write_checkpoint
+from damian.runs.checkpoint import Stored, read_checkpoint, to_tensordict, write_checkpoint
 
 FILES = 32
 """A full replay memory has about so many files."""
@@ -35,7 +35,7 @@ class ReplayMemory:
     def _storage(self) -> TimeStorage:
         return cast(TimeStorage, cast(ReplayBuffer, self._buffer).storage)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         """Write the files that are complete by now, and return what else there is to store."""
         if self._buffer is None or not self._buffer.write_count:
             return {"written": 0}
@@ -59,7 +59,7 @@ class ReplayMemory:
             "writer": self._buffer.writer.state_dict(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         """Fill the empty buffer with the rows of a state and of its files."""
         if self._buffer is None or not state["written"]:
             return
