@@ -30,6 +30,7 @@ from damian.delays.samplers import Sampler, streams_for
 from damian.keys import DONE, STEPPED
 from damian.transforms.entries import (
     Entries,
+    Keys,
     as_rows,
     path_of,
     require_keys,
@@ -112,10 +113,10 @@ class StatefulTransform(Transform):
 
     def __init__(
         self,
-        in_keys: NestedKey | Sequence[NestedKey] | None = None,
-        out_keys: NestedKey | Sequence[NestedKey] | None = None,
-        in_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
-        out_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
+        in_keys_inv: Keys | None = None,
+        out_keys_inv: Keys | None = None,
         seed: int | None = None,
     ) -> None:
         super().__init__(*(keys or None for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))

@@ -10,7 +10,7 @@ import shapely
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
-from damian.world.regions.geodesy import Floats, area_centroid, to_local
+from damian.world.regions.geodesy import Floats, LatLon, area_centroid, to_local
 from damian.world.regions.polygon import Area, polygon_from_rings
 
 _SLACK = 1e-6
@@ -33,7 +33,7 @@ class Region:
 
     polygon: Area
     name: str
-    origin: tuple[float, float] | None = None
+    origin: LatLon | None = None
     levels: tuple[float, float] | None = None
     offset: tuple[float, float] = (0.0, 0.0)
 
@@ -101,7 +101,7 @@ def _local_place(key: str, place: Any, region: Region) -> Floats:
         f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in "
         "metres, or take a region from a FIR table or GeoJSON file",
     )
-    return np.stack(to_local(place["lat"], place["lon"], cast(tuple[float, float], region.origin)))
+    return np.stack(to_local(place["lat"], place["lon"], cast(LatLon, region.origin)))
 
 
 def local_region(

@@ -16,7 +16,7 @@ from damian.common.text_files import data_file
 from damian.world.config import RegionConfig
 from damian.world.regions.files import read_area
 from damian.world.regions.fir import read_fir
-from damian.world.regions.geodesy import Floats, to_latlon, to_local
+from damian.world.regions.geodesy import Floats, LatLon, to_latlon, to_local
 from damian.world.regions.polygon import (
     Area,
     polygon_from_rings,
@@ -89,7 +89,7 @@ def _zones_of_map(path: str, region: Region) -> shapely.Geometry:
         f"is a map, but {region.name} has no position on Earth: give corners in metres",
     )
     area = read_area(data_file(path, "region.zones"), every=True)
-    origins = cast(tuple[float, float], area.origin), cast(tuple[float, float], region.origin)
+    origins = cast(LatLon, area.origin), cast(LatLon, region.origin)
 
     def moved(places: Floats) -> Floats:
         latitude, longitude = to_latlon(places[:, 0], places[:, 1], origins[0])
