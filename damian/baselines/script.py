@@ -149,7 +149,7 @@ class Seeker:
         self.real = points[..., 0].isfinite()
         self.points = points.nan_to_num(posinf=0.0)
         self.n_points = points.shape[1]
-        self.near = self.footprint_table(worlds)
+        self.near = self.footprint_table()
 
     def __call__(
         self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None
@@ -166,10 +166,10 @@ class Seeker:
         landed = gather_rows(self.points.flatten(0, 1), self.counted(held))
         weight = search_weights(held, ground, landed, now, self.radius, self.seeking)
         gain = weight @ self.footprints(region)
-        action, _ = self.choose_landing(held, gain, region, mask)
+        action, _ = self.choose_landing(held, gain, mask)
         return action
 
-    def footprint_table(self, worlds: UavEnv) -> Tensor:
+    def footprint_table(self) -> Tensor:
         """1 for landing points (rows) in the footprints of others (columns), [R, L, L]."""
         near = distances(self.points, self.points) <= self.radius
         return (near & self.real.unsqueeze(-1)).float()
@@ -181,9 +181,10 @@ class Seeker:
         return self.near[region]
 
     def choose_landing(
-        self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None
+        self, held: Messages, gain: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Actions, and the landing points [B, N] to which they lead, as indices in their region."""
+        region = self.region_of(held)
         ground = self.points[region]
         real = self.real[region].unsqueeze(1)
         gain = gain.where(real, -torch.inf)
@@ -311,7 +312,7 @@ class Searcher(Seeker):
         chance = torch.where(probable | near, chance, 0.0)
         highest = chance.amax(-1, keepdim=True)
         gain = torch.where(chance >= WORTH * highest, chance, 0.0)
-        action, _ = self.choose_landing(own, gain, region, mask)
+        action, _ = self.choose_landing(own, gain, mask)
         return action
 
     def from_others(self, known: Messages, ground: Tensor) -> Tensor:
@@ -339,9 +340,9 @@ class Coverer(Seeker):
     ahead.
     """
 
-    def footprint_table(self, worlds: UavEnv) -> Tensor:
+    def footprint_table(self) -> Tensor:
         """The landing points in the footprint of each, as bits, [R, L, W]."""
-        bits = footprint_bits(worlds.simulation.airspace.points, self.radius)
+        bits = footprint_bits(self.candidates.airspace.points, self.radius)
         return bits.unflatten(0, self.points.shape[:2])
 
     def __call__(  # type: ignore[override]
@@ -383,8 +384,7 @@ class Coverer(Seeker):
         for stop in latest.unbind(-1):
             taken = taken | _footprint_at(near, stop)
         gain = bit_count(near & ~taken.unsqueeze(1)).sum(-1).float()
-        region = self.region_of(known)
-        action, point = self.choose_landing(alone, gain.unsqueeze(1), region, mask)
+        action, point = self.choose_landing(alone, gain.unsqueeze(1), mask)
         gains = gain.gather(-1, point) > LEAST_GAIN
         return action, torch.where(gains, _footprint_at(near, point.squeeze(-1)), 0)
 
@@ -405,7 +405,7 @@ class Rescuer(Coverer):
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         close = (-from_goal / self.radius).exp()
-        action, _ = self.choose_landing(_only(known, uav), close, region, mask)
+        action, _ = self.choose_landing(_only(known, uav), close, mask)
         return action, claimed
 
     def searched(self, known: Messages, uav: int) -> Tensor:
@@ -439,7 +439,7 @@ class Dispatcher(Rescuer):
         goal = where_rows(assigned, goal, other)
         region = self.region_of(known)
         inside = distances(goal.unsqueeze(1), self.points[region]) <= self.radius
-        action, _ = self.choose_landing(alone, inside.float(), region, mask)
+        action, _ = self.choose_landing(alone, inside.float(), mask)
         return action, claimed
 
 
