@@ -41,7 +41,7 @@ LOGGERS = Registry[Callable[..., Logger]](
 """Loggers by name or ``package.module:Name``: functions or classes that get the run folder."""
 
 
-def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Logger]:
+def make_loggers(config: LoggerConfig, folder: Path, frames: int) -> list[Logger]:
     """Make the loggers of settings.
 
     Args:

@@ -21,7 +21,7 @@ PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra", "numpy", "sh
 """Modules whose versions a record names: a nightly build is a distribution of another name."""
 
 
-def write_record(folder: Path, command: str, resumes: bool = False, **entries: Any) -> None:
+def write_record(folder: Path, command: str, resumes: bool, **entries: Any) -> None:
     """Write the record of a run that begins; that of a resumed one gets the command in its
     ``resumed``."""
     record = {"command": command, "started": datetime.now(UTC).isoformat(timespec="seconds")}

@@ -49,7 +49,7 @@ def save_film(episode: Episode, path: Path, shown: Collection[str] = ()) -> None
     write_atomically(path, content.getvalue())
 
 
-def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
+def save_picture(episode: Episode, path: Path, shown: Collection[str]) -> None:
     """Write the picture of the instant at which the server was most mistaken about where the UAVs
     were."""
     error = np.linalg.norm(episode.true - episode.believed, axis=-1).sum(-1)

@@ -279,7 +279,7 @@ def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> Tr
     return replace(config, resume=str(folder), **changed)
 
 
-def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = "train") -> Any:
+def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str) -> Any:
     """The settings of a run that flies, or begins with, the policy of a stored run.
 
     Words lie over what is stored: a group's option replaces the settings that its options set, a
