@@ -108,11 +108,10 @@ def _script_of(worlds: UavEnv, believes: bool) -> "type[Seeker]":
     """The script for the task of some worlds."""
     n_regions, n_points = worlds.simulation.airspace.points.shape[:2]
     n_pairs = n_regions * n_points**2
-    shown = f"{n_points} landing points"
     checks.require(
         n_pairs <= MAX_PAIRS,
         "region.lattice_step",
-        shown,
+        f"{n_points} landing points",
         "are too many for the scripted policy: take a larger step",
     )
     scenario = worlds.scenario

@@ -460,9 +460,8 @@ class Simulation:
             length = torch.cat(nearest)
             longest = 2 * self.candidates.max_distance
         flies = bool((length < longest).any())
-        moves = flies or self.airspace.max_points == 1
         checks.require(
-            moves,
+            flies or self.airspace.max_points == 1,
             "actions.distances",
             actions.distances,
             "[m] lead from no landing point to another one: take larger ones, or a finer lattice",
