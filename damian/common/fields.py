@@ -62,6 +62,8 @@ def setting(default: Any, meaning: str = "", unit: str = "", **rule: Any) -> Any
 
 chance = functools.partial(setting, low=0, high=1)
 """A field between 0 and 1."""
+metres = functools.partial(setting, unit="m", above=0)
+"""A field that is a distance above 0."""
 
 
 def constant(default: Any, reason: str, **rule: Any) -> Any:

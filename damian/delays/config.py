@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from damian.common import checks
-from damian.common.fields import Settings, chance, setting
+from damian.common.fields import Settings, chance, metres, setting
 
 LONGEST = 10_000
 """Longest delay allowed [steps], because every message in transit takes memory."""
@@ -78,8 +78,8 @@ class LinkConfig(Settings):
     loss: Any = setting(
         0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix")
     )
-    range: float | None = setting(
-        None, "A UAV hears only UAVs within this distance.", unit="m", above=0, kinds=("matrix",)
+    range: float | None = metres(
+        None, "A UAV hears only UAVs within this distance.", kinds=("matrix",)
     )
 
     def __post_init__(self) -> None:

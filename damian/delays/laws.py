@@ -17,7 +17,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.common.fields import chance, rules, setting
+from damian.common.fields import chance, metres, rules, setting
 from damian.common.registry import Registry
 from damian.common.text_files import data_file, named, parse_table, read_text
 from damian.delays.config import LONGEST, is_matrix
@@ -333,7 +333,7 @@ class Distance(Law):
     """Delay at distance 0, of processing and transmission: steps, or a time."""
     speed: float = setting(math.inf, above=0, unit="m/s")
     """Propagation speed [m/s]."""
-    range: float = setting(math.inf, above=0, unit="m")
+    range: float = metres(math.inf)
     """Distance at which half of the messages are lost [m]."""
     path_loss_exponent: float = setting(2.0, above=0)
     """Exponent n of the path loss; 2 in free space, 3 to 5 in cities."""

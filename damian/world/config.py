@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from damian.common import checks
-from damian.common.fields import Settings, chance, check_place, constant, rules, setting
+from damian.common.fields import Settings, chance, check_place, constant, metres, rules, setting
 
 RANDOM = ("random",)
 GEOJSON = ("geojson",)
@@ -78,9 +78,7 @@ class RegionConfig(Settings):
     )
     zone_area: float = setting(2500.0, "Area of a random zone.", unit="m^2", above=0)
     zone_margin: float = setting(0.0, "Distance that UAVs keep from zones.", unit="m", low=0)
-    lattice_step: float = setting(
-        30.0, "Distance between landing points of a row.", unit="m", above=0
-    )
+    lattice_step: float = metres(30.0, "Distance between landing points of a row.")
     lattice_angle: float = setting(
         45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90
     )
@@ -190,16 +188,11 @@ class MotionConfig(Settings):
     sensing_time: float = setting(
         0.0, "Time that a landed UAV senses before it chooses.", unit="s", low=0
     )
-    min_level: float = setting(1.0, "Flight level of the first UAV.", unit="m", above=0)
-    max_level: float = setting(
-        20.0,
-        "Highest flight level; UAVs that fly instantly share levels if need be.",
-        unit="m",
-        above=0,
+    min_level: float = metres(1.0, "Flight level of the first UAV.")
+    max_level: float = metres(
+        20.0, "Highest flight level; UAVs that fly instantly share levels if need be."
     )
-    level_separation: float = setting(
-        0.5, "Vertical distance between two flight levels.", unit="m", above=0
-    )
+    level_separation: float = metres(0.5, "Vertical distance between two flight levels.")
     abort: float = chance(
         0.0,
         "Probability that a flight ends at another legal landing point than commanded; holding "
@@ -294,12 +287,8 @@ class SourceConfig(Settings):
     max_stops: int = setting(
         7, "Most inner points around a hotspot.", low=1, high=1000, kinds=DYNAMIC
     )
-    local_distance: float = setting(
-        50.0,
-        "Largest distance of an inner point from its hotspot.",
-        unit="m",
-        above=0,
-        kinds=DYNAMIC,
+    local_distance: float = metres(
+        50.0, "Largest distance of an inner point from its hotspot.", kinds=DYNAMIC
     )
     speed: float = setting(20.0, "Largest speed to a hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
     acceleration: float = setting(
@@ -369,11 +358,9 @@ class RequestConfig(Settings):
         high=6000,
     )
     most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
-    range: float | None = setting(
+    range: float | None = metres(
         None,
         "UAVs on the ground hear of those within it; the server knows all at once if not given.",
-        unit="m",
-        above=0,
     )
 
     @property
