@@ -24,7 +24,7 @@ Stored = dict[str, Any]
 _PLAIN = (bool, int, float, str, bytes, torch.Size, torch.device, torch.dtype, type(None))
 
 
-def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
+def write_checkpoint(path: Path, content: Stored) -> None:
     """Write a checkpoint, completely or not at all; an older file of this name is replaced."""
     buffer = io.BytesIO()
     torch.save(plain(content), buffer)
@@ -86,7 +86,7 @@ def to_tensordict(stored: Mapping[str, Any]) -> TensorDict:
     return TensorDict(entries, stored["batch_size"])
 
 
-def restore(components: Mapping[str, Any], stored: Mapping[str, Any], path: Path, key: str) -> None:
+def restore(components: Mapping[str, Any], stored: Stored, path: Path, key: str) -> None:
     """Restore components in place with their ``load_state_dict``; ``key`` is the setting of the
     file."""
     for name, component in components.items():

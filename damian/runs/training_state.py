@@ -131,7 +131,7 @@ class CarriedStep:
         collector = self._collector
         return {"step": collector._carrier, "trajectories": collector._traj_pool.state_dict()}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         collector = self._collector
         step = to_tensordict(state["step"]).to(collector.env.device)
         collector._carrier = step.clear_device_() if collector._carrier.device is None else step
@@ -150,7 +150,7 @@ class RandomState:
             "python": random.getstate(),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         torch.set_rng_state(state["torch"])
         if len(state["cuda"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda"])
