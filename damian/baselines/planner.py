@@ -43,8 +43,8 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     Raises:
         InputError: actions are continuous, or late messages are not flown forward.
     """
-    actions = env.uav_env.scenario.actions
-    checks.require(actions.kind == "discrete", "policy", "planner", "needs discrete actions")
+    discrete = env.uav_env.scenario.actions.kind == "discrete"
+    checks.require(discrete, "policy", "planner", "needs discrete actions")
     available = env.observation_spec.keys(True, True)
     relative = keys.COMMANDS not in available
     checks.require(relative, "policy", "planner", "plans for actions.command=relative")

@@ -132,7 +132,6 @@ class Seeker:
         scenario = worlds.scenario
         simulation = worlds.simulation
         server = worlds.server
-        source = scenario.source
         self.unpack = server.messages
         self.region_of = server.region_of
         self.counted = server.counted
@@ -142,7 +141,7 @@ class Seeker:
         self.dt = scenario.clock.dt
         self.candidates = simulation.candidates
         self.actions = scenario.actions
-        self.seeking = seeking_of(source, self.dt)
+        self.seeking = seeking_of(scenario.source, self.dt)
         self.hears_all = scenario.requests.range is None
         points = simulation.airspace.points
         self.real = points[..., 0].isfinite()

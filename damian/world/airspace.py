@@ -127,10 +127,11 @@ def build_airspace(
     connected in a region that is not convex.
     """
     step = config.lattice_step
-    degrees = config.lattice_angle
-    n_points = config.n_landing_points
     polygons = [region.polygon for region in regions]
-    lattices = [landing_lattice(polygon, step, degrees, n_points) for polygon in polygons]
+    lattices = [
+        landing_lattice(polygon, step, config.lattice_angle, config.n_landing_points)
+        for polygon in polygons
+    ]
     sizes = [len(lattice) for lattice in lattices]
     for region, size in zip(regions, sizes, strict=True):
         checks.require(

@@ -315,8 +315,7 @@ class PolynomialFlight(MotionModel):
         vertical = state.vertical
         cruise = state.cruise
         way = self.airspace.way(state.origin, state.goal)
-        degree = self.motion.degree
-        position, crossed = poses(way, self.levels, elapsed, vertical, cruise, degree)
+        position, crossed = poses(way, self.levels, elapsed, vertical, cruise, self.motion.degree)
         state = state._replace(position=position)
         if not self.battery.enabled:
             return state

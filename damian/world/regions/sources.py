@@ -72,8 +72,8 @@ def _without_zones(region: Region, config: RegionConfig, rng: Generator) -> Regi
         zones = [_zones_of_map(config.zones, region)]
     else:
         zones = [_random_zone(region.polygon, config, rng) for _ in range(int(config.zones))]
-    margin = config.zone_margin
-    kept = region.polygon - shapely.union_all(shapely.buffer(zones, margin, join_style="mitre"))
+    widened = shapely.buffer(zones, config.zone_margin, join_style="mitre")
+    kept = region.polygon - shapely.union_all(widened)
     checks.require(
         not kept.is_empty, "region.zones", config.zones, f"leave nothing of {region.name}"
     )
