@@ -167,8 +167,7 @@ def report(
         rows[PLANNER] = fly(policy)
         spent = cast(Planner, policy.module).milliseconds
         print(f"planner: {statistics.median(spent):.0f} ms for a decision in all worlds at once")
-    succeeds = config.episode.can_succeed
-    table = save_results(rows, folder, succeeds, env.delays.obs.late, MEANING)
+    table = save_results(rows, folder, config.episode.can_succeed, env.delays.obs.late, MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
     return rows
 

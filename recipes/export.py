@@ -39,7 +39,7 @@ UNFILTERED = (
 )
 
 
-def export(run: Path, trust: bool = False) -> Path:
+def export(run: Path, trust: bool) -> Path:
     """Export the policy of a run folder into its subfolder ``export``; returns that folder."""
     try:
         import_module("onnxscript")

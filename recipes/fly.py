@@ -38,7 +38,7 @@ def fly(config: FlyConfig) -> list[Episode]:
     env = make_env(config, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
     likely = config.flown == "deterministic"
     if config.learnt:
-        policy: TensorDictModuleBase = stored_actor(config, env)
+        policy = stored_actor(config, env)
         add_recurrent_state(env, policy)
     else:
         policy = unlearnt_policy(config, env)

@@ -103,7 +103,7 @@ def described(kind: type, path: str = "") -> dict[str, Setting]:
 
 def default_options(program: str) -> dict[str, str]:
     """The groups of a program, each with its default option; ``???`` if one must be chosen."""
-    found: dict[str, str] = {}
+    found = {}
     for each in yaml.safe_load((CONF / f"{program}.yaml").read_text(encoding="utf-8")).get(
         "defaults", []
     ):
@@ -116,7 +116,7 @@ def default_options(program: str) -> dict[str, str]:
 
 def groups() -> dict[str, list[str]]:
     """Options of every group, by the group's name; a file _NAME.yaml is what options share."""
-    options: dict[str, list[str]] = {}
+    options = {}
     for file in sorted(CONF.rglob("[!_]*.yaml")):
         group, *rest = file.relative_to(CONF).with_suffix("").parts
         if rest:

@@ -4,7 +4,6 @@ script flies on (one-at-a-time rollout; Bertsekas 2021)."""
 import time
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
@@ -44,8 +43,8 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     Raises:
         InputError: actions are continuous, or late messages are not flown forward.
     """
-    actions = env.uav_env.scenario.actions
-    checks.require(actions.kind == "discrete", "policy", "planner", "needs discrete actions")
+    discrete = env.uav_env.scenario.actions.kind == "discrete"
+    checks.require(discrete, "policy", "planner", "needs discrete actions")
     available = env.observation_spec.keys(True, True)
     relative = keys.COMMANDS not in available
     checks.require(relative, "policy", "planner", "plans for actions.command=relative")
@@ -56,7 +55,7 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     should = "plans from late messages with observation.own=true observation.forward=script"
     checks.require(keys.RECALLED in available, "policy", "planner", should)
     planner = LatePlanner(env.uav_env, ToldWorlds(env.uav_env.simulation), horizon, samples)
-    read: list[NestedKey] = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
+    read = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
     if keys.ACTION_MASK in available:
         read.append(keys.ACTION_MASK)
     return TensorDictModule(planner, read, [keys.ACTION])
@@ -110,10 +109,9 @@ class Planner:
         n_copies = n_actions * self.samples
         copies = tree_map(lambda each: each.repeat_interleave(n_copies, 0), state)
         copy = torch.arange(len(copies.seed), device=joint.device)
-        stream = torch.full_like(copies.seed, _STREAM)
         # Every action meets the same draws.
         number = copy % self.samples
-        seed = counter_rng.bits64(copies.seed, stream, copies.steps, number)
+        seed = counter_rng.bits64(copies.seed, _STREAM, copies.steps, number)
         copies = copies._replace(seed=seed)
         actions = joint.repeat_interleave(n_copies, 0)
         actions[:, uav] = copy // self.samples % n_actions

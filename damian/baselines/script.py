@@ -6,7 +6,6 @@ Every UAV flies to the landing point whose footprint contains the largest total 
 import math
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
@@ -45,7 +44,7 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
     available = env.observation_spec.keys(True, True)
     if keys.FORWARD in available:
         script = ForwardScript(script_without_belief(worlds))
-        forward_keys: list[NestedKey] = [keys.FORWARD, keys.FORWARD_MASK]
+        forward_keys = [keys.FORWARD, keys.FORWARD_MASK]
         forward_keys = [key for key in forward_keys if key in available]
         return TensorDictModule(script, forward_keys, [keys.ACTION])
     believes = worlds.scenario.seeks_source and keys.BELIEF in available
@@ -56,7 +55,7 @@ def script_policy(env: DelayedEnv) -> TensorDictModule:
     message = keys.MESSAGE
     if keys.RECEIVED in available:
         message = keys.RECEIVED
-    arguments: dict[str, NestedKey] = {"message": message, "mask": keys.ACTION_MASK}
+    arguments = {"message": message, "mask": keys.ACTION_MASK}
     if script is Searcher:
         arguments |= {"belief": keys.BELIEF, "own_belief": keys.OWN_BELIEF}
     if script is Seeker:
@@ -109,11 +108,10 @@ def _script_of(worlds: UavEnv, believes: bool) -> "type[Seeker]":
     """The script for the task of some worlds."""
     n_regions, n_points = worlds.simulation.airspace.points.shape[:2]
     n_pairs = n_regions * n_points**2
-    shown = f"{n_points} landing points"
     checks.require(
         n_pairs <= MAX_PAIRS,
         "region.lattice_step",
-        shown,
+        f"{n_points} landing points",
         "are too many for the scripted policy: take a larger step",
     )
     scenario = worlds.scenario
@@ -134,7 +132,6 @@ class Seeker:
         scenario = worlds.scenario
         simulation = worlds.simulation
         server = worlds.server
-        source = scenario.source
         self.unpack = server.messages
         self.region_of = server.region_of
         self.counted = server.counted
@@ -144,13 +141,13 @@ class Seeker:
         self.dt = scenario.clock.dt
         self.candidates = simulation.candidates
         self.actions = scenario.actions
-        self.seeking = seeking_of(source, self.dt)
+        self.seeking = seeking_of(scenario.source, self.dt)
         self.hears_all = scenario.requests.range is None
         points = simulation.airspace.points
         self.real = points[..., 0].isfinite()
         self.points = points.nan_to_num(posinf=0.0)
         self.n_points = points.shape[1]
-        self.near = self.footprint_table(worlds)
+        self.near = self.footprint_table()
 
     def __call__(
         self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None
@@ -167,10 +164,10 @@ class Seeker:
         landed = gather_rows(self.points.flatten(0, 1), self.counted(held))
         weight = search_weights(held, ground, landed, now, self.radius, self.seeking)
         gain = weight @ self.footprints(region)
-        action, _ = self.choose_landing(held, gain, region, mask)
+        action, _ = self.choose_landing(held, gain, mask)
         return action
 
-    def footprint_table(self, worlds: UavEnv) -> Tensor:
+    def footprint_table(self) -> Tensor:
         """1 for landing points (rows) in the footprints of others (columns), [R, L, L]."""
         near = distances(self.points, self.points) <= self.radius
         return (near & self.real.unsqueeze(-1)).float()
@@ -182,15 +179,15 @@ class Seeker:
         return self.near[region]
 
     def choose_landing(
-        self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None
+        self, held: Messages, gain: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Actions, and the landing points [B, N] to which they lead, as indices in their region."""
+        region = self.region_of(held)
         ground = self.points[region]
         real = self.real[region].unsqueeze(1)
         gain = gain.where(real, -torch.inf)
         flown = distances(held.target, ground)
-        goal = (gain - FLIGHT_COST * flown).argmax(-1)
-        goal_place = _places_at(ground, goal)
+        goal_place = _places_at(ground, (gain - FLIGHT_COST * flown).argmax(-1))
         left = distances(goal_place, ground)
         if self.actions.kind == "discrete":
             # A UAV that the server has last heard of at its takeoff stands on its target when it
@@ -308,13 +305,12 @@ class Searcher(Seeker):
         chance = chance.scatter(-1, here, stays)
         chance = chance.masked_fill(self.taken(known), 0.0)
         ground = self.points[region]
-        flown = distances(own.target, ground)
-        near = flown <= self.from_others(known, ground)
+        near = distances(own.target, ground) <= self.from_others(known, ground)
         probable = chance.amax(-1, keepdim=True) >= PROBABLE
         chance = torch.where(probable | near, chance, 0.0)
         highest = chance.amax(-1, keepdim=True)
         gain = torch.where(chance >= WORTH * highest, chance, 0.0)
-        action, _ = self.choose_landing(own, gain, region, mask)
+        action, _ = self.choose_landing(own, gain, mask)
         return action
 
     def from_others(self, known: Messages, ground: Tensor) -> Tensor:
@@ -330,8 +326,7 @@ class Searcher(Seeker):
         point = known.trail[..., :1] % self.n_points
         nowhere = point.new_zeros(*point.shape[:2], self.n_points)
         stands = nowhere.scatter(-1, point, 1)
-        everyone = stands.sum(1, keepdim=True)
-        return everyone > stands
+        return stands.sum(1, keepdim=True) > stands
 
 
 class Coverer(Seeker):
@@ -343,9 +338,9 @@ class Coverer(Seeker):
     ahead.
     """
 
-    def footprint_table(self, worlds: UavEnv) -> Tensor:
+    def footprint_table(self) -> Tensor:
         """The landing points in the footprint of each, as bits, [R, L, W]."""
-        bits = footprint_bits(worlds.simulation.airspace.points, self.radius)
+        bits = footprint_bits(self.candidates.airspace.points, self.radius)
         return bits.unflatten(0, self.points.shape[:2])
 
     def __call__(  # type: ignore[override]
@@ -366,8 +361,7 @@ class Coverer(Seeker):
             if mask is not None:
                 legal = mask[:, uav : uav + 1]
             if own_message is not None:
-                itself = (uavs == uav).unsqueeze(-1)
-                packed = torch.where(itself, own_message, message)
+                packed = torch.where((uavs == uav).unsqueeze(-1), own_message, message)
                 own = self.unpack(packed)
             action, claims = self.choose_new(own, uav, claimed, near, legal)
             actions.append(action)
@@ -388,8 +382,7 @@ class Coverer(Seeker):
         for stop in latest.unbind(-1):
             taken = taken | _footprint_at(near, stop)
         gain = bit_count(near & ~taken.unsqueeze(1)).sum(-1).float()
-        region = self.region_of(known)
-        action, point = self.choose_landing(alone, gain.unsqueeze(1), region, mask)
+        action, point = self.choose_landing(alone, gain.unsqueeze(1), mask)
         gains = gain.gather(-1, point) > LEAST_GAIN
         return action, torch.where(gains, _footprint_at(near, point.squeeze(-1)), 0)
 
@@ -406,12 +399,11 @@ class Rescuer(Coverer):
         heard_places = known.detected_position * heard.unsqueeze(-1)
         place = heard_places.sum(1) / times
         goal, assigned = _goal_of(uav, known.target, place, heard.any(1))
-        searched = self.searched(known, uav)
-        goal = where_rows(assigned, goal, searched)
+        goal = where_rows(assigned, goal, self.searched(known, uav))
         region = self.region_of(known)
         from_goal = distances(goal.unsqueeze(1), self.points[region])
         close = (-from_goal / self.radius).exp()
-        action, _ = self.choose_landing(_only(known, uav), close, region, mask)
+        action, _ = self.choose_landing(_only(known, uav), close, mask)
         return action, claimed
 
     def searched(self, known: Messages, uav: int) -> Tensor:
@@ -437,17 +429,15 @@ class Dispatcher(Rescuer):
         self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         requests, unserved = known_requests(known)
-        places = requests[..., :2]
-        goal, assigned = _goal_of(uav, known.target, places, unserved)
+        goal, assigned = _goal_of(uav, known.target, requests[..., :2], unserved)
         alone = _only(known, uav)
         other = alone.target[:, 0]
         if not self.hears_all:
             other = self.searched(known, uav)
         goal = where_rows(assigned, goal, other)
         region = self.region_of(known)
-        from_goal = distances(goal.unsqueeze(1), self.points[region])
-        inside = from_goal <= self.radius
-        action, _ = self.choose_landing(alone, inside.float(), region, mask)
+        inside = distances(goal.unsqueeze(1), self.points[region]) <= self.radius
+        action, _ = self.choose_landing(alone, inside.float(), mask)
         return action, claimed
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable)
 
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
@@ -27,9 +27,9 @@ class CompiledMethods:
     def __init__(self, options: dict[str, Any], cuda_graph: bool = False) -> None:
         self._options = options
         self._cuda_graph = cuda_graph
-        self._graphs: dict[tuple[Hashable, ...], Callable[..., Any]] = {}
+        self._graphs: dict[tuple[Hashable, ...], Callable] = {}
 
-    def get(self, method: Callable[..., Any], *variant: Hashable) -> Callable[..., Any]:
+    def get(self, method: Callable, *variant: Hashable) -> Callable:
         """The compiled method; each variant of what no guard checks has its own graph."""
         key = (method.__name__, *variant)
         if key not in self._graphs:
@@ -49,7 +49,7 @@ class CudaGraph:
     returns stays. (With ``torch.compile(mode="reduce-overhead")`` both would be lost.)
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable) -> None:
         self._function = function
         self._graph = torch.cuda.CUDAGraph()
         self._calls = 0

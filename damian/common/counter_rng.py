@@ -18,10 +18,14 @@ _FIRST = -0x40A7B892E31B1A47
 _SECOND = -0x6B2FB644ECCEEE15
 
 
-def bits64(key: Tensor, *counters: Tensor) -> Tensor:
+Counter = Tensor | int
+
+
+def bits64(key: Tensor, *counters: Counter) -> Tensor:
     """Draw 64 random bits, int64, one for each element of the broadcast shape of key and counters.
 
-    Counters are int64 and tell the draws of a stream apart; their order matters.
+    Counters are int64, or one number for all, and tell the draws of a stream apart; their order
+    matters.
     """
     for counter in counters:
         product = _product(key, counter)
@@ -29,25 +33,27 @@ def bits64(key: Tensor, *counters: Tensor) -> Tensor:
     return key
 
 
-def bits(key: Tensor, *counters: Tensor) -> Tensor:
+def bits(key: Tensor, *counters: Counter) -> Tensor:
     """Draw uniform integers in [0, 2^32); the arguments are those of ``bits64``."""
     return _high(key, counters) & _MASK
 
 
-def uniform(key: Tensor, *counters: Tensor) -> Tensor:
+def uniform(key: Tensor, *counters: Counter) -> Tensor:
     """Draw uniform floats in [0, 1), multiples of 2^-24; the arguments are those of ``bits64``."""
     return ((_high(key, counters) >> 8) & 0xFFFFFF).to(torch.float32) * 2.0**-24
 
 
-def _high(key: Tensor, counters: tuple[Tensor, ...]) -> Tensor:
+def _high(key: Tensor, counters: tuple[Counter, ...]) -> Tensor:
     """The upper 32 of 64 random bits, which need no last mixing, with the sign above them."""
     if counters:
         key = _product(bits64(key, *counters[:-1]), counters[-1])
     return key >> 32
 
 
-def _product(key: Tensor, counter: Tensor) -> Tensor:
+def _product(key: Tensor, counter: Counter) -> Tensor:
     """The hash of a counter before the last mixing of the lower bits; int64 wraps."""
+    if isinstance(counter, int):
+        counter = torch.full_like(key, counter)
     x = (counter * _WEYL) ^ key
     x = (x ^ ((x >> 30) & 0x3FFFFFFFF)) * _FIRST
     x = x + key
@@ -58,7 +64,7 @@ def world_seeds(seed: int, n_worlds: int, device: torch.device | None = None) ->
     """Derive one key for each world from a seed, [B] int64; neighbouring seeds share no streams."""
     wrapped = (index(seed) + 2**63) % 2**64 - 2**63
     base = torch.full((n_worlds,), wrapped, dtype=torch.long, device=device)
-    return bits64(base, torch.zeros_like(base), torch.arange(n_worlds, device=device))
+    return bits64(base, 0, torch.arange(n_worlds, device=device))
 
 
 def number_of(text: str) -> int:

@@ -60,6 +60,12 @@ def setting(default: Any, meaning: str = "", unit: str = "", **rule: Any) -> Any
     return field(default=default, metadata=metadata)
 
 
+chance = functools.partial(setting, low=0, high=1)
+"""A field between 0 and 1."""
+metres = functools.partial(setting, unit="m", above=0)
+"""A field that is a distance above 0."""
+
+
 def constant(default: Any, reason: str, **rule: Any) -> Any:
     """A field that is no key: a Python program may set it, but nobody needs to, for the reason
     given."""
@@ -135,7 +141,7 @@ def default_of(each: "dataclasses.Field[Any]") -> Any:
 def rules(kind: type) -> dict[str, Rule]:
     """The rules of the fields of a dataclass; a field that only changes the default keeps the
     rule."""
-    found: dict[str, Rule] = {}
+    found = {}
     for base in reversed(kind.__mro__):
         for each in getattr(base, "__dataclass_fields__", {}).values():
             if "rule" in each.metadata or each.name not in found:
@@ -157,25 +163,18 @@ def leaves(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 def nested(config: Any) -> dict[str, Any]:
     """Settings as plain data, a mapping for each section, without what ``leaves`` leaves out."""
-    found: dict[str, Any] = {}
+    found = {}
     for key, value in leaves(config):
         set_at(found, key, value)
     return found
 
 
-def value_at(values: Mapping[str, Any], key: str) -> Any:
-    """A value of nested data by its dotted key; None if there is none."""
-    found: Any = values
+def value_at(values: Mapping[str, Any], key: str, default: Any = None) -> Any:
+    """A value of nested data by its dotted key; the default if there is none."""
+    found = values
     for name in key.split("."):
-        found = found.get(name) if isinstance(found, Mapping) else None
+        found = found.get(name, default) if isinstance(found, Mapping) else default
     return found
-
-
-def has(values: Mapping[str, Any], key: str) -> bool:
-    """Whether nested data have a value, also None, at a dotted key."""
-    section, _, name = key.rpartition(".")
-    found = value_at(values, section) if section else values
-    return isinstance(found, Mapping) and name in found
 
 
 def set_at(values: dict[str, Any], key: str, value: Any) -> None:

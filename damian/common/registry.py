@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.metadata import entry_points
+from pkgutil import resolve_name
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from damian.common import checks
@@ -143,7 +144,7 @@ def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
     return name
 
 
-def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+def parameters_of(function: Callable) -> dict[str, inspect.Parameter]:
     """The keyword-only arguments of a function, by name."""
     accepted = inspect.signature(function).parameters
     return {
@@ -151,9 +152,7 @@ def parameters_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     }
 
 
-def check_parameters(
-    function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str
-) -> None:
+def check_parameters(function: Callable, given: Mapping[str, Any], path: str, key: str) -> None:
     """Require that ``given`` are the keyword-only arguments of a function; ``path`` names it in
     errors."""
     known = parameters_of(function)
@@ -170,11 +169,9 @@ def check_parameters(
     checks.require(not missing, key, path, f"needs a value for {', '.join(missing)}")
 
 
-def resolved(path: str) -> Any:
-    """The class or function at a path that code names, not a setting; it is imported when it is
-    needed."""
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
+resolved = resolve_name
+"""The class or function at a path that code names, not a setting; it is imported when it is
+needed."""
 
 
 def _import_path(path: str, key: str) -> Any:

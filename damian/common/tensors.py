@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 Tree = TypeVar("Tree", bound=NamedTuple)
 
@@ -43,31 +44,18 @@ def next_true(flags: Tensor) -> Tensor:
 
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
     """Apply a function to the corresponding tensors of nested named tuples."""
-    values: list[Any] = [
+    values = [
         tree_map(function, *leaf) if hasattr(leaf[0], "_fields") else function(*leaf)
         for leaf in zip(tree, *others, strict=True)
     ]
     return tree._make(values)
 
 
-def to_device(value: Any, device: torch.device) -> Any:
-    """Copy of a tensor, or of nested tuples and mappings of tensors and others, on another
-    device."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if isinstance(value, dict):
-        return {key: to_device(each, device) for key, each in value.items()}
-    if type(value) is tuple:
-        return tuple(to_device(each, device) for each in value)
-    return (
-        value._make(to_device(each, device) for each in value) if hasattr(value, "_make") else value
-    )
-
-
 def move_attributes(owner: object, device: torch.device) -> None:
-    """Move the tensors among an object's attributes to a device, in place."""
-    for name, value in vars(owner).items():
-        setattr(owner, name, to_device(value, device))
+    """Move the tensors among an object's attributes, and in tuples and mappings there, to a
+    device."""
+    moved = tree_map_only(Tensor, lambda each: each.to(device), vars(owner))
+    vars(owner).update(moved)
 
 
 def where_rows(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:

@@ -68,7 +68,7 @@ def regime(methods: Mapping[str, Method], name: str) -> str:
     return SIMULATOR if simulated else LATE_DATA
 
 
-def shown(line: Mapping[Any, Any], name: str) -> str:
+def shown(line: Mapping, name: str) -> str:
     """A value of a line and its interval, if they are known, for people."""
     value, low, high = (line[name + end] for end in ENDS)
     if np.isnan(value):
@@ -178,14 +178,15 @@ class Comparison:
         """
         names = (*self.measured, *COMPARED)
         columns = [name + end for name in names for end in ENDS]
-        return pd.DataFrame(self._lines(), columns=[*LABELLED, *columns])
+        lines = (
+            line
+            for task in self.tasks()
+            for delay in (NOT_LATE, *self.delays(task))
+            for line in self._lines(task, delay)
+        )
+        return pd.DataFrame(lines, columns=[*LABELLED, *columns])
 
-    def _lines(self) -> Iterator[dict[str, Any]]:
-        for task in self.tasks():
-            for delay in (NOT_LATE, *self.delays(task)):
-                yield from self._lines_of(task, delay)
-
-    def _lines_of(self, task: str, delay: str) -> Iterator[dict[str, Any]]:
+    def _lines(self, task: str, delay: str) -> Iterator[dict[str, Any]]:
         scores = self.scores(task, delay)
         methods = self._present(task, delay)
         others = [(name, self.policy_of(name)) for name in methods]
@@ -234,8 +235,7 @@ class Comparison:
             of[method] = (task, delay, method, self.policy_of(method))
         none = pd.DataFrame({self.score: []}, dtype=float)
         found = {name: self._runs.get(run, none)[self.score] for name, run in of.items()}
-        scores = pd.DataFrame(found).sort_index()
-        return scores * sign_of(self.score)
+        return pd.DataFrame(found).sort_index() * sign_of(self.score)
 
     def _present(self, task: str, delay: str) -> list[str]:
         """Methods that have a finished run of a task under a delay."""
@@ -259,8 +259,7 @@ class Comparison:
         found |= _estimates(["J_norm"], _norms, array)
         if rivals and not is_rival:
             _, _, *of_rivals, own = array
-            strongest = max(of_rivals, key=np.mean)
-            found |= improvement(own, strongest)
+            found |= improvement(own, max(of_rivals, key=np.mean))
             if not np.isnan(recovery(array)):
                 found |= _estimates(["recovery"], lambda drawn: recovery(drawn, 0.0), array)
         return found

@@ -21,6 +21,8 @@ from damian.runs.metrics import Evaluation
 from damian.runs.run_folder import RANDOM, SCRIPT, TRAINED, UNTRAINED
 
 Panel = TypeVar("Panel")
+Style = dict[str, Any]
+"""Arguments of Matplotlib."""
 
 LABELS = {
     "hindsight_return": "return in hindsight",
@@ -46,7 +48,7 @@ _POINTS = 200
 """Number of points of a learning curve."""
 _LINE = ["task", "delay", "method", "policy"]
 """Columns that name a line of the table of a comparison."""
-_LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
+_LEVEL: Style = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
 
 
@@ -118,7 +120,7 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
         for row, name in enumerate(shown):
             value, low, high = estimates[lines[name]]
             error = np.nan_to_num([[value - low], [high - value]], posinf=0.0)
-            style: dict[str, Any] = {"color": "0.5", "marker": "o"}
+            style: Style = {"color": "0.5", "marker": "o"}
             if name != SCRIPT:
                 style |= look(methods, name)
                 naive += [value] if methods[name].naive else []
@@ -163,7 +165,7 @@ def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
     save(path, [*filter(None, [along])], panel, (4.4, 3.2))
 
 
-def look(methods: Mapping[str, Method], method: str) -> dict[str, Any]:
+def look(methods: Mapping[str, Method], method: str) -> Style:
     """Style of a method by its place among all; dotted lines are of methods that train nothing."""
     again, colour = divmod([*methods].index(method), len(METHOD_COLOURS))
     trains = methods[method].policy_of is None and not methods[method].flies
@@ -193,7 +195,7 @@ def save(
         whole = (size[0] * width + 1.2, size[1] * height)
         figure = Figure(figsize=whole, layout="constrained")
         axes = figure.subplots(height, width, squeeze=False).flat
-        drawn: dict[str, Any] = {}
+        drawn: Style = {}
         for axis, panel in zip(axes, panels, strict=False):
             draw(axis, panel)
             handles, labels = axis.get_legend_handles_labels()
@@ -231,7 +233,7 @@ def _places(comparison: Comparison, undelayed: Sequence[str] = ()) -> list[tuple
     return [(task, delay) for task in tasks for delay in comparison.delays(task) or undelayed]
 
 
-def _line_of(comparison: Comparison, name: str) -> dict[str, Any]:
+def _line_of(comparison: Comparison, name: str) -> Style:
     """Style of the line of a method, with its entry in the legend: only the first six are
     coloured."""
     grey = {"color": "0.75"} if [*comparison.methods].index(name) > 5 else {}
@@ -250,7 +252,7 @@ def _over_steps(axis: Axes, measure: str, levels: Mapping[str, float | None], sc
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, script, "-.")):
         if (level := levels.get(policy)) is not None:  # a region may be too large for the script
-            style: dict[str, Any] = _LEVEL | {"label": label, "linestyle": line}
+            style: Style = _LEVEL | {"label": label, "linestyle": line}
             axis.axhline(level, **style)
 
 

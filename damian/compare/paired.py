@@ -13,13 +13,11 @@ from damian.runs.run_folder import measured_in
 
 NOTE = (
     f"n: runs, one for each seed; [95 % interval over runs, none below {FEWEST}]; perceived: as "
-    "far as the "
-    "server knew"
+    "far as the server knew"
 )
 DIFFERENCE = (
     "; difference: of the {score} to that of {first}, paired by seed; P > first: probability that "
-    "a run of "
-    "the line beats one of the first"
+    "a run of the line beats one of the first"
 )
 
 

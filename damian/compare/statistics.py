@@ -99,8 +99,7 @@ def improvement_interval(probability: float, n_seeds: int) -> tuple[float, float
     shared = (1 - truth) / (2 - truth) + truth / (1 + truth)
     variance = truth * (1 - truth) * (1 + (n_seeds - 1) * shared)
     chance = NORMAL * np.sqrt(variance) / n_seeds
-    distance = np.abs(truth - probability)
-    likely = truth[distance <= chance]
+    likely = truth[np.abs(truth - probability) <= chance]
     return float(likely.min()), float(likely.max())
 
 
@@ -130,8 +129,7 @@ def bootstrap(
     bias = math.sqrt(n_seeds / degrees)
     student = stdtrit(degrees, (1 + LEVEL) / 2)
     factor = bias * student / NORMAL
-    drawn = resampled(scores, draws)
-    low, high = interval(statistic(drawn))
+    low, high = interval(statistic(resampled(scores, draws)))
     below = factor * (value - low)
     above = factor * (high - value)
     return value, value - below, value + above

@@ -93,8 +93,7 @@ def _right(own: pd.DataFrame) -> Flags:
     """The same for a sender whose clock was set."""
     late = (own.received - own.time).reset_index(drop=True)
     part = np.cumsum(_steps(own))
-    median = late.groupby(part).median()
-    is_plausible = median.between(0, LATEST_MEDIAN)
+    is_plausible = late.groupby(part).median().between(0, LATEST_MEDIAN)
     comes_before_its_time = late < -AGREE
     least = late.mask(comes_before_its_time).groupby(part).min()
     is_right = is_plausible & (least <= least[is_plausible].min() + AGREE)

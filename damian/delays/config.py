@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from damian.common import checks
-from damian.common.fields import Settings, setting
+from damian.common.fields import Settings, chance, metres, setting
 
 LONGEST = 10_000
 """Longest delay allowed [steps], because every message in transit takes memory."""
@@ -27,7 +27,7 @@ class DelayConfig(Settings):
     act: Any = setting(
         0, "Delay of actions, written as ``obs``; a UAV holds until the first one arrives."
     )
-    act_loss: float = setting(0.0, "Probability that an action never arrives.", low=0, high=1)
+    act_loss: float = chance(0.0, "Probability that an action never arrives.")
     act_hold: str = setting(
         "none",
         "``max``: an action is executed when the longest delay of ``act`` has passed; else as it "
@@ -35,9 +35,7 @@ class DelayConfig(Settings):
         choices=("none", "max"),
     )
     rew: Any = setting(0, "Delay of rewards, written as ``obs``; none may be lost.")
-    loss: float = setting(
-        0.0, "Probability that a message to the server node is lost.", low=0, high=1
-    )
+    loss: float = chance(0.0, "Probability that a message to the server node is lost.")
     hold: str = setting(
         "none",
         "``max``: the server holds messages back until the longest delay of ``obs`` has passed.",
@@ -80,8 +78,8 @@ class LinkConfig(Settings):
     loss: Any = setting(
         0.0, "Probability of a loss; or a list per receiver.", kinds=("updown", "matrix")
     )
-    range: float | None = setting(
-        None, "A UAV hears only UAVs within this distance.", unit="m", above=0, kinds=("matrix",)
+    range: float | None = metres(
+        None, "A UAV hears only UAVs within this distance.", kinds=("matrix",)
     )
 
     def __post_init__(self) -> None:

@@ -73,7 +73,7 @@ def _best(fits: list[LawFit]) -> LawFit:
     return min(fits, key=attrgetter("bic"))
 
 
-def _likelihood(counts: NDArray[Any], chances: Floats) -> float:
+def _likelihood(counts: NDArray, chances: Floats) -> float:
     """Logarithm of the likelihood of counts of independent outcomes [nats]."""
     occurs = counts > 0
     with np.errstate(divide="ignore"):

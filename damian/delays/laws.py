@@ -17,7 +17,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.common.fields import rules, setting
+from damian.common.fields import chance, metres, rules, setting
 from damian.common.registry import Registry
 from damian.common.text_files import data_file, named, parse_table, read_text
 from damian.delays.config import LONGEST, is_matrix
@@ -106,8 +106,7 @@ def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "del
 _NO_STEPS = "is neither a number of steps >= 0 (3) nor a time (3s, 2min)"
 _NO_DELAY = (
     "is not a delay, which is a number of steps >= 0 (3), a time (3s, 2min), a range (1..7, "
-    "3s..7s), a "
-    "distribution ({law: geometric, mean: 2}; in Python Geometric(2)) or a function"
+    "3s..7s), a distribution ({law: geometric, mean: 2}; in Python Geometric(2)) or a function"
 )
 
 
@@ -169,7 +168,7 @@ class Uniform(Law):
     """Shortest delay: steps, or a time."""
     high: Delay = 0
     """Longest delay, written as ``low`` is."""
-    probability: float = setting(1.0, low=0, high=1)
+    probability: float = chance(1.0)
     """Probability that a message is late at all."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
@@ -225,17 +224,17 @@ class Burst(Law):
     1 and good from t = 2 on: messages sent at t = 0, 1 and 2 arrive at t = 3, 4 and 2.
     """
 
-    enter: float = setting(0.05, low=0, high=1)
+    enter: float = chance(0.05)
     """Probability that a good channel turns bad, per step."""
-    leave: float = setting(0.25, low=0, high=1)
+    leave: float = chance(0.25)
     """Probability that a bad channel turns good, per step."""
     good: Any = 0
     """Law of the delays while the channel is good; it must be memoryless."""
     bad: Any = 5
     """Law of the delays while the channel is bad; it must be memoryless."""
-    good_loss: float = setting(0.0, low=0, high=1)
+    good_loss: float = chance(0.0)
     """Probability that a message is lost while the channel is good."""
-    bad_loss: float = setting(0.5, low=0, high=1)
+    bad_loss: float = chance(0.5)
     """Probability that a message is lost while the channel is bad."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
@@ -287,7 +286,7 @@ class Lag(Law):
     update_period: Delay = 1
     """Time between two draws: steps, a time, or ``episode``: a lag is held until the end of the
     episode."""
-    hold_probability: float = setting(0.0, low=0, high=1)
+    hold_probability: float = chance(0.0)
     """Probability that an update keeps the lag instead of drawing another one."""
     shared: bool = False
     """All agents of a world have the same lags and losses."""
@@ -334,7 +333,7 @@ class Distance(Law):
     """Delay at distance 0, of processing and transmission: steps, or a time."""
     speed: float = setting(math.inf, above=0, unit="m/s")
     """Propagation speed [m/s]."""
-    range: float = setting(math.inf, above=0, unit="m")
+    range: float = metres(math.inf)
     """Distance at which half of the messages are lost [m]."""
     path_loss_exponent: float = setting(2.0, above=0)
     """Exponent n of the path loss; 2 in free space, 3 to 5 in cities."""
@@ -439,7 +438,7 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
             matrix,
             f"is not N x N, {n} x {n}: a list for each receiver, with an entry for each sender",
         )
-    distinct: list[Any] = []
+    distinct: list = []
     samplers: list[Sampler] = []
     index = []
     for i, j in itertools.product(range(n), range(n)):

@@ -102,14 +102,8 @@ class Sampler(nn.Module, ABC):
         """The delays [M], of which a share ``loss`` is lost, by a draw of its own."""
         if not self.loss:
             return delay
-        draw = _further_draw(streams, clock, _LOSS_DRAW)
+        draw = counter_rng.uniform(streams, clock, _LOSS_DRAW)
         return torch.where(draw < self.loss, self.lost, delay)
-
-
-def _further_draw(streams: Tensor, clock: Tensor, number: int) -> Tensor:
-    """A further random number in [0, 1) of each message, [M]."""
-    counter = torch.full_like(clock, number)
-    return counter_rng.uniform(streams, clock, counter)
 
 
 class TableSampler(Sampler):
@@ -176,8 +170,7 @@ class TableSampler(Sampler):
         below = self._boundaries[state]
         outcome = (draw.unsqueeze(-1) >= below).sum(-1)
         n = self.longest + 2
-        delay = outcome % n
-        return delay, outcome // n
+        return outcome % n, outcome // n
 
 
 _ROUNDING = 1e-10
@@ -208,8 +201,7 @@ class Recorded(Sampler):
         if self.loss:
             draw = counter_rng.uniform(streams, clock)
             delay = torch.where(draw < self.loss, self.lost, delay)
-        following = (state + 1) % len(self._delays)
-        return delay, following
+        return delay, (state + 1) % len(self._delays)
 
 
 class HeldSampler(Sampler):
@@ -237,8 +229,7 @@ class HeldSampler(Sampler):
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
-        held = torch.where(delay < self.lost, self.longest, self.lost)
-        return held, state
+        return torch.where(delay < self.lost, self.longest, self.lost), state
 
 
 class LossSampler(HeldSampler):
@@ -256,9 +247,8 @@ class LossSampler(HeldSampler):
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
-        draw = _further_draw(streams, clock, _LOSS_DRAW)
-        read = cast(MessageContext, context).entries
-        chance = read["loss"].view_as(draw)
+        draw = counter_rng.uniform(streams, clock, _LOSS_DRAW)
+        chance = cast(MessageContext, context).entries["loss"].view_as(draw)
         delay = torch.where(draw < chance, self.lost, delay)
         return delay, state
 
@@ -290,8 +280,7 @@ class LagSampler(Sampler):
         return torch.stack([lag, wait], -1)
 
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
-        first = self.initial_state(state[:, 0])
-        return where_rows(mask, first, state)
+        return where_rows(mask, self.initial_state(state[:, 0]), state)
 
     def forward(
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
@@ -304,13 +293,11 @@ class LagSampler(Sampler):
         renewed = due
         interval = torch.full_like(streams, self._period)
         if self._hold_probability:
-            draw = _further_draw(streams, clock, _HOLD_DRAW)
+            draw = counter_rng.uniform(streams, clock, _HOLD_DRAW)
             released = draw >= self._hold_probability
             renewed = first | (due & released)
         if self._stagger:
-            counter = torch.full_like(clock, _PHASE_DRAW)
-            bits = counter_rng.bits(streams, clock, counter)
-            phase = bits % self._period
+            phase = counter_rng.bits(streams, clock, _PHASE_DRAW) % self._period
             interval = torch.where(first, 1 + phase, interval)
         drawn, _ = self._lags(streams, clock, lag)
         lag = torch.where(renewed, drawn, lag)
@@ -385,8 +372,7 @@ class LinkSampler(Sampler):
     def __init__(self, samplers: Sequence[Sampler], law_index: Tensor, loss: Tensor) -> None:
         loses_on_links = bool((loss > 0).any())
         loses = loses_on_links or any(sampler.loses for sampler in samplers)
-        longest = max(sampler.longest for sampler in samplers)
-        super().__init__(longest, loses)
+        super().__init__(max(sampler.longest for sampler in samplers), loses)
         self.n_agents = math.isqrt(len(law_index))
         self.samplers: Any = nn.ModuleList(samplers)
         self.sees_context = any(sampler.sees_context for sampler in samplers)
@@ -400,8 +386,7 @@ class LinkSampler(Sampler):
         self.register_buffer("_loss", loss, persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        states = [sampler.initial_state(streams) for sampler in self.samplers]
-        return _packed(states)
+        return _packed([sampler.initial_state(streams) for sampler in self.samplers])
 
     def begin_episode(self, state: Tensor, mask: Tensor) -> Tensor:
         pairs = zip(self.samplers, self._split(state), strict=True)
@@ -423,7 +408,7 @@ class LinkSampler(Sampler):
             delay = torch.where(index == k, drawn, delay)
             states.append(new_state)
         if self._loses_on_links:
-            draw = _further_draw(streams, clock, _LINK_LOSS_DRAW)
+            draw = counter_rng.uniform(streams, clock, _LINK_LOSS_DRAW)
             loss = self._loss.repeat(n_worlds)
             delay = torch.where(draw < loss, self.lost, delay)
         return delay, _packed(states)

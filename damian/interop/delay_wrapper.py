@@ -30,7 +30,7 @@ Sent = dict[int, tuple[Any, float]]
 """Things that were sent, each with a time, by time."""
 
 
-class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class DelayWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """Delays what the agent observes, does and earns, as the transforms do, whatever the spaces
     are.
 
@@ -64,7 +64,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
 
     def __init__(
         self,
-        env: gymnasium.Env[Any, Any],
+        env: gymnasium.Env,
         observation: Any = 0,
         action: Any = 0,
         reward: Any = 0,
@@ -75,7 +75,7 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         default: Any = None,
         dt: float = 1.0,
     ) -> None:
-        told: dict[str, Any] = {
+        told: ByName = {
             "observation": observation,
             "action": action,
             "reward": reward,
@@ -95,15 +95,13 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         self._delays = Delays(observed, {"": env.action_space}, told)
         self.observation_space = self._delays.space("", space)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict]:
+    def reset(self, *, seed: int | None = None, options: ByName | None = None) -> tuple[Any, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
         observed = observation if self._in_parts else {"": observation}
         told, more = self._delays.reset(observed, seed)
         return told[""], info | more[""]
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, ByName]:
         executed = self._delays.act({"": action})[""]
         observation, reward, terminated, truncated, info = self.env.step(executed)
         ended = [""] if terminated or truncated else []
@@ -132,8 +130,7 @@ class Delays:
         self._observations = _Link("observation", observed, told)
         self.actions = _Link("action", acting, told)
         self._rewards = _Link("reward", acting, told)
-        all_arrive = not self._rewards.sampler.loses
-        checks.require(all_arrive, "reward", told["reward"], LOSES)
+        checks.require(not self._rewards.sampler.loses, "reward", told["reward"], LOSES)
         needed = self.actions.sampler.late or self._history
         default = dict(told["default"])
         for agent, space in acting.items():
@@ -149,7 +146,7 @@ class Delays:
         if self._history:
             self._chosen = {agent: _flat("history", each) for agent, each in acting.items()}
 
-    def space(self, agent: str, space: Space[Any]) -> Space[Any]:
+    def space(self, agent: str, space: Space) -> Space:
         """The space of what an agent is told, whose observations are in ``space``."""
         added = self._added(agent)
         if not added:
@@ -159,9 +156,8 @@ class Delays:
         checks.require(
             not taken, "observation", listed(taken), "is an entry of it already: rename that"
         )
-        for name, each in added.items():
-            entries[name] = Box(-np.inf, np.inf, each.shape)
-        return Dict(entries)
+        added = {name: Box(-np.inf, np.inf, each.shape) for name, each in added.items()}
+        return Dict(entries | added)
 
     def reset(self, observations: ByName, seed: int | None) -> Told:
         """What agents are told first, and their infos; a seed decides all later delays."""
@@ -175,8 +171,7 @@ class Delays:
         agents = self._agents(observations)
         self.present |= {*agents}
         self._observations.begin(observations)
-        defaults = {agent: self._default[agent] for agent in agents}
-        self.actions.begin(defaults)
+        self.actions.begin({agent: self._default[agent] for agent in agents})
         self._rewards.begin(dict.fromkeys(agents, 0.0))
         return self._told(agents)
 
@@ -221,8 +216,8 @@ class Delays:
         infos = {}
         for agent in agents:
             parts = self._parts[agent]
-            found: Any = {part: link.held(part) for part in parts}
-            age: Any = {part: link.age[part] for part in parts}
+            found = {part: link.held(part) for part in parts}
+            age = {part: link.age[part] for part in parts}
             if agent in found:
                 found = found[agent]
                 age = age[agent]
@@ -276,7 +271,7 @@ class _Link:
 
     def __init__(self, name: str, senders: Collection[str], told: ByName) -> None:
         loss = told["loss"] if name == "observation" else 0.0
-        laws: list[Any] = [told[name], loss]
+        laws: list = [told[name], loss]
         should = f"is named, but the names are: {listed(filter(None, senders))}"
         for key, given in zip((name, "loss"), laws, strict=True):
             if _by_name(given):
@@ -292,8 +287,7 @@ class _Link:
         self.sampler: Sampler = samplers[0]
         if len(samplers) > 1:
             index = torch.tensor([distinct.index(law) for law in each])
-            no_loss = torch.zeros(len(index))
-            self.sampler = LinkSampler(samplers, index, no_loss)
+            self.sampler = LinkSampler(samplers, index, torch.zeros(len(index)))
         self._line = DelayLine(self.sampler, "generation")
         before_step = name == "action"
         self._contexts = ContextReader(self.sampler, None, dt, name, before_step=before_step)
@@ -356,20 +350,17 @@ class _Link:
 
     def held(self, sender: str) -> Any:
         """What is held of a sender."""
-        time = self._now - self.age[sender]
-        thing, _ = self._sent[sender][time]
+        thing, _ = self._sent[sender][self._now - self.age[sender]]
         return copy.deepcopy(thing)
 
     def recent(self, sender: str) -> Sent:
         """What a sender sent lately, and the time until it arrives, by age [steps]."""
         now = self._now
-        recent = {}
-        for time, (thing, due) in self._sent[sender].items():
-            recent[now - time] = thing, due - now
-        return recent
+        sent = self._sent[sender].items()
+        return {now - time: (thing, due - now) for time, (thing, due) in sent}
 
 
-def _flat(key: str, space: Space[Any]) -> tuple[Space[Any], Numbers, Numbers]:
+def _flat(key: str, space: Space) -> tuple[Space, Numbers, Numbers]:
     """A space, and the bound and width of each of its D numbers, 0 and 1 if they have no bounds,
     [D]."""
     flat = flatten_space(space)
@@ -389,7 +380,7 @@ def _by_name(given: Any) -> bool:
     return isinstance(given, Mapping) and "law" not in given
 
 
-def _zero(space: Space[Any]) -> Any:
+def _zero(space: Space) -> Any:
     """The action 0 of a space."""
     zeros = create_empty_array(space, 1)
     zero = next(iter(iterate(batch_space(space, 1), zeros)))

@@ -22,7 +22,9 @@ from damian.show.film import LiveFilm
 
 RENDER_MODES = ("rgb_array",)
 METADATA: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 4}
-Array = NDArray[Any]
+Array = NDArray
+Infos = dict[str, Any]
+"""What Gymnasium tells beside an observation, by name."""
 
 
 class Instant(NamedTuple):
@@ -66,7 +68,7 @@ class Flight:
         """What an agent observes, [F]."""
         return self._box(keys.OBSERVATION, agent)
 
-    def action_space(self) -> Space[Any]:
+    def action_space(self) -> Space:
         """What an agent chooses: one of A actions, or a distance and a heading in [0, 1]."""
         spec = self.env.full_action_spec[keys.ACTION]
         return (
@@ -95,8 +97,8 @@ class Flight:
             stepped, self._now = self.env.step_and_maybe_reset(self._now)
         else:
             stepped = self.env.step(self._now)
-            self._now = cast(TensorDictBase, step_mdp(stepped))
-        after = cast(TensorDictBase, stepped["next"])
+            self._now = step_mdp(stepped)
+        after = stepped["next"]
         if self.film:
             self.film.add(after)
         return _instant(after), _instant(self._now)
@@ -108,7 +110,7 @@ class Flight:
     def state(self) -> Array:
         """What a central critic observes of the first world, from the messages at the server,
         [N G]."""
-        return cast(Tensor, self._now[keys.GLOBAL_OBSERVATION])[0].flatten().numpy().copy()
+        return self._now[keys.GLOBAL_OBSERVATION][0].flatten().numpy().copy()
 
     def state_space(self) -> Box:
         """The space of ``state``."""
@@ -142,7 +144,7 @@ def _instant(outputs: TensorDictBase) -> Instant:
     )
 
 
-def actions_in(space: Space[Any], key: str, given: Any) -> Array:
+def actions_in(space: Space, key: str, given: Any) -> Array:
     """Actions as an array of the type of a space; refused if they do not lie in it."""
     found = np.asarray(given).astype(space.dtype, casting="same_kind")
     if not space.contains(found):
@@ -150,7 +152,7 @@ def actions_in(space: Space[Any], key: str, given: Any) -> Array:
     return found
 
 
-def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:
+def row(infos: dict[str, Array], world: int, agent: int) -> Infos:
     """The infos of one UAV, copied; flags are Python's: Gymnasium's vector environments know no
     others."""
     found = {

@@ -9,7 +9,7 @@ from gymnasium.vector.utils import batch_space
 
 from damian.common import checks
 from damian.envs.config import ScenarioConfig
-from damian.interop.flight import METADATA, Array, Flight, actions_in, row
+from damian.interop.flight import METADATA, Array, Flight, Infos, actions_in, row
 
 
 class UavGymEnv(gymnasium.Env[Array, Any]):
@@ -43,14 +43,14 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         self._infos: dict[str, Array] = {}
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Infos | None = None
+    ) -> tuple[Array, Infos]:
         super().reset(seed=seed)
         instant = self.flight.reset(seed)
         self._infos = instant.infos
         return instant.observation[0, 0], row(instant.infos, 0, 0)
 
-    def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, Infos]:
         chosen = actions_in(self.action_space, "action", action)
         instant, _ = self.flight.step(chosen[None, None])
         self._infos = instant.infos
@@ -67,8 +67,7 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         """Which discrete actions are legal now, [A] bool; all of them if nothing is masked."""
         space = cast(gymnasium.spaces.Discrete, self.action_space)
         info = row(self._infos, 0, 0)
-        mask = info.get("action_mask", np.ones(space.n))
-        return mask.astype(bool)
+        return info.get("action_mask", np.ones(space.n)).astype(bool)
 
 
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
@@ -91,14 +90,14 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+        self, *, seed: int | list[int | None] | None = None, options: Infos | None = None
+    ) -> tuple[Array, Infos]:
         is_list = isinstance(seed, list)
         checks.require(not is_list, "seed", seed, "is a list: world i draws from seed + i")
         instant = self.flight.reset(seed)  # type: ignore[arg-type]
         return instant.observation[:, 0], _infos(instant.infos)
 
-    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, Infos]:
         chosen = actions_in(self.action_space, "actions", actions)
         last, instant = self.flight.step(chosen[:, None], reset=True)
         infos = _infos(instant.infos)
@@ -115,14 +114,12 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
         return observation, reward, last.terminated, last.truncated, infos
 
 
-def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, Any]:
+def _infos(infos: dict[str, Array], worlds: Array | None = None) -> Infos:
     """Infos of the worlds [B, ...] by name, each with a mask of the worlds [B] that have it
     (all)."""
     if worlds is None:
         worlds = np.ones(len(infos["ready"]), bool)
-    found = {}
-    for name, each in infos.items():
-        found[name] = each if name == "is_success" else each[:, 0]
+    found = {name: each if name == "is_success" else each[:, 0] for name, each in infos.items()}
     masks = {f"_{name}": worlds.copy() for name in found}
     return found | masks
 

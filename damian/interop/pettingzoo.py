@@ -40,16 +40,16 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
             name: self.flight.observation_space(i) for i, name in enumerate(self.possible_agents)
         }
         self.action_spaces = {name: self.flight.action_space() for name in self.possible_agents}
-        self.state_space: Space[Any] = self.flight.state_space()
+        self.state_space: Space = self.flight.state_space()
 
-    def observation_space(self, agent: str) -> Space[Any]:
+    def observation_space(self, agent: str) -> Space:
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Space[Any]:
+    def action_space(self, agent: str) -> Space:
         return self.action_spaces[agent]
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
+        self, seed: int | None = None, options: ByName | None = None
     ) -> tuple[ByName, ByName]:
         instant = self.flight.reset(seed)
         self.agents = [*self.possible_agents]
@@ -121,7 +121,7 @@ class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
         dt: float = 1.0,
     ) -> None:
         super().__init__(env)
-        told: ByName = {
+        told = {
             "observation": observation,
             "action": action,
             "reward": reward,
@@ -139,7 +139,7 @@ class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
             agent: self._delays.space(agent, space) for agent, space in observed.items()
         }
 
-    def observation_space(self, agent: str) -> Space[Any]:
+    def observation_space(self, agent: str) -> Space:
         return self._spaces[agent]
 
     def reset(

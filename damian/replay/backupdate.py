@@ -178,8 +178,7 @@ class BackupdateStorage(TimeStorage):
             "max_size",
             self.max_size,
             f"is too little for batches of {len(data)} steps and delays of up to {self.longest} "
-            "steps: "
-            f"{needs} steps of {n_worlds} worlds need {needs * n_worlds}",
+            f"steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}",
         )
         for name, key in delays.items():
             takes = f"steps, but a {name} takes {int(data[key].max())} steps"
@@ -282,7 +281,7 @@ class BackupdateStorage(TimeStorage):
         keep = begins[n_right:].clone()
         keep[0] |= n_right == 0  # the step before the first one is not among these steps
         step, world = keep.nonzero(as_tuple=True)
-        before: Entries = {}
+        before = {}
         for next_, value in after.items():
             key = unravel_key(next_[1:])
             stored = None if next_ in ENDS else self.steps.get(key, None)

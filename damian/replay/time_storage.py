@@ -1,7 +1,7 @@
 """A replay-buffer storage that keeps steps in order of time."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -22,14 +22,14 @@ class TimeStorage(LazyTensorStorage):
     @property
     def steps(self) -> TensorDictBase:
         """All stored steps, [T, B], as a ring: ``latest`` gives their order in time."""
-        return cast(TensorDictBase, self._storage)
+        return self._storage
 
     # Private names of TorchRL are used in this file only.
 
     @property
     def n_steps(self) -> int:
         """Number of stored steps, T."""
-        return cast(int, self._len_along_dim0 or 0)
+        return self._len_along_dim0 or 0
 
     def rows(self, index: Tensor) -> TensorDictBase:
         """The steps at these indices [K], [K, B]; an entry is copied when it is read."""

@@ -19,17 +19,19 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 
+Stored = dict[str, Any]
+"""What a ``state_dict`` returns, and a checkpoint holds."""
 _PLAIN = (bool, int, float, str, bytes, torch.Size, torch.device, torch.dtype, type(None))
 
 
-def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
+def write_checkpoint(path: Path, content: Stored) -> None:
     """Write a checkpoint, completely or not at all; an older file of this name is replaced."""
     buffer = io.BytesIO()
     torch.save(plain(content), buffer)
     write_atomically(path, buffer.getvalue())
 
 
-def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
+def read_checkpoint(path: Path, key: str) -> Stored:
     """Read a checkpoint, with all tensors on the CPU."""
     try:
         # torch does not compare checksums, so that a changed bit would be a silently wrong weight.
@@ -84,7 +86,7 @@ def to_tensordict(stored: Mapping[str, Any]) -> TensorDict:
     return TensorDict(entries, stored["batch_size"])
 
 
-def restore(components: Mapping[str, Any], stored: Mapping[str, Any], path: Path, key: str) -> None:
+def restore(components: Mapping[str, Any], stored: Stored, path: Path, key: str) -> None:
     """Restore components in place with their ``load_state_dict``; ``key`` is the setting of the
     file."""
     for name, component in components.items():

@@ -17,7 +17,7 @@ from damian.envs.recompute import beliefs_in_hindsight
 from damian.keys import next_key
 from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage
-from damian.runs.checkpoint import to_tensordict
+from damian.runs.checkpoint import Stored, to_tensordict
 from damian.runs.measures import BUILT_IN, METRICS
 from damian.server.server import Server
 
@@ -88,8 +88,7 @@ def evaluation(rollout: TensorDictBase, server: Server, metrics: Sequence[str] =
     found.returns = flights.true.returns.cpu()
     for name in dict.fromkeys((*BUILT_IN, *metrics)):
         with naming_errors(f"metric {name}"):
-            metric = METRICS.get(name, "metrics")
-            values = torch.as_tensor(metric.compute(flights))
+            values = torch.as_tensor(METRICS.get(name, "metrics").compute(flights))
             found[name] = values.float().mean().item()
     return found
 
@@ -141,11 +140,10 @@ def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Te
     if not server.rewards_belief:
         return None
     steps = rollout.select(keys.MESSAGE, keys.BELIEF, next_key(keys.MESSAGE), next_key(keys.BELIEF))
-    sent = cast(Tensor, rollout[next_key(keys.MESSAGE_SENT)])
+    sent = rollout[next_key(keys.MESSAGE_SENT)]
     steps[next_key(keys.DELAY)] = sent.long().unsqueeze(-1) - 1  # 0, or -1 where none was sent
     steps[keys.STEP_COUNT] = elapsed.unsqueeze(-1) - 1
-    beliefs = beliefs_in_hindsight(server, steps.transpose(0, 1))
-    return beliefs.transpose(0, 1)
+    return beliefs_in_hindsight(server, steps.transpose(0, 1)).transpose(0, 1)
 
 
 def _up_to_first_end(ended: Tensor) -> Tensor:
@@ -194,11 +192,11 @@ class EpisodeLog:
         self._known = [*map(_latest, self._known, ended)]
         self.finished += int(done.sum())
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         hindsight = self.hindsight.state_dict() if self.hindsight else None
         return {"finished": self.finished, "known": self._known, "hindsight": hindsight}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         self.finished = state["finished"]
         self._known = state["known"]
         if self.hindsight:
@@ -290,11 +288,11 @@ class HindsightReturns:
         storage: Any = super(BackupdateStorage, self.storage) if corrected else self.storage
         storage.set(index % n_rows, steps)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         rows = self.storage.steps[self.storage.latest()] if self._written else None
         return {"rows": rows, "waiting": self._waiting, "running": self._running}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         self._waiting = int(state["waiting"])
         self._running = state["running"]
         if state["rows"] is not None:

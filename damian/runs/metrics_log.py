@@ -41,7 +41,7 @@ LOGGERS = Registry[Callable[..., Logger]](
 """Loggers by name or ``package.module:Name``: functions or classes that get the run folder."""
 
 
-def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Logger]:
+def make_loggers(config: LoggerConfig, folder: Path, frames: int) -> list[Logger]:
     """Make the loggers of settings.
 
     Args:
@@ -64,21 +64,15 @@ def make_loggers(config: LoggerConfig, folder: Path, frames: int = 0) -> list[Lo
     return loggers
 
 
-class TensorBoard:
+class TensorBoard(SummaryWriter):
     """Writes TensorBoard events into the run folder; the files that a resumed run adds belong to
     the same."""
 
     def __init__(self, folder: Path, frames: int) -> None:
-        self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
+        super().__init__(str(folder), purge_step=frames + 1 if frames else None)
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
-        self._events.add_scalar(name, value, step)
-
-    def flush(self) -> None:
-        self._events.flush()
-
-    def close(self) -> None:
-        self._events.close()
+        self.add_scalar(name, value, step)
 
 
 def read_logger(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
@@ -98,9 +92,7 @@ def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Lo
 
     not_linked(folder / "wandb")
     number = uuid5(NAMESPACE_URL, str(folder.resolve())).hex
-    logger: Any = WandbLogger(
-        folder.name, offline, str(folder), number, project, log_env_packages=False
-    )
+    logger = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
     logger.close = import_module("wandb").finish
     return logger
 
@@ -127,7 +119,7 @@ class MetricsLog:
         self._loggers = loggers
         self._path = folder / METRICS if to_csv else None
         stored = read_metrics(folder)
-        self.rows: list[dict[Any, Any]] = stored[stored[_FIRST_COLUMN] <= frames].to_dict("records")
+        self.rows: list[dict] = stored[stored[_FIRST_COLUMN] <= frames].to_dict("records")
         self._call("log_hparams", settings or {})
 
     def show(self, frames: int, numbers: Mapping[str, float]) -> None:

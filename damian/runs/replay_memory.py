@@ -2,7 +2,7 @@
 written once."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from damian.common.atomic_files import make_folder, remove_unfinished
 from damian.replay.time_storage import TimeStorage
-from damian.runs.checkpoint import read_checkpoint, to_tensordict, write_checkpoint
+from damian.runs.checkpoint import Stored, read_checkpoint, to_tensordict, write_checkpoint
 
 FILES = 32
 """A full replay memory has about so many files."""
@@ -35,16 +35,16 @@ class ReplayMemory:
     def _storage(self) -> TimeStorage:
         return cast(TimeStorage, cast(ReplayBuffer, self._buffer).storage)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         """Write the files that are complete by now, and return what else there is to store."""
         if self._buffer is None or not self._buffer.write_count:
             return {"written": 0}
         storage = self._storage
-        written = cast(int, self._buffer.write_count)
+        written = self._buffer.write_count
         oldest = written - len(storage.latest())
         per_file = -(-len(storage.steps) // FILES)
         # Late messages correct rows after these (``BackupdateStorage``).
-        final = written - cast(int, getattr(storage, "longest", -1)) - 1
+        final = written - getattr(storage, "longest", -1) - 1
         files = range(oldest // per_file, max(final // per_file, oldest // per_file))
         for file in {*files} - {*self._files}:
             make_folder(self._folder)
@@ -59,13 +59,13 @@ class ReplayMemory:
             "writer": self._buffer.writer.state_dict(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         """Fill the empty buffer with the rows of a state and of its files."""
         if self._buffer is None or not state["written"]:
             return
         parts = [read_checkpoint(self._path(file), "resume")["rows"] for file in state["files"]]
         rows = torch.cat([to_tensordict(part) for part in (*parts, state["rows"])])  # type: ignore[arg-type]
-        rows = cast(TensorDictBase, rows)[state["oldest"] - state["written"] :]
+        rows = rows[state["oldest"] - state["written"] :]
         storage = self._storage
         if storage.device != "auto":
             rows = rows.to(storage.device)
@@ -85,7 +85,7 @@ class ReplayMemory:
 
     def _rows(self, begin: int, end: int) -> TensorDictBase:
         steps = self._storage.steps
-        return cast(TensorDictBase, steps[torch.arange(begin, end) % len(steps)])
+        return steps[torch.arange(begin, end) % len(steps)]
 
     def _path(self, file: int) -> Path:
         return self._folder / f"{file:06}.pt"

@@ -51,7 +51,7 @@ server [steps]; late and lost: shares of the messages."""
 
 
 def save_results(
-    rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool, note: str = ""
+    rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool, note: str
 ) -> str:
     """Write evaluations by policy to ``result.csv`` and, as the returned table, to
     ``result.md``."""
@@ -120,7 +120,7 @@ def measured_in(table: pd.DataFrame, score: str) -> list[str]:
     return [score, *(name for name in metrics if name != score)]
 
 
-def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
+def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool) -> str:
     """Evaluations of policies as a Markdown table; NAME``, deterministic`` gives columns of NAME's
     line."""
     hidden = {*["success"] * (not can_succeed), *["late"] * (not late)}

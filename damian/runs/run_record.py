@@ -3,13 +3,13 @@
 import json
 import os
 import platform
-import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
+from subprocess import DEVNULL, CalledProcessError, check_output
 from typing import Any
 
 import damian
@@ -21,7 +21,7 @@ PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra", "numpy", "sh
 """Modules whose versions a record names: a nightly build is a distribution of another name."""
 
 
-def write_record(folder: Path, command: str, resumes: bool = False, **entries: Any) -> None:
+def write_record(folder: Path, command: str, resumes: bool, **entries: Any) -> None:
     """Write the record of a run that begins; that of a resumed one gets the command in its
     ``resumed``."""
     record = {"command": command, "started": datetime.now(UTC).isoformat(timespec="seconds")}
@@ -46,19 +46,10 @@ def commit() -> str | None:
     folder = Path(damian.__file__).parents[1]
     if not (folder / ".git").exists():
         return None
-    git = [
-        "git",
-        "-C",
-        str(folder),
-        "describe",
-        "--always",
-        "--abbrev=40",
-        "--exclude=*",
-        "--dirty=+changes",
-    ]
+    git = ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes"]
     try:
-        return subprocess.run(git, capture_output=True, encoding="utf-8", check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
+        return check_output(git, cwd=folder, stderr=DEVNULL, encoding="utf-8").strip()
+    except (OSError, CalledProcessError):
         return None
 
 

@@ -15,7 +15,7 @@ from torchrl.data import ReplayBuffer
 
 from damian.common.text_files import data_file
 from damian.learners.schedule import SystemClock
-from damian.runs.checkpoint import read_checkpoint, restore, to_tensordict, write_checkpoint
+from damian.runs.checkpoint import Stored, read_checkpoint, restore, to_tensordict, write_checkpoint
 from damian.runs.metrics import EpisodeLog, HindsightReturns
 from damian.runs.replay_memory import ReplayMemory
 from damian.runs.run_folder import BEST, CHECKPOINT, REPLAY
@@ -32,10 +32,10 @@ class Progress:
     best: float = -math.inf
     """Best mean episode return at a checkpoint so far."""
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         return vars(self)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         vars(self).update(state)
 
 
@@ -117,7 +117,7 @@ def checkpoint_file(written: Path) -> Path:
     return written if written.is_file() else written / CHECKPOINT
 
 
-def _states(parts: Mapping[str, Any]) -> dict[str, Any]:
+def _states(parts: Mapping[str, Any]) -> Stored:
     return {name: part.state_dict() for name, part in parts.items()}
 
 
@@ -127,11 +127,11 @@ class CarriedStep:
     def __init__(self, collector: Collector) -> None:
         self._collector = collector
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         collector = self._collector
         return {"step": collector._carrier, "trajectories": collector._traj_pool.state_dict()}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         collector = self._collector
         step = to_tensordict(state["step"]).to(collector.env.device)
         collector._carrier = step.clear_device_() if collector._carrier.device is None else step
@@ -141,7 +141,7 @@ class CarriedStep:
 class RandomState:
     """The states of the global random generators of torch, NumPy and Python."""
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         name, numbers, *rest = np.random.get_state()  # noqa: NPY002 (components of the user's own may use it)
         return {
             "torch": torch.get_rng_state(),
@@ -150,7 +150,7 @@ class RandomState:
             "python": random.getstate(),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Stored) -> None:
         torch.set_rng_state(state["torch"])
         if len(state["cuda"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda"])

@@ -75,8 +75,7 @@ class Episode:
     source: Annotated[
         Floats | None,
         "positions of the sources, none if the task has none: east, north [m]; null if nobody "
-        "knows them, "
-        "[T + 1, K, 2]",
+        "knows them, [T + 1, K, 2]",
     ]
     emits: Annotated[Flags | None, "whether each source emits; null if nobody knows it, [T + 1, K]"]
     sent: Annotated[
@@ -247,7 +246,7 @@ def record(rollout: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> li
 def at_instant(outputs: TensorDictBase) -> TensorDictBase:
     """What an episode needs of an environment's outputs after a step, or at the reset, without a
     reward."""
-    sent = cast(Tensor, outputs[keys.MESSAGE_SENT])
+    sent = outputs[keys.MESSAGE_SENT]
     reward = outputs.get(keys.REWARD, torch.zeros_like(sent, dtype=torch.float32)[..., None])
     return outputs.select(*OUTPUTS, strict=False).set(keys.REWARD, reward)
 

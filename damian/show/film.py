@@ -30,7 +30,7 @@ STEPS_PER_SECOND = 4
 """Steps that a film shows in a second."""
 LAST_STEPS = 6
 """Steps for whose time a film shows the last instant."""
-_STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5, "lines.linewidth": 1.2}
+_STYLE: dict = {**STYLE, "font.size": 8.5, "lines.linewidth": 1.2}
 
 
 def save_film(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
@@ -49,7 +49,7 @@ def save_film(episode: Episode, path: Path, shown: Collection[str] = ()) -> None
     write_atomically(path, content.getvalue())
 
 
-def save_picture(episode: Episode, path: Path, shown: Collection[str] = ()) -> None:
+def save_picture(episode: Episode, path: Path, shown: Collection[str]) -> None:
     """Write the picture of the instant at which the server was most mistaken about where the UAVs
     were."""
     error = np.linalg.norm(episode.true - episode.believed, axis=-1).sum(-1)
@@ -108,9 +108,9 @@ class Film:
                 label="late by, or age [s]",
                 ticks=MaxNLocator(4, integer=True),
             )
-        self._moving: list[Any] = []
+        self._moving: list = []
 
-    def draw(self, step: int) -> list[Any]:
+    def draw(self, step: int) -> list:
         """Draw the instant after so many steps; returns the artists that were drawn."""
         for artist in self._moving:
             artist.remove()
@@ -153,7 +153,7 @@ class Film:
             axis.margins(x=0)
             axis.locator_params(nbins=3)
 
-    def _now(self, time: float) -> list[Any]:
+    def _now(self, time: float) -> list:
         """Mark a time in the charts, and cover what comes after it."""
         drawn = []
         for axis in (self.lanes, *self.charts):

@@ -60,7 +60,7 @@ class Frame:
     there."""
 
 
-def chosen_of(episode: Episode, shown: Collection[str] = ()) -> list[int]:
+def chosen_of(episode: Episode, shown: Collection[str]) -> list[int]:
     """Numbers of the UAVs that a picture tells apart: those with these IDs, else all of few."""
     found = [uav for uav, name in enumerate(episode.ids) if name in shown]
     return found or [*range(episode.n_agents if episode.n_agents <= len(COLOURS) else 0)]

@@ -7,13 +7,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from damian.world.regions.geodesy import to_latlon, wrap_longitude
+from damian.world.regions.geodesy import LatLon, to_latlon, wrap_longitude
 
 DIGITS = 7
 """Decimals of longitudes and latitudes: a centimetre."""
 
 
-def on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
+def on_earth(geometry: Any, origin: LatLon) -> dict[str, Any]:
     """A geometry of local metres in longitude and latitude, with holes clockwise."""
 
     def degrees(metres: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -85,10 +85,10 @@ class MapView:
         fresh = np.exp((self._covered_at - step) / _FADE)
         self._image.set_data(np.where(self._covered_at < 0, 0, _FADED + (1 - _FADED) * fresh))
 
-    def draw(self, frame: Frame) -> list[Any]:
+    def draw(self, frame: Frame) -> list:
         """Draw a frame; returns the artists that were drawn."""
         self._cover(frame.step)
-        drawn: list[Any] = []
+        drawn = []
         heat = [(part, p) for area, p in frame.cells for part in _polygons(area)]
         if heat:
             corners = [shapely.get_coordinates(part.exterior) for part, _ in heat]
@@ -103,12 +103,12 @@ class MapView:
             drawn += self._uav(uav)
         return drawn + self._names(frame)
 
-    def _plot(self, place: Floats, marker: str, fill: str, color: Any, **style: Any) -> list[Any]:
+    def _plot(self, place: Floats, marker: str, fill: str, color: Any, **style: Any) -> list:
         """Mark a place on the ground, [2]."""
         style = {"zorder": 6, **style}
         return self.axis.plot(*place, marker, color=color, markerfacecolor=fill, **style)
 
-    def _uav(self, uav: Uav) -> list[Any]:
+    def _uav(self, uav: Uav) -> list:
         """Draw a UAV with its footprint, as a dart that points where it flies, and a line to where
         the server believes it to be.
 
@@ -147,11 +147,11 @@ class MapView:
             drawn += self._plot(uav.believed, "o", "none", colour, **ring)
         return drawn
 
-    def _names(self, frame: Frame) -> list[Any]:
+    def _names(self, frame: Frame) -> list:
         """Name UAVs and rings on the sides away from the line between them; names at one place lie
         apart."""
         uavs = [uav for uav in frame.uavs if uav.chosen]
-        drawn: list[Any] = []
+        drawn = []
         for number, uav in enumerate(uavs):
             true = uav.path[-1, :2]
             east, north = true - uav.believed
@@ -208,9 +208,9 @@ def lateness(episode: Episode) -> Normalize:
     return Normalize(0, longest or 1.0)
 
 
-def legend_marks(episode: Episode) -> list[Any]:
+def legend_marks(episode: Episode) -> list:
     """Entries of a legend that explains what a view draws."""
-    marks: list[Any] = [
+    marks: list = [
         _mark("UAV, true", marker=DART, markersize=9),
         _mark(
             "UAV, as the server\nbelieves, with age",

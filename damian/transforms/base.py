@@ -30,6 +30,7 @@ from damian.delays.samplers import Sampler, streams_for
 from damian.keys import DONE, STEPPED
 from damian.transforms.entries import (
     Entries,
+    Keys,
     as_rows,
     path_of,
     require_keys,
@@ -112,10 +113,10 @@ class StatefulTransform(Transform):
 
     def __init__(
         self,
-        in_keys: NestedKey | Sequence[NestedKey] | None = None,
-        out_keys: NestedKey | Sequence[NestedKey] | None = None,
-        in_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
-        out_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
+        in_keys_inv: Keys | None = None,
+        out_keys_inv: Keys | None = None,
         seed: int | None = None,
     ) -> None:
         super().__init__(*(keys or None for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))
@@ -336,7 +337,7 @@ class StatefulTransform(Transform):
         for name, new in change[0].items():
             if new is not memory[name]:
                 memory[name] = where_rows(rows, new, memory[name])
-        merged: Entries = {}
+        merged = {}
         for key, new in change[1].items():
             # A later transform that widens an entry restores it itself.
             found = (td.get(key, None) for td in (before, after))
@@ -517,10 +518,8 @@ class StatefulTransform(Transform):
         alike = [other for other in others if (other.in_keys, other.in_keys_inv) == keys]
         place = next((i for i, other in enumerate(alike) if other is self), 0)
         number = counter_rng.number_of(f"{type(self).__name__} {keys[0]} {keys[1]} {place}")
-        name = torch.tensor(number, device=device)
-        streams = counter_rng.bits64(
-            worlds.view(-1, 1), name, torch.arange(n_agents, device=device)
-        )
+        agents = torch.arange(n_agents, device=device)
+        streams = counter_rng.bits64(worlds.view(-1, 1), number, agents)
         return streams_for(sampler, streams.flatten(), n_agents)
 
 
@@ -552,7 +551,7 @@ def check_order(transforms: Sequence[Transform]) -> None:
             )
 
 
-def leaf_transforms(transform: Transform | None) -> list[Any]:
+def leaf_transforms(transform: Transform | None) -> list:
     """All transforms of a Compose and of the Composes within it, in order; or the one transform."""
     if transform is None:
         return []

@@ -108,10 +108,9 @@ class Channel(StatefulTransform):
         sent = in_key or ("agents", "observation")
         super().__init__(sent if action_key is None else None, seed=seed)
         self.action_key = None if action_key is None else unravel_key(action_key)
-        self._beside = cast(NestedKey, self.action_key or self.in_keys[0])
+        self._beside = self.action_key or self.in_keys[0]
         should = "is not in a group of agents, as ('agents', 'observation') is"
-        in_group = isinstance(self._beside, tuple)
-        checks.require(in_group, "in_key", self._beside, should)
+        checks.require(isinstance(self._beside, tuple), "in_key", self._beside, should)
         written = out_key, age_key, mask_key, delay_key
         beside = [sibling_key(self._beside, key) for key in written]
         _, self.age_key, self.mask_key, self.delay_key = beside
@@ -221,8 +220,7 @@ class Channel(StatefulTransform):
         """Write what the senders send in the next step, [S, ...]; the step may send it or not."""
         following = memory["clock"][memory["link"]] + 1
         rows = slot_rows(following % self._n_slots)
-        slots = memory["contents"].flatten(0, 1)
-        slots.index_copy_(0, rows, content)
+        memory["contents"].flatten(0, 1).index_copy_(0, rows, content)
 
     def _hold(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [M] is true, hold the messages that were generated at ``generated_at``."""
@@ -230,8 +228,7 @@ class Channel(StatefulTransform):
         old = memory["held"]
         rows = slot * len(memory["link"]) + memory["sender"]
         new = memory["contents"].flatten(0, 1).index_select(0, rows)
-        held = where_rows(mask, new, old)
-        return memory | {"held": held}
+        return memory | {"held": where_rows(mask, new, old)}
 
     def _wanted(self, entries: Entries, active: Tensor) -> Tensor:
         """Links among the active ones [M] on which an agent wants to send, [M] bool."""
@@ -239,8 +236,7 @@ class Channel(StatefulTransform):
             return active
         n = self.agents[-1]
         wants = entries[self.sent_key].reshape(-1, 1, n)
-        by_link = wants.expand(-1, n, n)
-        return active & by_link.reshape(-1)
+        return active & wants.expand(-1, n, n).reshape(-1)
 
     def _send(self, memory: Memory, entries: Entries, wanted: Tensor) -> Memory:
         """Send what was written last over the wanted links [M], and deliver what arrives in this
@@ -253,8 +249,7 @@ class Channel(StatefulTransform):
         if self.comm_range is not None:
             place = cast(Tensor, position).view(-1, n, 2)
             way = place.unsqueeze(1) - place.unsqueeze(2)
-            distance = torch.linalg.vector_norm(way, dim=-1)
-            is_near = distance <= self.comm_range
+            is_near = torch.linalg.vector_norm(way, dim=-1) <= self.comm_range
             sent = sent & is_near.view(-1)
         context = self._context(memory, sent, position) if self.sampler.sees_context else None
         memory, delivery = self.line.step(memory, [], sent, context)
@@ -293,12 +288,11 @@ class Channel(StatefulTransform):
         if self.action_key:  # nothing is chosen at a reset
             own_time = now.masked_fill(now == 1, 0)
         time = torch.where(is_own, own_time, time)
-        clock = memory["clock"][memory["link"]]
-        newest = slot_rows(clock % self._n_slots)
+        newest = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
         own = memory["contents"].flatten(0, 1).index_select(0, newest)
         held = memory["held"].unflatten(0, (-1, n))
         value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
-        entries: Entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
+        entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
         if self.age_key is not None:
             age = now - time.clamp(min=1)
             entries[self.age_key] = age.to(torch.float32).view(shape)
@@ -320,8 +314,7 @@ class Channel(StatefulTransform):
         input_spec = super().transform_input_spec(input_spec)
         if self.action_key and self.message_size:
             specs = cast(Composite, input_spec)["full_action_spec"]
-            agents = spec_rows(specs, self.action_key)
-            shape = torch.Size((*agents, self.message_size))
+            shape = torch.Size((*spec_rows(specs, self.action_key), self.message_size))
             specs[self.action_key] = Bounded(-1.0, 1.0, shape, device=specs.device)
         return input_spec
 

@@ -36,8 +36,6 @@ class ContextReader:
         self._sees_context = sampler.sees_context
         self._dt = dt
         self._since_clock = 0 if before_step else 1
-        self.keys: dict[str, NestedKey] = {}
-        """Keys of the entries that the law gets, by name."""
         known = dict(context_keys or {}) if sampler.sees_context else {}
         for name in sampler.reads:
             checks.require(
@@ -46,8 +44,9 @@ class ContextReader:
                 known,
                 f"has no key for {name}, which the delay law reads",
             )
-        for name, key in known.items():
-            self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(key)))
+        nested = {name: sibling_key(beside, unravel_key(key)) for name, key in known.items()}
+        self.keys = cast(dict[str, NestedKey], nested)
+        """Keys of the entries that the law gets, by name."""
 
     def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:
         """Add what the contexts need to the memory of the transform, M rows of the shape

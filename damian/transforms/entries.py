@@ -15,6 +15,8 @@ from damian.keys import last_part
 
 Entries = dict[NestedKey, Tensor]
 """Entries of a TensorDict, by key."""
+Keys = NestedKey | Sequence[NestedKey]
+"""A key, or several."""
 
 
 def path_of(key: NestedKey) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from damian.common.tensors import where_rows
 from damian.delays.laws import Delay, in_steps
 from damian.keys import next_key
 from damian.transforms.base import Change, Correction, Memory, StatefulTransform
-from damian.transforms.entries import Entries, existing, select_entries
+from damian.transforms.entries import Entries, Keys, existing, select_entries
 
 
 class SampleAndHold(StatefulTransform):
@@ -40,8 +40,8 @@ class SampleAndHold(StatefulTransform):
     def __init__(
         self,
         period: Delay,
-        in_keys: NestedKey | Sequence[NestedKey] = "observation",
-        in_keys_inv: NestedKey | Sequence[NestedKey] = (),
+        in_keys: Keys = "observation",
+        in_keys_inv: Keys = (),
         *,
         ready_key: NestedKey | None = None,
         dt: float = 1.0,
@@ -100,11 +100,10 @@ class SampleAndHold(StatefulTransform):
         sampled: Tensor,
     ) -> Change:
         """Sample the entries where the mask [M] is true, and output the held values everywhere."""
-        outputs: Entries = {}
+        outputs = {}
         for i, key in enumerate(keys):
             new = self.to_rows(entries[key])
-            old = memory[f"{name}_{i}"]
-            held = where_rows(sampled, new, old)
+            held = where_rows(sampled, new, memory[f"{name}_{i}"])
             memory = memory | {f"{name}_{i}": held}
             outputs[key] = self.from_rows(held).clone()  # the memory keeps the held values
         return memory, outputs

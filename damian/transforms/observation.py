@@ -1,6 +1,6 @@
 """A transform that delays observations (paper, section 3.4)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import (
     Entries,
+    Keys,
     add_spec,
     existing,
     select_entries,
@@ -64,8 +65,8 @@ class ObservationDelay(StatefulTransform):
     def __init__(
         self,
         delay: Any,
-        in_keys: NestedKey | Sequence[NestedKey] = "observation",
-        out_keys: NestedKey | Sequence[NestedKey] | None = None,
+        in_keys: Keys = "observation",
+        out_keys: Keys | None = None,
         *,
         loss: float = 0.0,
         order: str = "generation",

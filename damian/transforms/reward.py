@@ -116,8 +116,7 @@ class RewardDelay(StatefulTransform):
         memory["time"] = memory["time"] + self.n_slots * mask
         memory["state"] = self.sampler.begin_episode(memory["state"], mask)
         delay = torch.zeros_like(clock)
-        earned = torch.zeros_like(memory["past"][0])
-        return memory, self._told(delay, earned)
+        return memory, self._told(delay, torch.zeros_like(memory["past"][0]))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock = memory["clock"] + 1
@@ -154,8 +153,7 @@ class RewardDelay(StatefulTransform):
         arrival = memory["time"] + delay
         flat = past.flatten(0, 1)
         due = memory["due"].view(-1)
-        slot = (memory["slot"] + delay) % self.n_slots
-        row = slot_rows(slot)
+        row = slot_rows((memory["slot"] + delay) % self.n_slots)
         there = flat.index_select(0, row)
         old = due.index_select(0, row)
         added = where_rows(old == arrival, there, 0) + reward
@@ -172,7 +170,7 @@ class RewardDelay(StatefulTransform):
     def _told(self, delay: Tensor, earned: Tensor) -> Entries:
         """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards
         [M, ...]."""
-        entries: Entries = {}
+        entries = {}
         if self.delay_key is not None:
             delays = delay.unsqueeze(-1).clone()
             entries[self.delay_key] = self.from_rows(delays)
@@ -212,14 +210,13 @@ class RewardDelay(StatefulTransform):
         if key in entries:
             earned = entries[key]
         elif earned_key is not None and earned_key in steps.keys(True):
-            earned = cast(Tensor, steps[earned_key])
+            earned = steps[earned_key]
         else:
             raise InputError(
                 f"earned_key: nothing says what {key} was earned: give RewardDelay an earned_key"
             )
         paid = self._paid(steps, count).squeeze(-1)
-        reward = where_rows(paid, earned, 0)
-        return entries | {key: reward}
+        return entries | {key: where_rows(paid, earned, 0)}
 
     def _paid(self, steps: TensorDictBase, count: Tensor) -> Tensor:
         """Whether the reward of each step has been paid by the last step, in the shape of the
@@ -283,8 +280,7 @@ class CumulativeReward(StatefulTransform):
         reward = self.to_rows(entries[self.reward_key])
         before = memory["past"][:, :-1]
         past = torch.cat([reward.unsqueeze(1), before], 1)
-        newest_first = past.movedim(1, 0)
-        total = discounted_sum(newest_first, self.gamma)
+        total = discounted_sum(past.movedim(1, 0), self.gamma)
         return {"past": past}, {self.reward_key: self.from_rows(total)}
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
@@ -323,5 +319,4 @@ def discounted_sum(past: Tensor, gamma: float) -> Tensor:
     # matter.
     ones = [1] * (past.dim() - 1)
     weighted = weights.view(-1, *ones) * past
-    total = weighted.sum(0, dtype=torch.float64)
-    return total.to(dtype)
+    return weighted.sum(0, dtype=torch.float64).to(dtype)

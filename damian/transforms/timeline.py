@@ -145,7 +145,7 @@ class ObservationTimeline(StatefulTransform):
         memory = self._added(memory, self._sent(entries.__getitem__))
         return memory, self._written(memory)
 
-    def _sent(self, entry: Callable[[NestedKey], Tensor]) -> dict[str, Tensor]:
+    def _sent(self, entry: Callable[[NestedKey], Tensor]) -> Memory:
         """The messages of a step, or of many, by the names of the memory; ``entry`` returns an
         entry.
 
@@ -170,7 +170,7 @@ class ObservationTimeline(StatefulTransform):
             found["position"] = entry(self.position_key)
         return found
 
-    def _by_row(self, sent: dict[str, Tensor]) -> Memory:
+    def _by_row(self, sent: Memory) -> Memory:
         """The messages of ``_sent`` by rows, [M, ...] each; several rows in order may share a
         position."""
         n_rows = sent["sent"].numel()
@@ -184,7 +184,7 @@ class ObservationTimeline(StatefulTransform):
                 rows[name] = each.reshape(n_rows, *each.shape[lead:])
         return rows
 
-    def _added(self, memory: Memory, sent: dict[str, Tensor]) -> Memory:
+    def _added(self, memory: Memory, sent: Memory) -> Memory:
         """The memory with the messages of a step as the newest."""
         newest = self._by_row(sent)
         older = memory | {"due": memory["due"] - 1}
@@ -209,8 +209,7 @@ class ObservationTimeline(StatefulTransform):
 
     def _written(self, memory: Memory) -> Entries:
         """The timeline, from the memory."""
-        arrived = memory["due"] <= 0
-        found = [self._timeline(memory, arrived)]
+        found = [self._timeline(memory, memory["due"] <= 0)]
         if len(self.out_keys) > 1:
             sent = memory["sent"].unsqueeze(-1)
             found.append(torch.cat([memory["kept"] * sent, sent.to(memory["kept"].dtype)], -1))

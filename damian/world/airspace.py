@@ -8,7 +8,6 @@ import numpy as np
 import shapely
 import torch
 from numpy.typing import NDArray
-from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
 from damian.common import checks
@@ -17,6 +16,7 @@ from damian.world.config import RegionConfig
 from damian.world.paths import Detours, detours
 from damian.world.regions.polygon import (
     RESOLUTION,
+    Area,
     Floats,
     landing_lattice,
     largest_vertex_distance,
@@ -127,10 +127,11 @@ def build_airspace(
     connected in a region that is not convex.
     """
     step = config.lattice_step
-    degrees = config.lattice_angle
-    n_points = config.n_landing_points
     polygons = [region.polygon for region in regions]
-    lattices = [landing_lattice(polygon, step, degrees, n_points) for polygon in polygons]
+    lattices = [
+        landing_lattice(polygon, step, config.lattice_angle, config.n_landing_points)
+        for polygon in polygons
+    ]
     sizes = [len(lattice) for lattice in lattices]
     for region, size in zip(regions, sizes, strict=True):
         checks.require(
@@ -192,8 +193,7 @@ def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: in
     place = ((target - corner) / side).long()
     column, row = place.clamp(min=0).minimum(shape - 1).unbind(-1)
     cell = first + row * shape[:, 0] + column
-    used = gather_rows(cells.row, cell)
-    point = gather_rows(cells.point, used).long()
+    point = gather_rows(cells.point, gather_rows(cells.row, cell)).long()
     base = region * points.shape[1]
     flat = point.clamp(min=0) + base.unsqueeze(-1)
     way = gather_rows(points.flatten(0, 1), flat) - target.unsqueeze(1)
@@ -208,7 +208,7 @@ def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: in
     return torch.where(best == _NEVER, -1, ids)
 
 
-def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], n: int) -> Cells:
+def build_cells(lattices: list[Floats], polygons: list[Area], n: int) -> Cells:
     """List the landing points that may be among the n nearest ones of any place in each cell.
 
     The n points nearest to a cell's centre are at most half a diagonal farther from any place in

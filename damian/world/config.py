@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from damian.common import checks
-from damian.common.fields import Settings, check_place, constant, rules, setting
+from damian.common.fields import Settings, chance, check_place, constant, metres, rules, setting
 
 RANDOM = ("random",)
 GEOJSON = ("geojson",)
@@ -74,14 +74,11 @@ class RegionConfig(Settings):
     zones: Any = setting(
         [],
         "No-fly zones: a list of the corners of each (places, as those of a source), a map, or the "
-        "number of "
-        "random ones.",
+        "number of random ones.",
     )
     zone_area: float = setting(2500.0, "Area of a random zone.", unit="m^2", above=0)
     zone_margin: float = setting(0.0, "Distance that UAVs keep from zones.", unit="m", low=0)
-    lattice_step: float = setting(
-        30.0, "Distance between landing points of a row.", unit="m", above=0
-    )
+    lattice_step: float = metres(30.0, "Distance between landing points of a row.")
     lattice_angle: float = setting(
         45.0, "Slant of the landing-point lattice.", unit="deg", above=0, high=90
     )
@@ -191,22 +188,15 @@ class MotionConfig(Settings):
     sensing_time: float = setting(
         0.0, "Time that a landed UAV senses before it chooses.", unit="s", low=0
     )
-    min_level: float = setting(1.0, "Flight level of the first UAV.", unit="m", above=0)
-    max_level: float = setting(
-        20.0,
-        "Highest flight level; UAVs that fly instantly share levels if need be.",
-        unit="m",
-        above=0,
+    min_level: float = metres(1.0, "Flight level of the first UAV.")
+    max_level: float = metres(
+        20.0, "Highest flight level; UAVs that fly instantly share levels if need be."
     )
-    level_separation: float = setting(
-        0.5, "Vertical distance between two flight levels.", unit="m", above=0
-    )
-    abort: float = setting(
+    level_separation: float = metres(0.5, "Vertical distance between two flight levels.")
+    abort: float = chance(
         0.0,
         "Probability that a flight ends at another legal landing point than commanded; holding "
         "included.",
-        low=0,
-        high=1,
         each=True,
     )
     options: Any = setting(
@@ -226,9 +216,7 @@ class FailureConfig(Settings):
 
     section = "failure"
 
-    probability: float = setting(
-        0.0, "Probability that a UAV fails in a simulation step.", low=0, high=1
-    )
+    probability: float = chance(0.0, "Probability that a UAV fails in a simulation step.")
     duration: float = setting(
         60.0, "Mean time after which it joins again; each step is as likely.", unit="s", above=0
     )
@@ -279,16 +267,11 @@ class SourceConfig(Settings):
         "constant, or on and off, drawn at each stop (per_stop) or simulation step (per_step).",
         choices=("constant", "per_stop", "per_step"),
     )
-    miss: float = setting(0.0, "Probability that a UAV in reach does not detect it.", low=0, high=1)
-    false_alarm: float = setting(
-        0.0,
-        "Probability that a listening UAV which is out of reach reports a detection.",
-        low=0,
-        high=1,
+    miss: float = chance(0.0, "Probability that a UAV in reach does not detect it.")
+    false_alarm: float = chance(
+        0.0, "Probability that a listening UAV which is out of reach reports a detection."
     )
-    emission_probability: float = setting(
-        0.5, "Probability that it is on, if not constant.", low=0, high=1
-    )
+    emission_probability: float = chance(0.5, "Probability that it is on, if not constant.")
     after_walk: str = setting(
         "loop",
         "After the last stop: go straight back and make the same round again (loop), or stay "
@@ -304,12 +287,8 @@ class SourceConfig(Settings):
     max_stops: int = setting(
         7, "Most inner points around a hotspot.", low=1, high=1000, kinds=DYNAMIC
     )
-    local_distance: float = setting(
-        50.0,
-        "Largest distance of an inner point from its hotspot.",
-        unit="m",
-        above=0,
-        kinds=DYNAMIC,
+    local_distance: float = metres(
+        50.0, "Largest distance of an inner point from its hotspot.", kinds=DYNAMIC
     )
     speed: float = setting(20.0, "Largest speed to a hotspot.", unit="m/s", above=0, kinds=DYNAMIC)
     acceleration: float = setting(
@@ -379,11 +358,9 @@ class RequestConfig(Settings):
         high=6000,
     )
     most: int = setting(6, "Number that can be open at once; another one is lost.", low=1, high=64)
-    range: float | None = setting(
+    range: float | None = metres(
         None,
         "UAVs on the ground hear of those within it; the server knows all at once if not given.",
-        unit="m",
-        above=0,
     )
 
     @property
@@ -515,8 +492,7 @@ class WorldConfig(Settings):
     randomise: dict[str, Any] = setting(
         {},
         "Settings that are drawn for each world and episode, such as {wind.speed: [0, 6]}: from a "
-        "range, or "
-        "from a list of more than two values; [6] is always 6.",
+        "range, or from a list of more than two values; [6] is always 6.",
     )
     sensors: list[Any] = setting(
         [],

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from damian.common.tensors import gather_rows
+from damian.world.regions.polygon import Area
 
 _GRID = 321
 """Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact."""
@@ -45,7 +46,7 @@ class FootprintTables(NamedTuple):
 
 
 def build_tables(
-    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],
+    polygons: Sequence[Area],
     points: np.ndarray,
     radius: float,
     words: int = 16,
@@ -60,14 +61,12 @@ def build_tables(
     offsets = radius * _unit_disc_samples(64 * words)
     masks = [_overlap(words)]
     for polygon, places in zip(polygons, points, strict=True):
-        outside = _outside(polygon, places, offsets)
-        masks.append(packed_bits(outside))
-    cells_per_metre = (_GRID - 1) / (4 * radius)
-    return FootprintTables(torch.cat(masks), cells_per_metre)
+        masks.append(packed_bits(_outside(polygon, places, offsets)))
+    return FootprintTables(torch.cat(masks), (_GRID - 1) / (4 * radius))
 
 
 def tables_of_all(
-    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],
+    polygons: Sequence[Area],
     points: np.ndarray,
     radii: Sequence[float],
 ) -> FootprintTables:
@@ -77,8 +76,7 @@ def tables_of_all(
     """
     first, *others = [build_tables(polygons, points, radius) for radius in radii]
     of_points = [each.masks[_GRID**2 :] for each in others]
-    masks = torch.cat([first.masks, *of_points])
-    return first._replace(masks=masks)
+    return first._replace(masks=torch.cat([first.masks, *of_points]))
 
 
 def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
@@ -95,8 +93,7 @@ def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor)
     cells = cells.reshape(*ids.shape, 2)
     # Windows that slide over the UAVs: i, i + 1, i + 2, ... (modulo N), without index tensors.
     twice = torch.cat([cells, cells[:, :-1]], 1)
-    fleets = twice.unfold(1, n_uavs, 1)
-    share = _share_of_first(tables, ids, fleets)
+    share = _share_of_first(tables, ids, twice.unfold(1, n_uavs, 1))
     return share.reshape(point_ids.shape[:-1])
 
 
@@ -139,8 +136,7 @@ def _update_share(
     if len(worlds):
         ids = ids.index_select(0, worlds)
         tables = FootprintTables(masks, cells_per_metre)
-        positions = gather_rows(points, ids)
-        shares = covered_share(tables, ids, positions)
+        shares = covered_share(tables, ids, gather_rows(points, ids))
         updated.index_copy_(0, worlds, shares)
     return updated
 
@@ -165,8 +161,7 @@ def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Ten
     cells = positions * tables.cells_per_metre
     cells = cells.reshape(*ids.shape, 2).index_select(1, pair)
     fleets = cells.view(-1, n_uavs, n_uavs, n_last, 2).movedim(2, -1)
-    share = _share_of_first(tables, own, fleets)
-    return share.reshape(point_ids.shape[:-2])
+    return _share_of_first(tables, own, fleets).reshape(point_ids.shape[:-2])
 
 
 def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleets: Tensor) -> Tensor:

@@ -268,11 +268,9 @@ def _rounds(
         candidate = asked.index_select(0, asking)
         own = stands.index_select(0, asking)
         point = points.index_select(0, candidate).long()
-        distance = distances.index_select(0, candidate)
-        in_reach = distance <= reach.index_select(0, asking)
+        in_reach = distances.index_select(0, candidate) <= reach.index_select(0, asking)
         flies = in_reach & (point != own)
-        goal = torch.where(flies, point, own)
-        booked.index_copy_(0, asking, goal)
+        booked.index_copy_(0, asking, torch.where(flies, point, own))
         asking = asking[flies]
         point = point[flies]
         wanted = base.index_select(0, asking) + point

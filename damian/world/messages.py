@@ -43,6 +43,12 @@ class Widths(NamedTuple):
 
 ONE_SOURCE = Widths()
 
+Number = Annotated[Tensor, Column()]
+Place = Annotated[Tensor, Column(2)]
+Flag = Annotated[Tensor, Column(dtype=torch.bool)]
+Varying = Annotated[Tensor, Column(None)]
+"""Fields whose number of columns depends on the settings."""
+
 
 class Messages(NamedTuple):
     """One message of each UAV, with any leading dimensions; each field [*, N] or [*, N, width].
@@ -51,46 +57,46 @@ class Messages(NamedTuple):
     points.
     """
 
-    time: Annotated[Tensor, Column()]
+    time: Number
     """Time at which the message was generated [s]."""
-    position: Annotated[Tensor, Column(2)]
+    position: Place
     """Position of the UAV, east, north [m]."""
-    target: Annotated[Tensor, Column(2)]
+    target: Place
     """Landing point to which the UAV flies, or on which it stands, east, north [m]."""
-    track: Annotated[Tensor, Column()]
+    track: Number
     """Heading of the latest flight, clockwise from north [rad]."""
-    battery: Annotated[Tensor, Column()]
+    battery: Number
     """Battery level, not rounded [%]."""
-    spotted: Annotated[Tensor, Column(dtype=torch.bool)]
+    spotted: Flag
     """Whether the UAV spots any source."""
-    empty: Annotated[Tensor, Column(dtype=torch.bool)]
+    empty: Flag
     """Whether the observed battery level is 0, or the battery allows nothing but holding."""
     motions: Annotated[Tensor, Column(dtype=torch.long)]
     """Motions (holding included) since the latest detection that counts before this message."""
-    detected_time: Annotated[Tensor, Column(None)]
+    detected_time: Varying
     """Time of the latest detection of each source [s], [*, N, K]; -1 if there was none."""
-    detected_position: Annotated[Tensor, Column(None)]
+    detected_position: Varying
     """Position of the UAV at its latest detection of each source, east, north [m], [*, N, K, 2]."""
-    true_time: Annotated[Tensor, Column(None)]
+    true_time: Varying
     """As ``detected_time``, of when the UAV truly was in reach, [*, N, T]; T is K, or 0 if it is
     not told."""
-    true_position: Annotated[Tensor, Column(None)]
+    true_position: Varying
     """As ``detected_position``, of where the UAV truly was in reach, [*, N, T, 2]."""
-    requests: Annotated[Tensor, Column(None)]
+    requests: Varying
     """The latest request of each slot (``damian.world.requests``) that the UAV has heard of,
     [*, N, M, 3].
 
     Without ``requests.range``, that which there is now, also if the UAV sends nothing.
     """
-    served: Annotated[Tensor, Column(None)]
+    served: Varying
     """When the latest request of each slot that the UAV has served appeared [s], [*, N, M]; -1 if
     none."""
-    serves: Annotated[Tensor, Column(None)]
+    serves: Varying
     """Whether it serves one now, 0 or 1, [*, N, 1]; [*, N, 0] if there are no requests."""
-    executed: Annotated[Tensor, Column(None)]
+    executed: Varying
     """Number of the command that the UAV has executed last, 0 before the first one, [*, N, 1];
     [*, N, 0] if commands are not absolute, or not late."""
-    announced: Annotated[Tensor, Column(None)]
+    announced: Varying
     """Where the commands under way lead, the newest first, east, north [m], by when they will have
     been executed [s], and 1; zeros for no command, [*, N, D, 4]."""
     pending: Annotated[Tensor, Column(None)]
@@ -100,12 +106,12 @@ class Messages(NamedTuple):
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the landing points of the latest stops, newest first, [*, N, S]; holding is a
     stop."""
-    landed: Annotated[Tensor, Column(None)]
+    landed: Varying
     """Time at which each of these stops began [s], [*, N, S]; -1 before the episode."""
-    events: Annotated[Tensor, Column(None)]
+    events: Varying
     """Whether each source was heard when each of these stops began, and, if there are requests,
     whether one was served, 0 or 1, [*, N, S, E]; E is 0 if it is not told."""
-    readings: Annotated[Tensor, Column(None)]
+    readings: Varying
     """Readings of the user's sensors, beside each other in the order of the settings, [*, N, K]."""
 
     @classmethod

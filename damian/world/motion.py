@@ -23,12 +23,10 @@ def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> 
     apart = config.level_separation
     room = (config.max_level - lowest) / apart
     n_fit = math.floor(room + _TINY) + 1
-    fits = shared or n_agents <= n_fit
-    shown = f"{config.max_level:g} m"
     checks.require(
-        fits,
+        shared or n_agents <= n_fit,
         "motion.max_level",
-        shown,
+        f"{config.max_level:g} m",
         f"leaves room for {n_fit} flight levels from min_level={lowest:g} m, "
         f"level_separation={apart:g} m apart, but there are {n_agents} UAVs",
     )

@@ -62,9 +62,9 @@ class News:
 
 def draw(state: State, stream: int, numbers: Tensor) -> Tensor:
     """Uniform draws of a stream in this step for the given numbers [N, ...], [B, N, ...]."""
-    counters = state.seed, torch.full_like(state.seed, stream), state.episode, state.steps
-    seed, *counters = (each.view(-1, *[1] * numbers.dim()) for each in counters)
-    return counter_rng.uniform(seed, *counters, numbers)
+    counters = state.seed, state.episode, state.steps
+    seed, episode, steps = (each.view(-1, *[1] * numbers.dim()) for each in counters)
+    return counter_rng.uniform(seed, stream, episode, steps, numbers)
 
 
 def _first_of_each(nearest: Tensor, distance: Tensor) -> Tensor:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
-from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
 from damian.world.regions.geodesy import Floats
+from damian.world.regions.polygon import Area
 
 _CONVEX = 1e-9
 """Share of the area of its hull that a polygon without dents may lack."""
@@ -47,8 +47,7 @@ class Detours(NamedTuple):
         wanted = origin * self.n_points + goal
         n_pairs = len(self.pair)
         found = torch.searchsorted(self.pair, wanted).clamp(max=n_pairs - 1)
-        listed = self.pair.take(found) == wanted
-        return torch.where(listed, found, n_pairs)
+        return torch.where(self.pair.take(found) == wanted, found, n_pairs)
 
     def way(self, origin: Tensor, goal: Tensor, points: Tensor) -> Tensor:
         """Places on the ways between landing points, from one to the other, [*, C + 2, 2]
@@ -69,15 +68,12 @@ class Detours(NamedTuple):
         way = self._along(row, origin, goal, points)
         legs = torch.linalg.vector_norm(way.diff(dim=-2), dim=-1)
         between = way[..., -1, :] - way[..., 0, :]
-        straight = torch.linalg.vector_norm(between, dim=-1)
-        near = straight <= self.longest
+        near = torch.linalg.vector_norm(between, dim=-1) <= self.longest
         leads = near & gather_rows(self.reached, row)
         return legs.sum(-1).where(leads, torch.inf)
 
 
-def detours(
-    polygons: list[Polygon | MultiPolygon], points: list[Floats], longest: float
-) -> Detours | None:
+def detours(polygons: list[Area], points: list[Floats], longest: float) -> Detours | None:
     """The detours between landing points [L_r, 2] m of each region; None if all ways are straight.
 
     Only pairs are looked at that are at most ``longest`` [m] apart.
@@ -96,8 +92,7 @@ def detours(
         one, other = near.T
         near = near[~_visible(polygon, places[one], places[other])]
         if len(near):
-            back = near[:, ::-1]
-            blocked = np.concatenate([near, back])
+            blocked = np.concatenate([near, near[:, ::-1]])
             one, other = blocked.T
             blocked = blocked[np.lexsort((other, one))]
             bends, leads = _shortest(polygon, places, blocked)
@@ -172,8 +167,7 @@ def _shortest(
 
 def _visible(polygon: shapely.Geometry, origin: Floats, goal: Floats) -> NDArray[np.bool_]:
     """Whether the straight ways between places [Q, 2] m stay in the polygon, [Q]."""
-    ends = np.stack([origin, goal], 1)
-    ways = shapely.linestrings(ends)
+    ways = shapely.linestrings(np.stack([origin, goal], 1))
     return np.asarray(shapely.covers(polygon, ways))
 
 

@@ -43,8 +43,7 @@ def poisson_arrivals(
     # That at least k appear has the probability P(k, mean), the regularised lower incomplete gamma
     # function.
     at_least = torch.arange(1, slots + 1, dtype=torch.float64)
-    means = torch.full_like(at_least, mean)
-    chance = torch.special.gammainc(at_least, means)
+    chance = torch.special.gammainc(at_least, torch.full_like(at_least, mean))
     return Arrivals(
         chance=chance.float(),
         places=torch.as_tensor(np.stack(places), dtype=torch.float32),
@@ -56,8 +55,7 @@ def is_open(requests: Tensor, served: Tensor) -> Tensor:
     """Which requests [*, M, 3] no UAV has served, as far as its memory [*, N, M] tells, [*, M]
     bool."""
     time = requests[..., 2]
-    last_served = served.amax(-2)
-    return (time >= 0) & (time > last_served)
+    return (time >= 0) & (time > served.amax(-2))
 
 
 def appear(
@@ -71,12 +69,10 @@ def appear(
     in seconds.
     """
     seed, episode, step, region = (each.unsqueeze(-1) for each in counters)
-    appears = torch.full_like(step, _APPEARS)
-    share = counter_rng.uniform(seed, appears, episode, step)
+    share = counter_rng.uniform(seed, _APPEARS, episode, step)
     at_least = (share < arrivals.chance) & (step > 0)
     number = at_least.sum(-1, keepdim=True)
-    where = torch.full_like(step, _PLACE)
-    drawn = counter_rng.bits(seed, where, episode, step, arrivals.slots)
+    drawn = counter_rng.bits(seed, _PLACE, episode, step, arrivals.slots)
     n_places = arrivals.places.shape[1]
     row = region * n_places + drawn % n_places
     place = gather_rows(arrivals.places.flatten(0, 1), row)
@@ -85,8 +81,7 @@ def appear(
     waits = is_open(requests, served)
     appeared = requests[..., 2].masked_fill(waits, torch.inf)
     rank = appeared.argsort(dim=-1, stable=True).argsort(-1)
-    taken = (rank < number) & ~waits
-    return where_rows(taken, new, requests)
+    return where_rows((rank < number) & ~waits, new, requests)
 
 
 def serve(

@@ -85,7 +85,7 @@ def footprint(state: State, world: Any) -> Tensor:
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
     """Read ``package.module:name`` or ``{sensor: package.module:name, strength: 3}``; sensors by
     name."""
-    found: dict[str, Sensor] = {}
+    found = {}
     for number, each in enumerate(written):
         key = f"sensors[{number}]"
         entry = each if isinstance(each, Mapping) else {"sensor": each}

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 import torch
+from numpy.random import Generator
 from torch import Tensor
 
 from damian.world.config import SourceConfig
-from damian.world.regions.polygon import sample_interior
-
-_Polygon = shapely.Polygon | shapely.MultiPolygon
+from damian.world.regions.polygon import Area, sample_interior
 
 _TINY = 1e-9
 _FULL_DISC_ROUNDS = 256
@@ -75,10 +74,10 @@ def drawn_radius(level: Tensor, config: SourceConfig) -> Tensor:
 
 
 def draw_walks(
-    polygon: _Polygon,
+    polygon: Area,
     config: SourceConfig,
     n_walks: int,
-    rng: np.random.Generator,
+    rng: Generator,
     start: np.ndarray | None = None,
 ) -> Walk:
     """Draw the walks of ``W = n_walks`` sources in a polygon of local metres, float32 on the CPU.
@@ -144,9 +143,7 @@ def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Te
     [*]."""
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
-    tiny = torch.finfo(peak.dtype).tiny
-    duration = length / peak.clamp_min(tiny) + ramp
-    return ramp, duration
+    return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp
 
 
 def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:
@@ -161,7 +158,7 @@ def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tenso
 
 
 def _draw_stops(
-    polygon: _Polygon, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
+    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Each hotspot [W, H, 2] m followed by its inner points, packed to the left and padded.
 
@@ -186,7 +183,7 @@ def _draw_stops(
 
 
 def _inner_points(
-    polygon: _Polygon, hotspots: np.ndarray, config: SourceConfig, rng: np.random.Generator
+    polygon: Area, hotspots: np.ndarray, config: SourceConfig, rng: Generator
 ) -> np.ndarray:
     """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2]
     metres."""
@@ -216,7 +213,7 @@ def _timed_walk(
     hotspot: np.ndarray,
     n: np.ndarray,
     config: SourceConfig,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Walk:
     """Add waiting times, legs and emission to the stops."""
     shape = hotspot.shape

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import shapely
 import torch
+from numpy.random import Generator
 from torch import Tensor
 
 from damian.common import checks, counter_rng
@@ -47,8 +48,7 @@ class Simulation:
         self.dt = dt
         self.sensors = sensors_of(config.sensors)
         self.sources = config.source.all
-        radii = [footprint_radius(source) for source in self.sources]
-        self.reach = torch.tensor(radii)
+        self.reach = torch.tensor([footprint_radius(source) for source in self.sources])
         """Largest distance at which UAVs detect each source [m], [K]."""
         self.radius = footprint_radius(config.source)
         """Radius of a footprint [m]."""
@@ -133,8 +133,7 @@ class Simulation:
         condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
         others = fresh.integers[:, kept.shape[1] :]
-        integers = torch.cat([kept, others], 1)
-        fresh = fresh._replace(integers=integers)
+        fresh = fresh._replace(integers=torch.cat([kept, others], 1))
         if not self.draws:
             return fresh
         state = self.layout.unpack(fresh)  # the first messages tell what is drawn for this episode
@@ -163,8 +162,7 @@ class Simulation:
         if self.foretold or not self.news.fails:
             return self._sense(moved, action_valid)
         moved = self.news.fail(moved)
-        joins = state.failed & ~moved.failed
-        return self._sense(moved, action_valid, joins)
+        return self._sense(moved, action_valid, state.failed & ~moved.failed)
 
     def action_mask(self, state: State) -> Tensor:
         """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
@@ -189,8 +187,7 @@ class Simulation:
         if not self.vehicles.is_windy:
             return distance
         nearest = gather_rows(self.candidates.nearest, state.goal)
-        in_wind = self._distance_to(state, nearest)
-        return in_wind.where(distance.isfinite(), torch.inf)
+        return self._distance_to(state, nearest).where(distance.isfinite(), torch.inf)
 
     def _distance_to(self, state: State, goals: Tensor) -> Tensor:
         """Lengths for the batteries of flights to these flat ids [m], [B, N, K]."""
@@ -231,12 +228,10 @@ class Simulation:
         if action_valid is not None:
             reach = torch.where(action_valid, reach, -1.0)
         ready = reach >= 0
-        assigned = assign_landing_points(ranking, row, standing, reach, n_points)
-        goal = assigned + base
+        goal = assign_landing_points(ranking, row, standing, reach, n_points) + base
         departs = goal != state.goal
         track = torch.where(departs, self._heading(state.goal, goal), state.track)
-        motions = state.motions + ready
-        state = state._replace(track=track, motions=motions)
+        state = state._replace(track=track, motions=state.motions + ready)
         if command is not None:
             state = state._replace(sent=self._with_commands(state, command, ready))
         return self.vehicles.take_off(state, goal, ready, departs)
@@ -263,8 +258,7 @@ class Simulation:
         base = state.region * self.airspace.max_points
         flat = torch.cat([point + base.view(-1, 1, 1), state.goal.unsqueeze(-1)], -1)
         point = flat - base.view(-1, 1, 1)
-        distance = self._distance_to(state, flat)
-        return Ranking.of_each(point, distance)
+        return Ranking.of_each(point, self._distance_to(state, flat))
 
     def _heading(self, origin: Tensor, goal: Tensor) -> Tensor:
         """Heading from landing points to others, flat ids, clockwise from north [rad], [B, N]."""
@@ -379,8 +373,7 @@ class Simulation:
         miss = self._chance("source.miss", state, self.misses)
         alarm = self._chance("source.false_alarm", state, self.false_alarms)
         share = draw(state, _REPORT, self.pairs)
-        false_alarm = listens & (share < alarm)
-        return torch.where(in_reach, share >= miss, false_alarm)
+        return torch.where(in_reach, share >= miss, listens & (share < alarm))
 
     def _chance(self, key: str, state: State, settings: Tensor) -> Tensor:
         """A probability that is drawn for each world, [B, 1, 1], or that of each source, [K]."""
@@ -440,8 +433,7 @@ class Simulation:
             return requests.expand(-1, on_ground.shape[-1], -1, -1)
         ways = requests[..., :2] - state.position[..., None, :2]
         near = ways.square().sum(-1) <= reach**2
-        hears = on_ground.unsqueeze(-1) & near
-        return where_rows(hears, requests, state.sent.requests)
+        return where_rows(on_ground.unsqueeze(-1) & near, requests, state.sent.requests)
 
     def _empty(self, state: State, on_ground: Tensor) -> Tensor:
         """Whether each UAV's observed battery level is 0, or allows nothing but holding, [B, N]."""
@@ -453,8 +445,7 @@ class Simulation:
         else:
             shortest = gather_rows(self.shortest_flight, state.goal)
         stuck = on_ground & (reach < shortest)
-        level = observed(state.battery, self.config.battery)
-        return stuck | (level <= 0)
+        return stuck | (observed(state.battery, self.config.battery) <= 0)
 
     def _shortest_flights(self) -> Tensor:
         """Length of the shortest flight from each landing point [m], 0 if no action flies, [R*L].
@@ -471,9 +462,8 @@ class Simulation:
             length = torch.cat(nearest)
             longest = 2 * self.candidates.max_distance
         flies = bool((length < longest).any())
-        moves = flies or self.airspace.max_points == 1
         checks.require(
-            moves,
+            flies or self.airspace.max_points == 1,
             "actions.distances",
             actions.distances,
             "[m] lead from no landing point to another one: take larger ones, or a finer lattice",
@@ -518,9 +508,7 @@ class Simulation:
         config = self.sources[number]
         seed = state.seed
         if number:
-            stream = torch.full_like(seed, _SOURCE)
-            source = torch.full_like(seed, number)
-            seed = counter_rng.bits64(seed, stream, source)
+            seed = counter_rng.bits64(seed, _SOURCE, number)
         emits = torch.ones_like(state.source_over)
         if config.motion == "static":
             place = state.source[:, number]
@@ -529,8 +517,7 @@ class Simulation:
             condition = state.initial_condition
             walk = tree_map(lambda t: t.index_select(0, condition), self.walks[number])
             time = state.steps.double() * self.dt
-            loops = config.after_walk == "loop"
-            place, stop, tour, over = locate(walk, time, loops)
+            place, stop, tour, over = locate(walk, time, config.after_walk == "loop")
             if config.emission == "per_stop":
                 first = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
                 draw = counter_rng.uniform(seed, state.episode, tour, stop)
@@ -610,7 +597,7 @@ def _last_found(
 
 
 def _draw_initial_conditions(
-    config: WorldConfig, airspace: Airspace, rng: np.random.Generator
+    config: WorldConfig, airspace: Airspace, rng: Generator
 ) -> tuple[Tensor, Tensor, tuple[Walk, ...]]:
     """Draw Q initial conditions, the same number for each region, on the CPU.
 
@@ -630,8 +617,7 @@ def _draw_initial_conditions(
             drawn.append(walk)
         start = _draw_starts(config, airspace, index, per_region, rng)
         starts.append(start)
-    regions = torch.arange(len(airspace.regions))
-    indices = regions.repeat_interleave(per_region)
+    indices = torch.arange(len(airspace.regions)).repeat_interleave(per_region)
     return indices, torch.cat(starts), tuple(map(_joined, walks))
 
 
@@ -648,12 +634,11 @@ def _pad(walk: Walk, stops: int) -> Walk:
     index = torch.arange(stops)
     kept = index.clamp(max=last)
     padded = tree_map(lambda field: field[:, kept], walk)
-    arrive = padded.arrive.masked_fill(index > last, torch.inf)
-    return padded._replace(arrive=arrive)
+    return padded._replace(arrive=padded.arrive.masked_fill(index > last, torch.inf))
 
 
 def _draw_starts(
-    config: WorldConfig, airspace: Airspace, region: int, n: int, rng: np.random.Generator
+    config: WorldConfig, airspace: Airspace, region: int, n: int, rng: Generator
 ) -> Tensor:
     """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for
     each."""
@@ -668,8 +653,7 @@ def _draw_starts(
         order = torch.as_tensor(rng.random((n, n_points)))
         return order.topk(config.agents, dim=-1).indices
     home = airspace.regions[region]
-    places = local_places(key, given, home)
-    points = airspace.nearest(places, region)
+    points = airspace.nearest(local_places(key, given, home), region)
     problem = (
         f"lead to the same landing point of {home.name}: take others, or region.start_together=true"
     )

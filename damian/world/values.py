@@ -29,7 +29,7 @@ class Values(NamedTuple):
         worlds [B]."""
         columns = []
         for key, values in self.choices.items():
-            share = counter_rng.uniform(seed, torch.full_like(episode, self.streams[key]), episode)
+            share = counter_rng.uniform(seed, self.streams[key], episode)
             if len(values) == 2:
                 columns.append(values[0] + (values[1] - values[0]) * share)
             else:
@@ -54,7 +54,7 @@ def times(values: Tensor, factor: Value) -> Tensor:
 
 def values_of(config: WorldConfig) -> Values:
     """The values of the settings of a world."""
-    settings: dict[str, Value] = {}
+    settings = {}
     for section in (config.motion, config.battery, config.wind, config.source):
         for name, rule in rules(type(section)).items():
             value = getattr(section, name)

@@ -25,6 +25,7 @@ from damian.world.config import WorldConfig
 from damian.world.landing import displacement
 from damian.world.messages import Messages
 from damian.world.motion import air_length, flight_levels, minimum_time, poses
+from damian.world.news import draw
 from damian.world.regions.region import local_places
 from damian.world.state import State
 from damian.world.values import times, values_of
@@ -59,8 +60,7 @@ class MotionModel(ABC):
         if not self.instant:
             check_levels(levels, airspace)
         self.levels = torch.tensor(levels)
-        n_draws = 2 * config.agents
-        self.gusts = torch.arange(n_draws).view(-1, 2)
+        self.gusts = torch.arange(2 * config.agents).view(-1, 2)
         """Numbers of the two draws of each UAV's gust, [N, 2]; made within a step, they would not
         compile."""
         self.chargers = _charging_points(config, airspace)
@@ -138,8 +138,7 @@ class MotionModel(ABC):
         if not self.battery.enabled:
             return torch.full_like(state.battery, checks.METRES)
         battery = battery_of(self.values, state.drawn)
-        climb_and_descent = 2 * self.vertical(state)
-        left = state.battery - vertical_drain(climb_and_descent, battery)
+        left = state.battery - vertical_drain(2 * self.vertical(state), battery)
         return cruise_range(left, battery).clamp(min=0)
 
     def distance(self, state: State, origin: Tensor, goal: Tensor) -> Tensor:
@@ -216,8 +215,7 @@ class InstantMotion(MotionModel):
     def move(self, state: State) -> State:
         place = gather_rows(self.points, state.goal)
         height = torch.zeros_like(place[..., :1])
-        position = torch.cat([place, height], -1)
-        state = state._replace(position=position)
+        state = state._replace(position=torch.cat([place, height], -1))
         if not self.battery.enabled:
             return state
         length = self.airspace.length(state.origin, state.goal)
@@ -317,8 +315,7 @@ class PolynomialFlight(MotionModel):
         vertical = state.vertical
         cruise = state.cruise
         way = self.airspace.way(state.origin, state.goal)
-        degree = self.motion.degree
-        position, crossed = poses(way, self.levels, elapsed, vertical, cruise, degree)
+        position, crossed = poses(way, self.levels, elapsed, vertical, cruise, self.motion.degree)
         state = state._replace(position=position)
         if not self.battery.enabled:
             return state
@@ -338,19 +335,14 @@ class PolynomialFlight(MotionModel):
         ones = [1] * (origin.dim() - 1)
         wind = self._wind(state).view(-1, *ones, 2)
         air, slowest = self._through(state, origin, goal, wind)
-        advances = slowest >= self.motion.min_ground_speed
-        length = air.where(advances, torch.inf)
+        length = air.where(slowest >= self.motion.min_ground_speed, torch.inf)
         return torch.where(origin == goal, 0.0, length)
 
     def _air(self, state: State) -> Tensor:
         """Way of each flight through the air that begins now [m], gusts included, [B, N]."""
         if not self.is_windy:
             return self.airspace.length(state.origin, state.goal)
-        of_gusts = torch.full_like(state.episode, _GUST)
-        numbers = state.seed, of_gusts, state.episode, state.steps
-        seed, *counters = (each.view(-1, 1, 1) for each in numbers)
-        draws = counter_rng.uniform(seed, *counters, self.gusts)
-        size, turn = draws.unbind(-1)
+        size, turn = draw(state, _GUST, self.gusts).unbind(-1)
         # Normal east and north (Box and Muller, 1958).
         standard = (-2 * (1 - size).log()).sqrt()
         size = times(standard, self.values.get("wind.gusts", state.drawn))
@@ -364,8 +356,7 @@ class PolynomialFlight(MotionModel):
         calm = state.track.new_zeros(len(state.seed), 1)
         speed = calm - self.values.get("wind.speed", state.drawn)
         direction = calm + self.values.get("wind.direction", state.drawn)
-        wind = displacement(speed, direction.deg2rad())
-        return wind.squeeze(-2)
+        return displacement(speed, direction.deg2rad()).squeeze(-2)
 
     def _through(
         self, state: State, origin: Tensor, goal: Tensor, wind: Tensor
@@ -395,8 +386,7 @@ class PolynomialFlight(MotionModel):
         self, state: State, on_ground: Tensor, action_valid: Tensor | None
     ) -> Tensor | None:
         """Each decision adds one landing point, however long the UAV then senses there."""
-        landing = self.steps(state).clamp(min=1)
-        return on_ground & (state.elapsed == landing)
+        return on_ground & (state.elapsed == self.steps(state).clamp(min=1))
 
     def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
         """Least number of steps after which the latest flight, and a time [s] after it, are over,

@@ -90,7 +90,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
         [*learner.components()],
         "has no actor, which evaluations load: return {'actor': self.actor, ...}",
     )
-    assume(config, env, cast(TensorDictModuleBase, learner.components()["actor"]))
+    assume(config, env, learner.components()["actor"])
     return learner
 
 
@@ -104,9 +104,8 @@ def require_delayed_talk(config: TrainConfig, env: DelayedEnv, learner: Learner)
     known = "observation.own=true" if own else f"links={links}"
     should = (
         f"has an actor that reads other UAVs' rows, which with {known} hold what each knows at "
-        "once: attend "
-        "over blocks of a UAV's own row (docs/extending.md), or give learner.talks=true to let "
-        "UAVs talk so"
+        "once: attend over blocks of a UAV's own row (docs/extending.md), or give "
+        "learner.talks=true to let UAVs talk so"
     )
     with own_code(config.learner):
         talk = undelayed_talk(learner.actor, env)
@@ -205,7 +204,7 @@ def ticks(collector: Collector, clock: SystemClock, server: Server) -> Iterator[
         parts.append(part)
         if sum(part.shape[1] for part in parts) < clock.period:
             continue
-        batch = cast(TensorDictBase, torch.cat(parts, 1)) if len(parts) > 1 else part  # type: ignore[arg-type]
+        batch = torch.cat(parts, 1) if len(parts) > 1 else part  # type: ignore[arg-type]
         if clock.change:
             clock.tick(spotting(batch, server))
         parts = []

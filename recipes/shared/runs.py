@@ -9,7 +9,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from damian.common.atomic_files import not_linked, remove_unfinished, write_atomically
 from damian.common.devices import keep_freed_memory
 from damian.common.errors import InputError
-from damian.common.fields import filled, has, leaves, nested, set_at, value_at
+from damian.common.fields import filled, leaves, nested, set_at, value_at
 from damian.common.registry import stored_settings
 from damian.common.text_files import read_text, show
 from damian.learners.config import LearnerConfig
@@ -163,7 +163,7 @@ def run_settings(given: DictConfig, words: Sequence[str], program: str = "train"
     from_file = any(values.get(key) for key in ("checkpoint", "resume", "journal"))
     with stored_settings([*texts(values)], bool(values["trust"])) if from_file else nullcontext():
         if program == "train" and values["resume"] is not None:
-            config: Any = resumed(short(Path(values["resume"])), values, words)
+            config = resumed(short(Path(values["resume"])), values, words)
         elif values.get("checkpoint") is not None:
             config = with_policy_of(values, words, program)
         else:
@@ -211,7 +211,7 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     """Write the record of words, versions and machine into the run folder, then the settings."""
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    entries: dict[str, Any] = {OVERRIDES: [*config.overrides], SEED: config.seed}
+    entries = {OVERRIDES: [*config.overrides], SEED: config.seed}
     entries |= {"device": device, "threads": config.threads}
     if HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN:
         entries[JOB] = HydraConfig.get().job.num
@@ -279,7 +279,7 @@ def resumed(folder: Path, values: Mapping[str, Any], words: Sequence[str]) -> Tr
     return replace(config, resume=str(folder), **changed)
 
 
-def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str = "train") -> Any:
+def with_policy_of(values: dict[str, Any], words: Sequence[str], program: str) -> Any:
     """The settings of a run that flies, or begins with, the policy of a stored run.
 
     Words lie over what is stored: a group's option replaces the settings that its options set, a
@@ -309,11 +309,10 @@ def reach(key: str, program: str) -> set[str]:
     A scenario says nothing of the networks: they are those of the policy.
     """
     known = known_settings(program)
-    found = {key} & known_settings(program).keys()
+    found = {key} & known.keys()
     for written, chosen in options_in(key):
-        found |= {
-            each for each, setting in known.items() if not setting.is_section and has(written, each)
-        }
+        settings = (each for each, setting in known.items() if not setting.is_section)
+        found |= {each for each in settings if value_at(written, each, MISSING) is not MISSING}
         found |= {
             name.removeprefix("override /") for name in chosen if name.startswith("override /")
         }

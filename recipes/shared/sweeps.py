@@ -185,9 +185,7 @@ class Results(NamedTuple):
 NO_RESULTS = Results(pd.DataFrame(columns=RUN), pd.DataFrame(columns=CURVE))
 
 
-def results_of(
-    runs: Sequence[Run], methods: Mapping[str, Method], kept: Results = NO_RESULTS
-) -> Results:
+def results_of(runs: Sequence[Run], methods: Mapping[str, Method], kept: Results) -> Results:
     """The results of finished runs, and the kept ones of the others."""
     again = pd.MultiIndex.from_frame(pd.DataFrame(map(names_of, runs), columns=RUN))
     others = [old[~pd.MultiIndex.from_frame(old[RUN]).isin(again)] for old in kept]

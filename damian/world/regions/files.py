@@ -21,6 +21,8 @@ from damian.common.text_files import listed, named, near, one_line, read_text, s
 from damian.world.regions.geodesy import Floats
 from damian.world.regions.region import Region, local_region
 
+GeoJson = dict[str, Any]
+"""An object of GeoJSON, or the properties of a feature."""
 _AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
 _DEGREES = re.compile(r"(CRS:?84|EPSG:[\d.]*:?4326)$", re.IGNORECASE)
 """Names of WGS 84, the coordinate reference system of GPS and of GeoJSON."""
@@ -33,8 +35,8 @@ class _Feature(NamedTuple):
     """One feature of a file; ``place`` is its path in the document, such as ``features[2]``."""
 
     place: str
-    properties: dict[str, Any]
-    geometry: dict[str, Any]
+    properties: GeoJson
+    geometry: GeoJson
     """As in GeoJSON."""
     crs: Any = None
     """Coordinate reference system: a name, an object of GeoJSON, or None for longitude and
@@ -172,20 +174,20 @@ def _from_map(path: Path) -> list[_Feature]:
             }
             place = f"features[{len(found)}]"
             if path.suffix.lower() in _KML and shape and _is_picture(properties):
-                geometry: dict[str, Any] = {"type": "picture (GroundOverlay)"}
+                geometry = {"type": "picture (GroundOverlay)"}
             else:
                 geometry = _of_wkb(shape, place)
             found.append(_Feature(place, properties, geometry, about["crs"] or {}))
     return found
 
 
-def _is_picture(properties: dict[str, Any]) -> bool:
+def _is_picture(properties: GeoJson) -> bool:
     """Is a shape of a KML the outline of a picture? Of all others GDAL says whether they are
     extruded."""
     return properties.get("extrude", 0) not in (0, 1)  # but None, or nan
 
 
-def _of_wkb(shape: bytes | None, place: str) -> dict[str, Any]:
+def _of_wkb(shape: bytes | None, place: str) -> GeoJson:
     """The geometry of well-known binary, as in GeoJSON; empty if there is none."""
     try:
         return mapping(shapely.from_wkb(shape)) if shape else {}
@@ -255,7 +257,7 @@ def _fitting(features: list[_Feature], where: str) -> _Feature:
     return found[0]
 
 
-def _polygons(geometry: dict[str, Any]) -> Iterator[list[Any]]:
+def _polygons(geometry: GeoJson) -> Iterator[list]:
     """The rings of each polygon of a geometry, the shell first; those without corners are left
     out."""
     kind = geometry.get("type")

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+LatLon = tuple[float, float]
+"""A latitude and a longitude [deg]."""
 
 EARTH_RADIUS_M = 6_371_008.8
 """Mean radius of the Earth (IUGG R1)."""
 
 
-def to_local(
-    lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]
-) -> tuple[Floats, Floats]:
+def to_local(lat_deg: ArrayLike, lon_deg: ArrayLike, origin: LatLon) -> tuple[Floats, Floats]:
     """Convert latitudes in [-90, 90] and longitudes, [*] degrees, to metres [*] east and north of
     ``origin``.
 
@@ -46,12 +46,10 @@ def to_local(
 
 def _by_bearing(length: Floats, bearing: Floats) -> tuple[Floats, Floats]:
     """Parts east and north of lengths [*] in the directions of bearings [*] rad."""
-    east = length * np.sin(bearing)
-    north = length * np.cos(bearing)
-    return east, north
+    return length * np.sin(bearing), length * np.cos(bearing)
 
 
-def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
+def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: LatLon) -> tuple[Floats, Floats]:
     """Convert metres east and north [*] to latitudes and longitudes [*]; the inverse of
     ``to_local``.
 
@@ -74,7 +72,7 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tu
     return lat, wrap_longitude(lon)
 
 
-def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
+def area_centroid(rings: Sequence[Floats]) -> LatLon:
     """Centroid of a polygon's area on the sphere, as (latitude, longitude) in degrees.
 
     It is the place below the mean of all points of the area in space. For a polygon whose edges are

@@ -10,12 +10,15 @@ from typing import Any, cast
 
 import numpy as np
 import shapely
+from numpy.random import Generator
 from shapely.geometry import MultiPoint, MultiPolygon, Polygon
 
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.world.regions.geodesy import Floats
 
+Area = Polygon | MultiPolygon
+"""What a region covers, in one part or in several."""
 RESOLUTION = 0.01
 """Distances of landing points that differ by less are not told apart [m]."""
 MAX_CANDIDATES = 5_000_000
@@ -52,7 +55,7 @@ def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polyg
     return polygon
 
 
-def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
+def random_polygon(rng: Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
     """Draw a random convex polygon: the hull of points uniform in the disc of area ``max_area_m2``.
 
     The hull grows by one point at a time until its area reaches ``min_area_m2``; if a thousand
@@ -70,14 +73,14 @@ def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: fl
     return _hull(scale * shapely.get_coordinates(hull))
 
 
-def largest_vertex_distance(polygon: Polygon | MultiPolygon) -> float:
+def largest_vertex_distance(polygon: Area) -> float:
     """Largest distance between two vertices [m], by which features divide distances."""
     corners = shapely.get_coordinates(shapely.convex_hull(polygon))
     return max(float(np.hypot(*(corners - corner).T).max()) for corner in corners)
 
 
 def landing_lattice(
-    polygon: Polygon | MultiPolygon, step_m: float, degrees: float, n_points: int | None = None
+    polygon: Area, step_m: float, degrees: float, n_points: int | None = None
 ) -> Floats:
     """Lay a serpentine lattice over the polygon; its points inside the polygon are the landing
     points.
@@ -108,7 +111,7 @@ def landing_lattice(
     return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
 
 
-def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Generator) -> Floats:
+def sample_interior(polygon: Area, n: int, rng: Generator) -> Floats:
     """Draw points uniformly in the polygon, strictly inside, [n, 2] metres.
 
     First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it
@@ -149,7 +152,7 @@ def _hull(corners: Floats) -> Polygon:
     return cast(Polygon, MultiPoint(corners).convex_hull)
 
 
-def _disc(rng: np.random.Generator, area_m2: float, n: int) -> Floats:
+def _disc(rng: Generator, area_m2: float, n: int) -> Floats:
     """Draw points [n, 2] uniformly in the disc of the given area about (0, 0)."""
     radius = np.sqrt(area_m2 / np.pi * rng.random(n))
     angle = 2 * np.pi * rng.random(n)

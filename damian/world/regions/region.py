@@ -6,13 +6,12 @@ from typing import Any, cast
 
 import numpy as np
 import shapely
-from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
-from damian.world.regions.geodesy import Floats, area_centroid, to_local
-from damian.world.regions.polygon import polygon_from_rings
+from damian.world.regions.geodesy import Floats, LatLon, area_centroid, to_local
+from damian.world.regions.polygon import Area, polygon_from_rings
 
 _SLACK = 1e-6
 """Share of the area of a region that may lie between edges which cross once laid out in metres."""
@@ -32,9 +31,9 @@ class Region:
             (0, 0) if vertices were given, or drawn, about another origin.
     """
 
-    polygon: Polygon | MultiPolygon
+    polygon: Area
     name: str
-    origin: tuple[float, float] | None = None
+    origin: LatLon | None = None
     levels: tuple[float, float] | None = None
     offset: tuple[float, float] = (0.0, 0.0)
 
@@ -100,10 +99,9 @@ def _local_place(key: str, place: Any, region: Region) -> Floats:
         key,
         place,
         f"has latitude and longitude, but {region.name} has no position on Earth: give [x, y] in "
-        "metres, or "
-        "take a region from a FIR table or GeoJSON file",
+        "metres, or take a region from a FIR table or GeoJSON file",
     )
-    return np.stack(to_local(place["lat"], place["lon"], cast(tuple[float, float], region.origin)))
+    return np.stack(to_local(place["lat"], place["lon"], cast(LatLon, region.origin)))
 
 
 def local_region(
@@ -126,19 +124,19 @@ def local_region(
         excluded: parts that are cut out.
     """
 
-    def united(some: Sequence[Sequence[Floats]]) -> Polygon | MultiPolygon:
+    def united(some: Sequence[Sequence[Floats]]) -> Area:
         unwrapped = [
             [_unwrap_longitude(ring, parts[0][0][0, 0]) for ring in rings] for rings in some
         ]
         polygons = [
             polygon_from_rings(rings, source, "deg (longitude, latitude)") for rings in unwrapped
         ]
-        return cast(Polygon | MultiPolygon, shapely.union_all(polygons))
+        return cast(Area, shapely.union_all(polygons))
 
     # Parts that were cut at the antimeridian share an edge, which a valid MultiPolygon must not.
     shape = united(parts)
     if excluded:
-        shape = cast(Polygon | MultiPolygon, shape - united(excluded))
+        shape = cast(Area, shape - united(excluded))
         if shape.is_empty:
             raise InputError(f"{source}: all of it is excluded; take a larger region")
     if shape.bounds[2] - shape.bounds[0] > 180:
@@ -149,7 +147,7 @@ def local_region(
     return Region(_made_valid(local, source), one_line(name), origin, levels)
 
 
-def _made_valid(local: Polygon | MultiPolygon, source: str) -> Polygon | MultiPolygon:
+def _made_valid(local: Area, source: str) -> Area:
     """A polygon in metres without the little by which holes cross the edges that they touch in
     degrees."""
     if local.is_valid:
@@ -157,7 +155,7 @@ def _made_valid(local: Polygon | MultiPolygon, source: str) -> Polygon | MultiPo
     valid = shapely.make_valid(local, method="structure", keep_collapsed=False)
     if not abs(valid.area - local.area) < _SLACK * local.area:
         raise InputError(f"{source}: edges cross once laid out in metres; take a smaller region")
-    return cast(Polygon | MultiPolygon, valid)
+    return cast(Area, valid)
 
 
 def _unwrap_longitude(ring: Floats, lon_deg: float) -> Floats:
