@@ -158,18 +158,6 @@ def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew():
 
 
 @pytest.mark.slow
-def test_ppo_behind_delays_takes_a_few_steps():
-    (mean,) = load("ppo_gymnasium")["train"](delay=2, frames=1000)
-    assert 9 < mean < 60
-
-
-@pytest.mark.slow
-def test_multi_agent_ppo_behind_delays_takes_a_few_steps():
-    pytest.importorskip("vmas")
-    assert len(load("ppo_vmas")["train"](batches=1)) == 1
-
-
-@pytest.mark.slow
 def test_worker_processes_draw_late_messages():
     run("late_workers")
 
