@@ -475,51 +475,9 @@ class Relay(ParallelEnv):
         )
 
 
-def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
-    env = DelayParallelWrapper(
-        Relay(),
-        {
-            "a": 1,
-            "b": 4,
-            "c": 2,
-        },
-        {"a": 2},
-        {"b": 3, "a": 1},
-        timeline=4,
-    )
-    for _ in range(2):  # nothing of an episode reaches the next one
-        told, infos = env.reset()
-        assert {agent: each["observation"].tolist() for agent, each in told.items()} == {
-            "a": [0, 0],
-            "b": [0, 0],
-        }
-        rows = []
-        while env.agents:
-            actions = dict.fromkeys(env.agents, env.unwrapped.t + 1)
-            told, rewards, *_, infos = env.step(actions)
-            assert told.keys() == rewards.keys() == infos.keys()
-            rows.append((told, rewards))
-            assert infos["a"]["t"] == env.unwrapped.t
-        told = [row[0] for row in rows]
-        seen = {
-            uav: [each[uav]["observation"].tolist() for each in told if uav in each]
-            for uav in "abc"
-        }
-        assert seen["a"] == [[0, 0], [1, 0], [2, 0], [3, 1], [4, 2], [5, 3], [6, 4], [7, 5], [8, 6]]
-        assert seen["b"] == [[0, 0], [0, 0], [0, 0], [0, 0], [1, 1]]
-        assert (
-            seen["c"]
-            == [[3, -1], [3, -1], [3, -1], [4, 4], [5, 5], [6, 6], [7, 7]][: len(seen["c"])]
-        )
-        assert [row[1].get("b") for row in rows] == [0, 0, 0, 10, 111100, None, None, None, None]
-        assert [row[1]["a"] for row in rows] == [0, *(10**t for t in range(1, 8)), 10**8 + 10**9]
-        assert rows[4][0]["c"]["timeline"][:, -1].tolist() == [0, 0, 1, 0]
-        assert rows[4][0]["a"]["timeline"][:, 0].tolist() == [0, 4, 3, 2]
-
-
 @pytest.mark.parametrize("tells", [True, False])
-@pytest.mark.parametrize("again", [6, 8])
-def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
+@pytest.mark.parametrize("again", [None, 6, 8])
+def test_agents_that_die_or_come_again_are_told_and_paid_as_in_the_transforms(again, tells):
     observation, action, reward = (("agents", each) for each in ("observation", "action", "reward"))
     delays = Compose(
         ActionDelay(1, action),
@@ -548,8 +506,10 @@ def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
         chosen = env.unwrapped.t + 1
         now["agents", "action"] = torch.full((2,), chosen)
         now = reference.step(now)["next"]
-        told, rewards, *_ = env.step(dict.fromkeys(env.agents, chosen))
+        told, rewards, *_, infos = env.step(dict.fromkeys(env.agents, chosen))
+        assert told.keys() == rewards.keys() == infos.keys()
         for agent in told:
+            assert infos[agent]["t"] == chosen
             i = env.possible_agents.index(agent)
             for key in ("held", "age", "timeline"):
                 assert np.array_equal(told[agent][WRITTEN[key]], now["agents", key][i].numpy()), key
@@ -562,6 +522,16 @@ def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
             )
             assert now["agents", "reward"][i].item() == pytest.approx(expected, rel=1e-5)
         earned |= rewards
+
+
+def test_an_agent_that_joins_late_begins_with_what_it_sees_then():
+    env = DelayParallelWrapper(Relay(), {"c": 2})
+    env.reset()
+    seen = []
+    while env.agents:
+        told, *_ = env.step(dict.fromkeys(env.agents, env.unwrapped.t + 1))
+        seen.append(told["c"].tolist() if "c" in told else None)
+    assert seen == [None, None, *[[3, -1]] * 3, [4, 4], [5, 5], [6, 6], [7, 7]]
 
 
 def test_only_those_who_are_there_send():
