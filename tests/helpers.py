@@ -47,6 +47,17 @@ SMALLEST_TRAINING = [
 SQUARE = [[0.0, 0.0], [200.0, 0.0], [200.0, 200.0], [0.0, 200.0]]
 """Corners of a square region of 200 m by 200 m, [x, y] in metres."""
 
+DENTED = [
+    [0, 0],
+    [600, 0],
+    [600, 400],
+    [320, 400],
+    [300, 240],
+    [280, 400],
+    [0, 400],
+]
+"""Corners of a region with a dent, which some straight ways cross."""
+
 
 def usecase(case, **changed):
     """The paper's use case 1 or 2; ``changed`` replaces whole sections."""

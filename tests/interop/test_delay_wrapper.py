@@ -8,7 +8,6 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sequence, Text, Tuple
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import SyncVectorEnv
 from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
 from torchrl.envs import Compose, TransformedEnv
@@ -240,100 +239,36 @@ class Overwrites(gymnasium.Env):
         return {"gps": self.count, "camera": self.count}, self.paid, False, False, {}
 
 
-class OneOverwrites(ParallelEnv):
-    """The same for PettingZoo, of one agent."""
-
-    metadata, agents, possible_agents = {"name": "one"}, ["a"], ["a"]
-
-    def __init__(self):
-        self.inner = Overwrites()
-
-    def action_space(self, agent):
-        return LINE
-
-    def observation_space(self, agent):
-        return Overwrites.observation_space
-
-    def reset(self, seed=None, options=None):
-        return tuple({"a": each} for each in self.inner.reset())
-
-    def step(self, actions):
-        return tuple({"a": each} for each in self.inner.step(actions["a"]))
-
-
-@pytest.mark.parametrize("kind", ["whole", "in parts", "agent"])
-def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
+@pytest.mark.parametrize("parts", [False, True])
+def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(parts):
+    inner = Overwrites()
     default = np.full(1, 4, np.float32)
-    late = {
-        "observation": 2,
-        "action": 2,
-        "reward": 3,
-        "history": 3,
-        "timeline": 4,
-        "default": default,
-    }
-    if kind == "agent":
-        inner = OneOverwrites()
-        env = DelayParallelWrapper(inner, **late | {"default": {"a": default}})
-        inner = inner.inner
-    else:
-        inner = Overwrites()
-        env = DelayWrapper(
-            inner, **late | ({"observation": {"camera": 2}} if kind == "in parts" else {})
-        )
-    of_agent = {"agent": lambda each: each["a"]}.get(kind, lambda each: each)
-    default[:], action, rows = 9, np.zeros(1, np.float32), []
-    told = of_agent(env.reset(seed=0)[0])
+    late = {"observation": {"camera": 2} if parts else 2, "action": 2, "reward": 3}
+    env = DelayWrapper(inner, **late, history=3, timeline=4, default=default)
+    default[:] = 9
+    action = np.zeros(1, np.float32)
+    told, _ = env.reset(seed=0)
+    seen = []
+    rewards = []
+    ages = []
     for step in range(1, 7):
         for each in told.values():
             each[...] = -9
         action[...] = step
-        found = env.step({"a": action} if kind == "agent" else action)
-        told, reward, info = (of_agent(found[i]) for i in (0, 1, -1))
-        rows.append((copy.deepcopy(told), float(np.max(reward)), info))
-    seen, rewards, infos = zip(*rows, strict=True)
+        told, reward, *_, info = env.step(action)
+        seen.append(copy.deepcopy(told))
+        rewards.append(float(reward))
+        ages.append(info["age"]["camera"] if parts else info["age"])
     held = [0, 0, 1, 2, 3, 4]
     now = [1, 2, 3, 4, 5, 6]
     assert [each["camera"].item() for each in seen] == held
-    assert [each["gps"].item() for each in seen] == (now if kind == "in parts" else held)
-    assert seen[-1]["timeline"][2:, -2 if kind == "in parts" else 0].tolist() == [4, 3]
+    assert [each["gps"].item() for each in seen] == (now if parts else held)
+    assert seen[-1]["timeline"][2:, -2 if parts else 0].tolist() == [4, 3]
     of_actions = [(each["action_history"] * 198 - 99).round().tolist() for each in seen]
     assert of_actions == [[4, 4, 1], [4, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5], [4, 5, 6]]
     assert inner.executed == [4, 4, 1, 2, 3, 4]
-    assert list(rewards) == [0, 0, 0, 1, 2, 3]
-    ages = [info["age"]["camera"] if kind == "in parts" else info["age"] for info in infos]
+    assert rewards == [0, 0, 0, 1, 2, 3]
     assert [np.max(age) for age in ages] == [1, 2, 2, 2, 2, 2]
-
-
-DRAWN = {"observation": Uniform(1, 4), "action": 1, "reward": Uniform(0, 3), "loss": 0.2}
-
-
-def test_wrapped_environments_in_a_vector_are_those_alone():
-    def made() -> gymnasium.Env:
-        env = gymnasium.make("CartPole-v1", max_episode_steps=8)
-        return DelayWrapper(env, **DRAWN, history=2, timeline=3)
-
-    vector = SyncVectorEnv([made] * 3)
-    singles = [made() for _ in range(3)]
-    observations, infos = vector.reset(seed=4)
-    firsts = [env.reset(seed=4 + i)[0] for i, env in enumerate(singles)]
-    vector.action_space.seed(0)
-    done = [False] * 3
-    for _ in range(30):
-        assert vector.observation_space.contains(observations)
-        for i, first in enumerate(firsts):
-            assert data_equivalence({key: each[i] for key, each in observations.items()}, first)
-        actions = vector.action_space.sample()
-        observations, rewards, *_, infos = vector.step(actions)
-        for i, env in enumerate(singles):
-            if done[i]:  # the new episode begins in the step after the last one
-                (firsts[i], info), reward, done[i] = env.reset(), 0.0, False
-            else:
-                firsts[i], reward, terminated, truncated, info = env.step(actions[i])
-                done[i] = terminated or truncated
-                assert infos["received"][i] == info["received"]
-            assert rewards[i] == reward
-            assert infos["age"][i] == info["age"]
 
 
 def test_what_a_user_can_get_wrong_is_said_in_one_line():

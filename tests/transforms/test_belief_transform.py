@@ -32,7 +32,7 @@ def tracking(law=PAPER, own=False, **changed):
     )
 
 
-def rollout(env, steps=14):
+def rollout(env, steps=10):
     """Steps [B, T] over the ends of several episodes."""
     return env.rollout(steps, break_when_any_done=False)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import both_kinds, clock, play
+from helpers import DENTED, both_kinds, clock, play
 
 from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.common import counter_rng
@@ -23,7 +23,6 @@ from damian.world.config import (
     WindConfig,
 )
 
-DENTED = [[0, 0], [600, 0], [600, 400], [320, 400], [300, 240], [280, 400], [0, 400]]
 SPEED = [8.0, 12.0, 20.0]
 HARDEST = [1.0, 2.0, 4.0]
 LEAST = 2.0
