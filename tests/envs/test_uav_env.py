@@ -24,7 +24,11 @@ from damian.world.config import ActionConfig
 
 
 @pytest.mark.parametrize(
-    ("motion", "belief"), [("instant", []), ("polynomial", ["belief_moments"])]
+    ("motion", "belief"),
+    [
+        ("instant", []),
+        ("polynomial", ["belief_moments"]),
+    ],
 )
 def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion, belief):
     delay = DelayConfig(

@@ -39,7 +39,14 @@ GRIDS = {
 }
 
 
-@pytest.mark.parametrize(("miss", "alarm"), [(0.0, 0.0), (0.3, 0.1), (0.5, 0.0)])
+@pytest.mark.parametrize(
+    ("miss", "alarm"),
+    [
+        (0.0, 0.0),
+        (0.3, 0.1),
+        (0.5, 0.0),
+    ],
+)
 def test_reports_of_a_source_that_stays_have_the_probabilities_of_all_cases(miss, alarm):
     emission = 0.6
     grid = make_grid(emission, moves=False, miss=miss, false_alarm=alarm)

@@ -262,7 +262,14 @@ def test_a_copy_made_during_an_episode_continues_like_the_original(case, copied,
 
 @pytest.mark.sample(10)
 @every_case
-@pytest.mark.parametrize(("n_steps", "used"), [(5, True), (5, False), (0, True)])
+@pytest.mark.parametrize(
+    ("n_steps", "used"),
+    [
+        (5, True),
+        (5, False),
+        (0, True),
+    ],
+)
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_loaded_checkpoint_continues_bit_for_bit(case, whole, n_steps, used):
     env = case.build()

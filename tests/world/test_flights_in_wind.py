@@ -54,7 +54,13 @@ def through_the_air(way, wind, speed):
     return total, slowest
 
 
-@pytest.mark.parametrize("wind", [(7.0, 250.0), (15.0, 30.0)])
+@pytest.mark.parametrize(
+    "wind",
+    [
+        (7.0, 250.0),
+        (15.0, 30.0),
+    ],
+)
 def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
     speed, whence = wind
     env = UavEnv(replace(WORLD, wind=WindConfig(speed=speed, direction=whence)), 8, seed=1)
@@ -131,7 +137,13 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
     assert set(seen[:, 1].tolist()) <= {1.0, 2.0, 3.0}
 
 
-@pytest.mark.parametrize(("kind", "belief"), [("instant", True), ("polynomial", False)])
+@pytest.mark.parametrize(
+    ("kind", "belief"),
+    [
+        ("instant", True),
+        ("polynomial", False),
+    ],
+)
 def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     levels = [138.0, 142.0, 145.0]
     flying = MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)

@@ -16,7 +16,7 @@ from damian.world.regions.sources import RegionConfig, regions_of
 from damian.world.simulation import Simulation
 
 SQUARE = RegionConfig("vertices", vertices=helpers.SQUARE, initial_conditions=4)
-CORNERS = [[8.0, 45.0], [8.003, 45.0], [8.003, 45.002], [8.0, 45.002], [8.0, 45.0]]
+CORNERS = helpers.ring(8.0, 45.0, 8.003, 45.002)
 
 
 def build(region, **settings):
