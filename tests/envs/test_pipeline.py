@@ -77,7 +77,7 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
 # Clocks.
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(5)
 @pytest.mark.parametrize(
     "act",
     [
