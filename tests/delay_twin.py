@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from damian import Burst, ContextSampler, Geometric, Law, Trace, Uniform
@@ -145,14 +145,12 @@ class Counting(EnvBase):
         worlds: integer names of the worlds; what a world does depends on its name, but on no other
             world.
         n_agents: number of agents in each world, N.
-        continuous: actions are two numbers in [-1, 3], which are rounded to an integer, instead of
-            integers.
         ends: probability that an episode ends in a step.
     """
 
     N_ACTIONS = 7
 
-    def __init__(self, worlds, n_agents=2, continuous=False, ends=0.15):
+    def __init__(self, worlds, n_agents=2, ends=0.15):
         super().__init__(batch_size=[len(worlds)])
         self.names = torch.tensor(worlds)
         self.n_agents = n_agents
@@ -164,12 +162,9 @@ class Counting(EnvBase):
         def group(**specs):
             return Composite(agents=Composite(**specs, shape=agents), shape=worlds_shape)
 
-        action = Categorical(self.N_ACTIONS, shape=agents)
-        if continuous:
-            action = Bounded(-1.0, 3.0, shape=(*agents, 2))
         flag = Binary(shape=agents, n=n_agents, dtype=torch.bool)
         observation = Unbounded((*agents, 7), dtype=torch.float64)
-        self.action_spec = group(action=action)
+        self.action_spec = group(action=Categorical(self.N_ACTIONS, shape=agents))
         self.observation_spec = group(
             observation=observation, message_sent=flag, ready=flag.clone()
         )
@@ -218,9 +213,7 @@ class Counting(EnvBase):
     def _step(self, tensordict):
         self.total += 1
         action = tensordict["agents", "action"]
-        if action.is_floating_point():
-            action = (action * action.new_tensor([1.0, 10.0])).round().sum(-1)
-        self.x = (3 * self.x + action.long() + 1) % 101
+        self.x = (3 * self.x + action + 1) % 101
         self.executed = action
         self.action_valid = tensordict.get(("agents", "action_valid"), self.action_valid)
         outputs = self._outputs()

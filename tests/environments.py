@@ -133,45 +133,35 @@ REWARD = ("agents", "reward")
 
 class Drift(EnvBase):
     """Three worlds with a moving point each, which the action pushes; their episodes last 3, 4 and
-    5 steps.
-
-    Observation and reward have a gradient with respect to the action of the same step, but not of
-    earlier steps.
-    """
+    5 steps."""
 
     def __init__(self):
         super().__init__(batch_size=torch.Size([3]))
         self.observation_spec = Composite(observation=Unbounded((3, 2)), shape=(3,))
         self.action_spec = Bounded(-1.0, 1.0, (3, 2))
         self.reward_spec = Unbounded((3, 1))
-        self._longest = torch.tensor([3, 4, 5])
+        self.place = torch.zeros(3, 2)
+        self.time = torch.zeros(3)
 
     def _reset(self, tensordict=None):
         reset = torch.ones(3, dtype=torch.bool)
         if tensordict is not None and "_reset" in tensordict:
             reset = tensordict["_reset"].view(3)
-        first = torch.arange(6.0).view(3, 2)
-        if reset.all():
-            self.place = first
-            self.time = torch.zeros(3, dtype=torch.long)
-        self.place = torch.where(reset.unsqueeze(-1), first, self.place)
+        self.place = torch.where(reset.unsqueeze(-1), torch.arange(6.0).view(3, 2), self.place)
         self.time = self.time.masked_fill(reset, 0)
         return TensorDict({"observation": self.place}, [3])
 
     def _step(self, tensordict):
-        place = 0.9 * self.place + tensordict["action"]
-        self.place = place.detach()
+        self.place = 0.9 * self.place + tensordict["action"]
         self.time = self.time + 1
-        done = (self.time >= self._longest).unsqueeze(-1)
-        flags = {"done": done, "terminated": done}
-        return TensorDict(
-            {
-                "observation": place,
-                "reward": place.sum(-1, keepdim=True),
-                **flags,
-            },
-            [3],
-        )
+        done = (self.time >= torch.tensor([3, 4, 5])).unsqueeze(-1)
+        outputs = {
+            "observation": self.place,
+            "reward": self.place.sum(-1, keepdim=True),
+            "done": done,
+            "terminated": done,
+        }
+        return TensorDict(outputs, [3])
 
     def _set_seed(self, seed):
         """The environment has no randomness."""

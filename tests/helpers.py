@@ -44,8 +44,31 @@ SMALLEST_TRAINING = [
 ]
 """Words of the smallest training that makes two updates."""
 
-SQUARE = [[0.0, 0.0], [200.0, 0.0], [200.0, 200.0], [0.0, 200.0]]
+
+def corners(west, south, east, north):
+    """Corners of a rectangle, [x, y] each."""
+    return [[west, south], [east, south], [east, north], [west, north]]
+
+
+def ring(*bounds):
+    """The same, closed."""
+    open_ring = corners(*bounds)
+    return [*open_ring, open_ring[0]]
+
+
+SQUARE = corners(0.0, 0.0, 200.0, 200.0)
 """Corners of a square region of 200 m by 200 m, [x, y] in metres."""
+
+DENTED = [
+    [0, 0],
+    [600, 0],
+    [600, 400],
+    [320, 400],
+    [300, 240],
+    [280, 400],
+    [0, 400],
+]
+"""Corners of a region with a dent, which some straight ways cross."""
 
 
 def usecase(case, **changed):
@@ -312,7 +335,7 @@ def one_uav(**changed):
     (390, 100)."""
     region = RegionConfig(
         kind="vertices",
-        vertices=[[0.0, 0.0], [400.0, 0.0], [400.0, 200.0], [0.0, 200.0]],
+        vertices=corners(0.0, 0.0, 400.0, 200.0),
         initial_conditions=1,
         start_positions=[[60.0, 100.0]],
     )

@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import ring
 
 import damian
 
@@ -51,7 +52,7 @@ INSTEAD = {
     "region.where=[name:north,name:south]": "region.where=name:park",
 }
 """What stands instead of some words: fewer runs, a map that is there, and no Slurm."""
-PARK = [[-4.134, 52.808], [-4.122, 52.808], [-4.122, 52.817], [-4.134, 52.817], [-4.134, 52.808]]
+PARK = ring(-4.134, 52.808, -4.122, 52.817)
 
 
 def commands(text):

@@ -66,11 +66,6 @@ def test_back_updated_rewards_and_ends_are_the_true_ones_wherever_the_message_ha
     for name in ("reward", "terminated"):
         assert after[name][arrived].equal(truth[name][arrived])
     assert not collected[arrived].equal(truth["reward"][arrived])
-    first_end = truth["terminated"][:60].long().cumsum(0)
-    over = (first_end - truth["terminated"][:60].long()) > 0
-    first_episode = steps["step_count"][:60] == torch.arange(60).view(-1, 1, 1)
-    assert over[first_episode].any()
-    assert steps["valid"][:60][first_episode].equal(~over[first_episode])
     printed = re.findall(r"mean error of the (.*): (\S+)", capsys.readouterr().out)
     errors = {name: float(value) for name, value in printed}
     assert errors["reward after back-updating"] < 0.05 * errors["reward as collected"]
@@ -155,18 +150,6 @@ def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew():
     assert learnt["next", "state"].equal(learnt["next", "observation"])
     assert learnt["known"][6:, :, :3].equal(learnt["state"][:-6])  # six steps old, then six actions
     assert learnt["known"][6:, :, -1:].equal((learnt["action"][5:-1] + 2) / 4)
-
-
-@pytest.mark.slow
-def test_ppo_behind_delays_takes_a_few_steps():
-    (mean,) = load("ppo_gymnasium")["train"](delay=2, frames=1000)
-    assert 9 < mean < 60
-
-
-@pytest.mark.slow
-def test_multi_agent_ppo_behind_delays_takes_a_few_steps():
-    pytest.importorskip("vmas")
-    assert len(load("ppo_vmas")["train"](batches=1)) == 1
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ Run by `make test-site`.
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from urllib.parse import unquote, urlsplit
 
 import pytest
 from chromium import chromium, problems, resize
@@ -29,12 +28,9 @@ return {
   broken: [...document.images].filter((each) => !each.naturalWidth).map((each) => each.src),
   wide: [...wide.map((each) => each.outerHTML.slice(0, 100)), document.documentElement.scrollWidth]
     .filter((each) => typeof each === 'string' || each > innerWidth),
-  links: [...document.links].map((each) => each.href),
-  ids: [...document.querySelectorAll('[id]')].map((each) => each.id),
 }
 """
-"""What is wrong on a page, and what links may lead to. What lies in a box that scrolls is not
-wide."""
+"""What is wrong on a page; what lies in a box that scrolls is not wide."""
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -46,7 +42,7 @@ class Quiet(SimpleHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The folder of the site, and where it is served."""
+    """The folder of the site, and where it is served; that its links lead somewhere: test_site.py."""
     folder = build(tmp_path_factory.mktemp("site"))
     server = ThreadingHTTPServer(("localhost", 0), partial(Quiet, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -82,24 +78,3 @@ def seen(site):
 def test_no_page_has_a_broken_picture_a_part_wider_than_the_screen_or_an_error(seen, problem):
     assert len(seen) > 150
     assert {place: page[problem] for place, page in seen.items() if page[problem]} == {}
-
-
-def test_every_link_inside_the_site_leads_somewhere(site, seen):
-    folder, address = site
-    nowhere = set()
-    for (name, _), page in seen.items():
-        for link in page["links"]:
-            if not link.startswith(address):
-                continue
-            parts = urlsplit(link)
-            path = unquote(parts.path).removeprefix("/")
-            part = unquote(parts.fragment)
-            target = seen.get((path, 1440))
-            there = (
-                part in {"", "__codelineno", *target["ids"]}
-                if target
-                else (folder / path).is_file()
-            )
-            if not there:
-                nowhere.add((name, link.removeprefix(address)))
-    assert nowhere == set()

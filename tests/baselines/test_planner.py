@@ -72,9 +72,9 @@ def test_the_planner_returns_more_than_the_script_and_tells_its_time():
 def test_without_news_a_late_plan_is_the_undelayed_one():
     chosen = []
     for words in ([], ["delay.obs=1..3", "observation.own=true", "observation.forward=script"]):
-        env = made(*words, worlds=3)
+        env = made(*words)
         env.assume(assumed_script(env))
-        rollout = env.rollout(8, planner_policy(env, 2), break_when_any_done=False)
+        rollout = env.rollout(5, planner_policy(env, 2), break_when_any_done=False)
         chosen.append(rollout[keys.ACTION])
     assert chosen[0].equal(chosen[1])
 
@@ -82,7 +82,7 @@ def test_without_news_a_late_plan_is_the_undelayed_one():
 def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same():
     env = make_env(compose_scenario("scenario=requests"), 2, seed=5, extras=["message"])
     planner = Planner(env.uav_env, env.uav_env.simulation, 6, 2)
-    env.rollout(5, break_when_any_done=False)
+    env.rollout(3, break_when_any_done=False)
     state = env.uav_env.state
     joint = planner.choice(state)
     first = planner.values(state, joint, 0)
@@ -96,7 +96,10 @@ def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same(
 
 @pytest.mark.parametrize(
     ("word", "error"),
-    [("delay.obs=2", "observation.forward=script"), ("actions=continuous", "needs discrete")],
+    [
+        ("delay.obs=2", "observation.forward=script"),
+        ("actions=continuous", "needs discrete"),
+    ],
 )
 def test_what_it_cannot_plan_is_refused(word, error):
     with pytest.raises(InputError, match=error):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import both_kinds, both_motions, everything, sent_messages, walking
+from helpers import both_kinds, both_motions, corners, everything, sent_messages, walking
 
 from damian import DelayConfig, ScenarioConfig, keys, make_env
 from damian.baselines.random import random_policy
@@ -16,7 +16,6 @@ from damian.server.features.search import BLUR_M, RECENT, TRUST, likely_places
 from damian.world.config import RegionConfig, SourceConfig
 from damian.world.landing import ActionConfig, action_table, displacement
 
-FIELD = [[0.0, 0.0], [400.0, 0.0], [400.0, 400.0], [0.0, 400.0]]
 STARTS = [[50.0, 50.0], [200.0, 200.0], [360.0, 260.0]]
 FINE = ActionConfig(distances=[50.0 * n for n in range(7)], headings=[22.5 * n for n in range(16)])
 CONTINUOUS = ActionConfig(kind="continuous", distances=[300.0])
@@ -29,7 +28,7 @@ def field(**changed):
     first."""
     region = RegionConfig(
         kind="vertices",
-        vertices=FIELD,
+        vertices=corners(0.0, 0.0, 400.0, 400.0),
         lattice_step=32.0,
         initial_conditions=4,
         start_positions=STARTS,

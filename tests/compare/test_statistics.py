@@ -17,7 +17,14 @@ from damian.compare.statistics import (
 
 
 @pytest.mark.parametrize(
-    ("naive", "defined"), [(8.0, True), (9.0, True), (9.01, False), (10.0, False), (11.0, False)]
+    ("naive", "defined"),
+    [
+        (8.0, True),
+        (9.0, True),
+        (9.01, False),
+        (10.0, False),
+        (11.0, False),
+    ],
 )
 def test_recovery_is_nan_if_the_delay_costs_less_than_a_tenth(naive, defined):
     scores = np.array([[10.0], [0.0], [naive], [9.5]])
@@ -80,7 +87,14 @@ def test_the_probability_of_improvement_is_that_of_rliable(n_seeds, improvement)
     )
 
 
-@pytest.mark.parametrize(("n_nans", "ends"), [(0, (2, 97)), (1, (1, 98)), (10, (-np.inf, np.inf))])
+@pytest.mark.parametrize(
+    ("n_nans", "ends"),
+    [
+        (0, (2, 97)),
+        (1, (1, 98)),
+        (10, (-np.inf, np.inf)),
+    ],
+)
 def test_a_nan_counts_at_both_ends_of_an_interval(n_nans, ends):
     values = np.arange(100.0)
     values[40 : 40 + n_nans] = np.nan

@@ -111,7 +111,13 @@ def test_numbered_reports_of_one_second_are_different_messages_also_without_plac
     assert trace_rows(fitted)[7] == "lost"
 
 
-@pytest.mark.parametrize(("shift", "said"), [(-2.0, "1.5 s before"), (3600.0, "3.6e+03 s after")])
+@pytest.mark.parametrize(
+    ("shift", "said"),
+    [
+        (-2.0, "1.5 s before"),
+        (3600.0, "3.6e+03 s after"),
+    ],
+)
 def test_clocks_that_differ_are_named_before_anything_is_written(
     log, tmp_path, capsys, shift, said
 ):

@@ -58,7 +58,11 @@ def context_of(uniform, dt=1.0, **entries):
 
 
 @pytest.mark.parametrize(
-    ("loses", "expected"), [(True, [6, 5, 6, 3, 5, 0]), (False, [0, 5, 0, 3, 5, 0])]
+    ("loses", "expected"),
+    [
+        (True, [6, 5, 6, 3, 5, 0]),
+        (False, [0, 5, 0, 3, 5, 0]),
+    ],
 )
 def test_delays_are_rounded_up_and_cut_and_negative_ones_are_lost(loses, expected):
     values = torch.tensor([math.nan, math.inf, -0.5, 2.1, 99.0, 0.0])

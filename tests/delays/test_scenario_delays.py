@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from delay_twin import trace
 from delayed_envs import choices
-from helpers import all_same, play, square
+from helpers import all_same, play, ring, square
 
 from damian import TableSampler, UavEnv, make_env
 from damian.delays.config import DelayConfig, LinkConfig
@@ -45,9 +45,8 @@ def write_trace(path, delay):
 
 
 def write_region(path, side):
-    places = [
-        [x * side * 1e-5, y * side * 1e-5] for x, y in [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
-    ]
+    degrees = side * 1e-5
+    places = ring(0.0, 0.0, degrees, degrees)
     path.write_text(json.dumps({"type": "Polygon", "coordinates": [places]}))
 
 

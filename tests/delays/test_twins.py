@@ -178,7 +178,11 @@ def options(law):
 
 @pytest.mark.sample(3)
 @pytest.mark.parametrize(
-    ("order", "loss", "sent_key"), [("generation", 0.0, None), ("arrival", 0.25, "message_sent")]
+    ("order", "loss", "sent_key"),
+    [
+        ("generation", 0.0, None),
+        ("arrival", 0.25, "message_sent"),
+    ],
 )
 def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sent_key):
     further = {"loss": loss, "order": order, "sent_key": sent_key, "delay_key": "delay"}
@@ -219,7 +223,12 @@ def test_every_agent_holds_the_message_that_the_twin_holds(law, order, loss, sen
 
 @pytest.mark.sample(3)
 @pytest.mark.parametrize(
-    ("loss", "sent_key", "hold"), [(0.0, None, False), (0.25, "ready", False), (0.25, None, True)]
+    ("loss", "sent_key", "hold"),
+    [
+        (0.0, None, False),
+        (0.25, "ready", False),
+        (0.25, None, True),
+    ],
 )
 def test_every_agent_executes_the_action_that_the_twin_holds(law, loss, sent_key, hold):
     chosen = choices()

@@ -64,7 +64,15 @@ def test_a_triggered_clock_stays_within_its_bounds():
     ]
 
 
-@pytest.mark.parametrize(("spotting_worlds", "period"), [(0, 12), (1, 12), (2, 8), (4, 8)])
+@pytest.mark.parametrize(
+    ("spotting_worlds", "period"),
+    [
+        (0, 12),
+        (1, 12),
+        (2, 8),
+        (4, 8),
+    ],
+)
 def test_the_period_shrinks_if_the_source_is_spotted_in_half_of_the_worlds_or_more(
     spotting_worlds, period
 ):

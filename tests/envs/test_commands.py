@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import shapely
 import torch
-from helpers import both_kinds, both_motions, everything, play, random_actions, square
+from helpers import both_kinds, both_motions, corners, everything, play, random_actions, square
 from torchrl.envs.utils import check_env_specs
 
 from damian import ClockConfig, UavEnv, make_env
@@ -30,9 +30,7 @@ from damian.world.landing import action_table
 ABSOLUTE = ActionConfig(command="absolute")
 LONG = EpisodeConfig(max_steps=1000)
 OBSERVED = (OBSERVATION, GLOBAL_OBSERVATION)
-WIDE = RegionConfig(
-    kind="vertices", vertices=[[0, 0], [600, 0], [600, 600], [0, 600]], lattice_step=40.0
-)
+WIDE = RegionConfig(kind="vertices", vertices=corners(0, 0, 600, 600), lattice_step=40.0)
 
 
 class Scripted(Sampler):
@@ -79,7 +77,11 @@ def test_an_absolute_command_that_arrives_at_once_is_the_relative_one(name, kind
 
 
 @pytest.mark.parametrize(
-    ("motion", "kind"), [("instant", "continuous"), ("polynomial", "discrete")]
+    ("motion", "kind"),
+    [
+        ("instant", "continuous"),
+        ("polynomial", "discrete"),
+    ],
 )
 def test_with_commands_that_arrive_at_once_agents_see_what_they_saw_without(motion, kind):
     shown = []
@@ -113,7 +115,13 @@ def free_actions(env, frame, generator):
 
 
 @pytest.mark.parametrize(
-    ("obs", "act", "own"), [(0, 2, True), (2, 1, False), (1, 3, False), (1, 3, True)]
+    ("obs", "act", "own"),
+    [
+        (0, 2, True),
+        (2, 1, False),
+        (1, 3, False),
+        (1, 3, True),
+    ],
 )
 def test_a_delay_of_held_commands_is_a_longer_delay_of_what_is_observed(obs, act, own):
     names = ["others", "coverage_map"]
@@ -203,7 +211,14 @@ class Twin:
                 self.goal[uav] = next(free, self.goal[uav])
 
 
-@pytest.mark.parametrize(("hold", "period"), [("none", 1), ("none", 3), ("max", 1)])
+@pytest.mark.parametrize(
+    ("hold", "period"),
+    [
+        ("none", 1),
+        ("none", 3),
+        ("max", 1),
+    ],
+)
 @pytest.mark.parametrize("delays", [[0, 2, 1, 2, 0], [1, 2, 3, 0, 2, 3, 3, 1]])
 def test_uavs_fly_where_commands_lead_that_come_late_or_overtake_or_are_lost(delays, hold, period):
     law = Scripted(delays)
@@ -262,7 +277,13 @@ def test_the_specs_are_right_with_absolute_commands(motion, kind):
     check_env_specs(make_env(scenario, 2, extras=["message"]), seed=0, break_when_any_done="both")
 
 
-@pytest.mark.parametrize(("motion", "step"), [("instant", 4), ("polynomial", 0)])
+@pytest.mark.parametrize(
+    ("motion", "step"),
+    [
+        ("instant", 4),
+        ("polynomial", 0),
+    ],
+)
 def test_nobody_sees_what_another_uav_has_sent_before_a_message_tells_of_it(motion, step):
     late = DelayConfig(obs=1, act=2)
     near = replace(ABSOLUTE, distances=[0.0, 40.0])
@@ -355,7 +376,14 @@ def test_agents_see_their_latest_commands_and_which_are_known_to_be_executed(own
     assert fates == {0.0, 1.0}
 
 
-@pytest.mark.parametrize(("obs", "act"), [(0, 2), (2, 3), (3, 2)])
+@pytest.mark.parametrize(
+    ("obs", "act"),
+    [
+        (0, 2),
+        (2, 3),
+        (3, 2),
+    ],
+)
 def test_others_tell_where_their_commands_under_way_lead_and_by_when(obs, act):
     delay = DelayConfig(obs=obs, act="0..2" if act == 2 else act, act_hold="max")
     observation = ObservationConfig(["place"], own=True, stops=5, intent=True)

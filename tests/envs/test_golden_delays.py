@@ -141,7 +141,13 @@ def held_by_server(steps):
     return held, torch.tensor([step.number for step in steps])
 
 
-@pytest.mark.parametrize(("case", "compared", "late_resets"), [(1, 181, 2), (2, 621, 9)])
+@pytest.mark.parametrize(
+    ("case", "compared", "late_resets"),
+    [
+        (1, 181, 2),
+        (2, 621, 9),
+    ],
+)
 def test_the_server_holds_the_recorded_messages_but_for_late_ones_of_the_reset(
     case, compared, late_resets
 ):

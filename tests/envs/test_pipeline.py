@@ -77,7 +77,7 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
 # Clocks.
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(5)
 @pytest.mark.parametrize(
     "act",
     [
@@ -90,7 +90,12 @@ def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
     ],
 )
 @pytest.mark.parametrize(
-    ("motion", "agents"), [("instant", "3s"), ("polynomial", "1s"), ("polynomial", "3s")]
+    ("motion", "agents"),
+    [
+        ("instant", "3s"),
+        ("polynomial", "1s"),
+        ("polynomial", "3s"),
+    ],
 )
 def test_an_action_chosen_while_not_ready_is_never_executed(act, motion, agents):
     delay = DelayConfig(obs=1, act=act, history=2)

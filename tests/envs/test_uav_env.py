@@ -13,23 +13,33 @@ from helpers import (
     same,
 )
 from torchrl.envs.utils import check_env_specs
+from twin import GLOBAL, LOCAL
 
 from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.keys import ACTION
+from damian.server.config import ObservationConfig
 from damian.world.config import ActionConfig
 
 # Specs and TorchRL's rules.
 
 
-@both_motions
-def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
+@pytest.mark.parametrize(
+    ("motion", "belief"),
+    [
+        ("instant", []),
+        ("polynomial", ["belief_moments"]),
+    ],
+)
+def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion, belief):
     delay = DelayConfig(
         obs={"law": "burst"},
         act="0..2",
         rew=1,
         history=2,
     )
-    scenario = everything(motion, delay=delay)
+    observation = ObservationConfig(LOCAL, GLOBAL, timeline=3, own=True, belief=belief)
+    scenario = everything(motion, delay=delay, observation=observation)
+    rounding = 1e-6 if belief else 0.0  # sums over cells in another order
     skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
     td = skipping.reset()
     other = steady.reset()
@@ -39,7 +49,7 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion):
         for world in (0, 1):  # first the one, then the other
             mask = torch.arange(2) == world
             stepped = skipping.step(td.clone().set(ACTION, action).set("_step", mask))["next"]
-            assert same(stepped[world], after[world])
+            assert same(stepped[world], after[world], rounding)
             assert same(
                 stepped[1 - world].select(*td.keys(True, True), strict=False), td[1 - world]
             )
@@ -65,9 +75,6 @@ def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, r
         ),
     )
     check_env_specs(UavEnv(config, num_worlds=2), seed=0, break_when_any_done="both")
-
-
-# Worlds and seeds.
 
 
 # Worlds and seeds.

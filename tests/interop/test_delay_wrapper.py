@@ -8,7 +8,6 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Sequence, Text, Tuple
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import SyncVectorEnv
 from pettingzoo import ParallelEnv
 from pettingzoo.test import parallel_api_test
 from torchrl.envs import Compose, TransformedEnv
@@ -240,100 +239,36 @@ class Overwrites(gymnasium.Env):
         return {"gps": self.count, "camera": self.count}, self.paid, False, False, {}
 
 
-class OneOverwrites(ParallelEnv):
-    """The same for PettingZoo, of one agent."""
-
-    metadata, agents, possible_agents = {"name": "one"}, ["a"], ["a"]
-
-    def __init__(self):
-        self.inner = Overwrites()
-
-    def action_space(self, agent):
-        return LINE
-
-    def observation_space(self, agent):
-        return Overwrites.observation_space
-
-    def reset(self, seed=None, options=None):
-        return tuple({"a": each} for each in self.inner.reset())
-
-    def step(self, actions):
-        return tuple({"a": each} for each in self.inner.step(actions["a"]))
-
-
-@pytest.mark.parametrize("kind", ["whole", "in parts", "agent"])
-def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(kind):
+@pytest.mark.parametrize("parts", [False, True])
+def test_nothing_that_is_kept_changes_when_others_write_over_their_arrays(parts):
+    inner = Overwrites()
     default = np.full(1, 4, np.float32)
-    late = {
-        "observation": 2,
-        "action": 2,
-        "reward": 3,
-        "history": 3,
-        "timeline": 4,
-        "default": default,
-    }
-    if kind == "agent":
-        inner = OneOverwrites()
-        env = DelayParallelWrapper(inner, **late | {"default": {"a": default}})
-        inner = inner.inner
-    else:
-        inner = Overwrites()
-        env = DelayWrapper(
-            inner, **late | ({"observation": {"camera": 2}} if kind == "in parts" else {})
-        )
-    of_agent = {"agent": lambda each: each["a"]}.get(kind, lambda each: each)
-    default[:], action, rows = 9, np.zeros(1, np.float32), []
-    told = of_agent(env.reset(seed=0)[0])
+    late = {"observation": {"camera": 2} if parts else 2, "action": 2, "reward": 3}
+    env = DelayWrapper(inner, **late, history=3, timeline=4, default=default)
+    default[:] = 9
+    action = np.zeros(1, np.float32)
+    told, _ = env.reset(seed=0)
+    seen = []
+    rewards = []
+    ages = []
     for step in range(1, 7):
         for each in told.values():
             each[...] = -9
         action[...] = step
-        found = env.step({"a": action} if kind == "agent" else action)
-        told, reward, info = (of_agent(found[i]) for i in (0, 1, -1))
-        rows.append((copy.deepcopy(told), float(np.max(reward)), info))
-    seen, rewards, infos = zip(*rows, strict=True)
+        told, reward, *_, info = env.step(action)
+        seen.append(copy.deepcopy(told))
+        rewards.append(float(reward))
+        ages.append(info["age"]["camera"] if parts else info["age"])
     held = [0, 0, 1, 2, 3, 4]
     now = [1, 2, 3, 4, 5, 6]
     assert [each["camera"].item() for each in seen] == held
-    assert [each["gps"].item() for each in seen] == (now if kind == "in parts" else held)
-    assert seen[-1]["timeline"][2:, -2 if kind == "in parts" else 0].tolist() == [4, 3]
+    assert [each["gps"].item() for each in seen] == (now if parts else held)
+    assert seen[-1]["timeline"][2:, -2 if parts else 0].tolist() == [4, 3]
     of_actions = [(each["action_history"] * 198 - 99).round().tolist() for each in seen]
     assert of_actions == [[4, 4, 1], [4, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5], [4, 5, 6]]
     assert inner.executed == [4, 4, 1, 2, 3, 4]
-    assert list(rewards) == [0, 0, 0, 1, 2, 3]
-    ages = [info["age"]["camera"] if kind == "in parts" else info["age"] for info in infos]
+    assert rewards == [0, 0, 0, 1, 2, 3]
     assert [np.max(age) for age in ages] == [1, 2, 2, 2, 2, 2]
-
-
-DRAWN = {"observation": Uniform(1, 4), "action": 1, "reward": Uniform(0, 3), "loss": 0.2}
-
-
-def test_wrapped_environments_in_a_vector_are_those_alone():
-    def made() -> gymnasium.Env:
-        env = gymnasium.make("CartPole-v1", max_episode_steps=8)
-        return DelayWrapper(env, **DRAWN, history=2, timeline=3)
-
-    vector = SyncVectorEnv([made] * 3)
-    singles = [made() for _ in range(3)]
-    observations, infos = vector.reset(seed=4)
-    firsts = [env.reset(seed=4 + i)[0] for i, env in enumerate(singles)]
-    vector.action_space.seed(0)
-    done = [False] * 3
-    for _ in range(30):
-        assert vector.observation_space.contains(observations)
-        for i, first in enumerate(firsts):
-            assert data_equivalence({key: each[i] for key, each in observations.items()}, first)
-        actions = vector.action_space.sample()
-        observations, rewards, *_, infos = vector.step(actions)
-        for i, env in enumerate(singles):
-            if done[i]:  # the new episode begins in the step after the last one
-                (firsts[i], info), reward, done[i] = env.reset(), 0.0, False
-            else:
-                firsts[i], reward, terminated, truncated, info = env.step(actions[i])
-                done[i] = terminated or truncated
-                assert infos["received"][i] == info["received"]
-            assert rewards[i] == reward
-            assert infos["age"][i] == info["age"]
 
 
 def test_what_a_user_can_get_wrong_is_said_in_one_line():
@@ -475,51 +410,9 @@ class Relay(ParallelEnv):
         )
 
 
-def test_agents_that_die_stay_dead_are_paid_at_their_end_and_others_may_join():
-    env = DelayParallelWrapper(
-        Relay(),
-        {
-            "a": 1,
-            "b": 4,
-            "c": 2,
-        },
-        {"a": 2},
-        {"b": 3, "a": 1},
-        timeline=4,
-    )
-    for _ in range(2):  # nothing of an episode reaches the next one
-        told, infos = env.reset()
-        assert {agent: each["observation"].tolist() for agent, each in told.items()} == {
-            "a": [0, 0],
-            "b": [0, 0],
-        }
-        rows = []
-        while env.agents:
-            actions = dict.fromkeys(env.agents, env.unwrapped.t + 1)
-            told, rewards, *_, infos = env.step(actions)
-            assert told.keys() == rewards.keys() == infos.keys()
-            rows.append((told, rewards))
-            assert infos["a"]["t"] == env.unwrapped.t
-        told = [row[0] for row in rows]
-        seen = {
-            uav: [each[uav]["observation"].tolist() for each in told if uav in each]
-            for uav in "abc"
-        }
-        assert seen["a"] == [[0, 0], [1, 0], [2, 0], [3, 1], [4, 2], [5, 3], [6, 4], [7, 5], [8, 6]]
-        assert seen["b"] == [[0, 0], [0, 0], [0, 0], [0, 0], [1, 1]]
-        assert (
-            seen["c"]
-            == [[3, -1], [3, -1], [3, -1], [4, 4], [5, 5], [6, 6], [7, 7]][: len(seen["c"])]
-        )
-        assert [row[1].get("b") for row in rows] == [0, 0, 0, 10, 111100, None, None, None, None]
-        assert [row[1]["a"] for row in rows] == [0, *(10**t for t in range(1, 8)), 10**8 + 10**9]
-        assert rows[4][0]["c"]["timeline"][:, -1].tolist() == [0, 0, 1, 0]
-        assert rows[4][0]["a"]["timeline"][:, 0].tolist() == [0, 4, 3, 2]
-
-
 @pytest.mark.parametrize("tells", [True, False])
-@pytest.mark.parametrize("again", [6, 8])
-def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
+@pytest.mark.parametrize("again", [None, 6, 8])
+def test_agents_that_die_or_come_again_are_told_and_paid_as_in_the_transforms(again, tells):
     observation, action, reward = (("agents", each) for each in ("observation", "action", "reward"))
     delays = Compose(
         ActionDelay(1, action),
@@ -548,8 +441,10 @@ def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
         chosen = env.unwrapped.t + 1
         now["agents", "action"] = torch.full((2,), chosen)
         now = reference.step(now)["next"]
-        told, rewards, *_ = env.step(dict.fromkeys(env.agents, chosen))
+        told, rewards, *_, infos = env.step(dict.fromkeys(env.agents, chosen))
+        assert told.keys() == rewards.keys() == infos.keys()
         for agent in told:
+            assert infos[agent]["t"] == chosen
             i = env.possible_agents.index(agent)
             for key in ("held", "age", "timeline"):
                 assert np.array_equal(told[agent][WRITTEN[key]], now["agents", key][i].numpy()), key
@@ -562,6 +457,16 @@ def test_who_comes_again_begins_anew_as_in_the_transforms(again, tells):
             )
             assert now["agents", "reward"][i].item() == pytest.approx(expected, rel=1e-5)
         earned |= rewards
+
+
+def test_an_agent_that_joins_late_begins_with_what_it_sees_then():
+    env = DelayParallelWrapper(Relay(), {"c": 2})
+    env.reset()
+    seen = []
+    while env.agents:
+        told, *_ = env.step(dict.fromkeys(env.agents, env.unwrapped.t + 1))
+        seen.append(told["c"].tolist() if "c" in told else None)
+    assert seen == [None, None, *[[3, -1]] * 3, [4, 4], [5, 5], [6, 6], [7, 7]]
 
 
 def test_only_those_who_are_there_send():

@@ -49,12 +49,13 @@ def learnt(kind="discrete", steps=40):
     return learner, flight, drawn[-1]
 
 
-def rows(before, after, state):
+def rows(steps):
     """What an update reads of each decision: the actor's observation, and a state, before and after
     it."""
-    return torch.cat(
-        [agents[key] for agents in (before, after) for key in ("observation", state)], -1
-    )
+    before = steps["agents"]
+    after = steps["next", "agents"]
+    read = ("observation", "global_observation")
+    return torch.cat([each[key] for each in (before, after) for key in read], -1)
 
 
 @both_kinds
@@ -62,30 +63,14 @@ def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_fr
     kind,
 ):
     _, flight, drawn = learnt(kind)
-    found = rows(drawn["agents"], drawn["next", "agents"], "global_observation")
-    expected = []
-    late = []
-    for world in range(4):
-        for step in range(40 - LONGEST):  # the messages of later ones may still be on their way
-            for agent in range(3):
-                place = world, step, agent
-                before = flight["agents"][place]
-                after = flight["next", "agents"][place]
-                twin = [
-                    torch.cat(
-                        [each["observation"], each["privileged_observation"][:-2]]
-                    )  # no source
-                    for each in (before, after)
-                ]
-                expected.append(torch.cat(twin))
-                late.append(rows(before, after, "global_observation"))
-    differences = (found.unsqueeze(1) - torch.stack(expected)).abs().amax(-1)
-    assert (
-        differences.amin(1).max() < 1e-5
-    )  # every drawn transition has undelayed states of a settled step
-    assert (
-        torch.stack(late) - torch.stack(expected)
-    ).abs().max() > 0.1  # as collected, they were late
+    late = flight[:, : 40 - LONGEST]  # the messages of later steps may still be on their way
+    undelayed = late.clone()
+    for agents in (undelayed["agents"], undelayed["next", "agents"]):
+        agents["global_observation"] = agents["privileged_observation"][..., :-2]  # no source
+    expected = rows(undelayed).flatten(0, 2)
+    differences = (rows(drawn).unsqueeze(1) - expected).abs().amax(-1)
+    assert differences.amin(1).max() < 1e-5, "each drawn transition is one of them"
+    assert (rows(late).flatten(0, 2) - expected).abs().max() > 0.1, "as collected, they were late"
 
 
 def test_bpql_waits_for_states_and_refuses_to_learn_without_back_updating():

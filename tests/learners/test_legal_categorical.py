@@ -24,7 +24,13 @@ def both(shape, masked):
     return LegalCategorical(logits), Categorical(logits=logits), logits
 
 
-every_shape = pytest.mark.parametrize("shape", [(50,), (5, 4, 3)])
+every_shape = pytest.mark.parametrize(
+    "shape",
+    [
+        (50,),
+        (5, 4, 3),
+    ],
+)
 masked_or_not = pytest.mark.parametrize("masked", [True, False])
 
 

@@ -183,7 +183,12 @@ def test_values_are_those_of_two_passes_over_the_batch(case):
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("case", "advantage"),
-    [("discrete", True), ("discrete", False), ("shared value", True), ("recurrent", True)],
+    [
+        ("discrete", True),
+        ("discrete", False),
+        ("shared value", True),
+        ("recurrent", True),
+    ],
 )
 def test_rewards_of_any_scale_teach_the_same_if_values_are_normalised(case, advantage):
     env, _, batch = flown(case)

@@ -24,7 +24,11 @@ ROUNDING = 3e-5
 
 both_kinds_and_motions = pytest.mark.parametrize(
     ("kind", "motion"),
-    [("discrete", "instant"), ("continuous", "instant"), ("discrete", "polynomial")],
+    [
+        ("discrete", "instant"),
+        ("continuous", "instant"),
+        ("discrete", "polynomial"),
+    ],
 )
 
 

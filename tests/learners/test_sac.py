@@ -1,6 +1,5 @@
 """SAC: its targets, its temperature, and the decisions that it draws from the replay buffer."""
 
-import itertools
 import math
 
 import pytest
@@ -12,9 +11,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss
 
 from damian import UavEnv, make_env
-from damian.keys import OBSERVATION, PRIVILEGED_OBSERVATION
+from damian.keys import OBSERVATION, PRIVILEGED_OBSERVATION, READY
 from damian.learners.sac import Sac, SacConfig
 from damian.models.config import MlpConfig
+from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
 from damian.server.config import EpisodeConfig
 from damian.world.config import ActionConfig
@@ -92,39 +92,6 @@ class RecordingSac(Sac):
         return super().update(drawn)
 
 
-def decision(flight, world, begin, agent, last):
-    """Transition of a UAV over a decision at step ``begin``, as a row of numbers (``ROW``).
-
-    None if the UAV was not ready, or if the outcome is not known by the last step.
-    """
-    agents = flight["agents"]
-    next_agents = flight["next", "agents"]
-    ends = flight["next"]
-    if not agents["ready"][world, begin, agent]:
-        return None
-    earned = 0.0
-    for t in range(begin, last + 1):
-        earned += 0.8 ** (t - begin) * next_agents["reward"][world, t, agent]
-        ready = next_agents["ready"][world, t, agent]
-        over = ends["done"][world, t]
-        if ready | over:
-            break
-    else:
-        return None
-    terminated = ends["terminated"][world, t]
-    if not (ready | terminated):
-        return None
-    observations = [
-        entries[key][world, step, agent]
-        for entries, step in ((agents, begin), (next_agents, t))
-        for key in ("observation", PRIVILEGED_OBSERVATION[-1])
-    ]
-    action = agents["action"][world, begin, agent].view(1)
-    return torch.cat(
-        [*observations, action, earned, over, terminated, torch.tensor([t - begin + 1])]
-    )
-
-
 OBSERVED = [OBSERVATION, PRIVILEGED_OBSERVATION]
 ROW = [
     *OBSERVED,
@@ -133,6 +100,11 @@ ROW = [
     ("next", "agents", "reward"),
 ]
 ROW += [("next", "done"), ("next", "terminated"), "steps_to_next_obs"]
+
+
+def rows(batch):
+    """Transitions as rows of numbers."""
+    return torch.cat([batch[key].view(len(batch), -1) for key in ROW], -1)
 
 
 def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_holds():
@@ -151,13 +123,15 @@ def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_ho
         learner.drawn = ()
         learner.learn(part)
     assert [len(drawn) for drawn in learner.drawn] == [600, 600]
-    candidates = itertools.product(range(4), range(16, 37), range(3))  # world, first step, agent
-    rows = (decision(flight, *candidate, last=36) for candidate in candidates)
-    expected = torch.stack([row for row in rows if row is not None])
+    settled = flight[:, 16:37].transpose(0, 1)  # of those that the buffer still holds
+    after = settled["next"]
+    ends = (after[name].squeeze(-1) for name in ("done", "terminated"))
+    decisions = find_decisions(settled[READY], after[READY], *ends)
+    observed = [key[-1] for key in OBSERVED]
+    expected = rows(transitions(settled, torch.arange(21), decisions, 0.8, observed, 0.0))
     assert 0 < expected[:, -2].sum() < expected[:, -3].sum() < len(expected)  # terminated, done
-    drawn = torch.cat(learner.drawn)
-    drawn_rows = torch.cat([drawn[key].view(len(drawn), -1) for key in ROW], -1)
-    difference = (drawn_rows.unsqueeze(1) - expected).abs().amax(-1)
+    drawn = rows(torch.cat(learner.drawn))
+    difference = (drawn.unsqueeze(1) - expected).abs().amax(-1)
     assert difference.amin(1).max() < 1e-5  # every drawn decision is expected
     assert difference.amin(0).max() < 1e-5  # every expected decision is drawn
 

@@ -46,7 +46,13 @@ def test_a_run_folder_holds_configuration_episode_film_and_figure(fly, capsys):
         assert film.size == (720, 690)
 
 
-@pytest.mark.parametrize(("motion", "crosses"), [("instant", True), ("polynomial", False)])
+@pytest.mark.parametrize(
+    ("motion", "crosses"),
+    [
+        ("instant", True),
+        ("polynomial", False),
+    ],
+)
 def test_a_note_says_that_instant_ways_cross_no_fly_zones(fly, capsys, motion, crosses):
     fly("region.zones=1", "episode.max_steps=2", f"motion={motion}", *FLYING[1:])
     assert (

@@ -15,7 +15,6 @@ from helpers import (
     random_actions,
     square,
 )
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from twin import GLOBAL, LOCAL
 
 from damian import ClockConfig, DelayConfig, make_env
@@ -96,9 +95,3 @@ def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(lear
     env = learning_env(config)
     actor = make_learner(config, env, replay_buffer(config, env)).actor
     assert PRIVILEGED not in actor.in_keys
-    td = env.reset()
-    other = td.clone()
-    other[PRIVILEGED] = -td[PRIVILEGED]
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        actions = [actor(each)["agents", "action"] for each in (td, other)]
-    assert actions[0].equal(actions[1])

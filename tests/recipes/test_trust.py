@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from helpers import SMALLEST_TRAINING
+from helpers import SMALLEST_TRAINING, ring
 
 import damian
 from damian.common.errors import InputError
@@ -208,9 +208,8 @@ def test_what_the_person_who_starts_the_program_names_or_trusts_is_imported(stor
 
 
 def test_a_value_with_a_colon_is_no_name(store):
-    corners = [[8, 45], [8.01, 45], [8.01, 45.008], [8, 45.008], [8, 45]]
     park = {"type": "Feature", "properties": {"name": "park"}}
-    park["geometry"] = {"type": "Polygon", "coordinates": [corners]}
+    park["geometry"] = {"type": "Polygon", "coordinates": [ring(8, 45, 8.01, 45.008)]}
     Path("park.geojson").write_text(json.dumps(park), "utf-8")
     store("region", {"kind": "geojson", "path": "park.geojson", "where": "name:park"})
     _, env = damian.load("run")

@@ -69,7 +69,14 @@ def check_others(rows, ways):
     assert not rows[len(ways) :].any()
 
 
-@pytest.mark.parametrize(("agents", "motion"), [(1, "instant"), (3, "instant"), (7, "polynomial")])
+@pytest.mark.parametrize(
+    ("agents", "motion"),
+    [
+        (1, "instant"),
+        (3, "instant"),
+        (7, "polynomial"),
+    ],
+)
 @pytest.mark.parametrize("own", [False, True])
 def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
     local = ["place", "time_left", "number"]

@@ -58,7 +58,13 @@ def test_rewards_and_beliefs_are_those_of_the_rollout_after_each_step(flown):
         assert episode.perceived_return == pytest.approx(reward.mean(-1).sum())
 
 
-@pytest.mark.parametrize(("weight", "n_sources"), [(0.0, 0), (1.0, 1)])
+@pytest.mark.parametrize(
+    ("weight", "n_sources"),
+    [
+        (0.0, 0),
+        (1.0, 1),
+    ],
+)
 def test_an_episode_of_a_task_without_a_source_has_none(weight, n_sources, tmp_path):
     scenario = ScenarioConfig(reward=RewardConfig(coverage=1.0, spotted=weight))
     env = make_env(scenario, 1, seed=5, extras=["message", "state"])

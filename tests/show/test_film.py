@@ -13,7 +13,10 @@ from damian.show.frame import INK, LATENESS, frame_of
 
 @pytest.mark.parametrize(
     ("changes", "title"),
-    [({}, "age of"), ({"battery": np.ones((4, 2)) * [[9], [8], [7], [6]]}, "battery")],
+    [
+        ({}, "age of"),
+        ({"battery": np.ones((4, 2)) * [[9], [8], [7], [6]]}, "battery"),
+    ],
 )
 def test_a_film_has_a_frame_for_each_instant_that_differs(tmp_path, changes, title):
     save_film(flight(**changes), tmp_path / "film.gif")
@@ -25,7 +28,14 @@ def test_a_film_has_a_frame_for_each_instant_that_differs(tmp_path, changes, tit
     assert Film(flight(**changes)).charts[1].get_title("left").startswith(title)
 
 
-@pytest.mark.parametrize(("changes", "n_marks"), [({}, 2), (NO_SOURCE, 0), (UNKNOWN_SOURCE, 0)])
+@pytest.mark.parametrize(
+    ("changes", "n_marks"),
+    [
+        ({}, 2),
+        (NO_SOURCE, 0),
+        (UNKNOWN_SOURCE, 0),
+    ],
+)
 def test_a_film_tells_of_a_source_only_if_the_task_has_one(changes, n_marks):
     film = Film(flight(**changes))
     film.draw(0)
@@ -41,16 +51,24 @@ def named(film):
     return [artist for artist in film.draw(0) if hasattr(artist, "xyann")]
 
 
-def shows(film, colour):
-    """Whether some pixel of a film has a colour."""
-    return bool((np.abs(film.frame(0) / 255 - to_rgb(colour)).max(-1) < 0.02).any())
+def shows(picture, colour):
+    """Whether some pixel of a picture has a colour."""
+    difference = np.abs(picture / 255 - to_rgb(colour)).max(-1)
+    return bool((difference < 0.02).any())
 
 
-@pytest.mark.parametrize(("shown", "told"), [((), []), (("17", "4"), ["4", "17"])])
+@pytest.mark.parametrize(
+    ("shown", "told"),
+    [
+        ((), []),
+        (("17", "4"), ["4", "17"]),
+    ],
+)
 def test_of_many_uavs_only_those_to_tell_apart_have_names_and_colours(shown, told):
     film = Film(crowd(), shown)
     assert [name.get_text() for name in named(film)] == told
-    colours = [shows(film, colour) for colour in COLOURS[:4]]
+    picture = film.frame(0)
+    colours = [shows(picture, colour) for colour in COLOURS[:4]]
     assert colours == [number < len(told) for number in range(4)]
 
 

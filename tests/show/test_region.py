@@ -9,7 +9,14 @@ from damian.show.region import save_region
 SQUARE = "region.vertices=[[0,0],[1000,0],[1000,500],[0,500]]"
 
 
-@pytest.mark.parametrize(("level_db", "fits"), [(115, False), (135, True), (155, False)])
+@pytest.mark.parametrize(
+    ("level_db", "fits"),
+    [
+        (115, False),
+        (135, True),
+        (155, False),
+    ],
+)
 def test_it_draws_the_region_and_warns_where_footprints_do_not_fit(tmp_path, level_db, fits):
     words = ("scenario=coverage", "region=vertices", SQUARE, f"source.level_db={level_db}")
     told = save_region(UavEnv(compose_scenario(*words), 1).simulation, tmp_path / "region.png")

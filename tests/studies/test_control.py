@@ -20,7 +20,13 @@ def trained(task, bpql):
     return learner
 
 
-@pytest.mark.parametrize(("bpql", "waits"), [(False, 0), (True, DELAY)])
+@pytest.mark.parametrize(
+    ("bpql", "waits"),
+    [
+        (False, 0),
+        (True, DELAY),
+    ],
+)
 def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(bpql, waits):
     learner = trained(Task(shortest=DELAY, longest=DELAY, history=DELAY), bpql)
     learner.buffer.storage.steps["next", *keys.REWARD][:20] = torch.arange(20.0).view(20, 1, 1)

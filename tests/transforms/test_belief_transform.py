@@ -15,7 +15,7 @@ from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.envs.recompute import server_recompute
 from damian.server.belief import build_source_grid
 from damian.server.config import ObservationConfig
-from damian.world.config import MotionConfig
+from damian.world.config import MotionConfig, RegionConfig
 from damian.world.signal_source import footprint_radius
 
 LONGEST = 7
@@ -32,7 +32,7 @@ def tracking(law=PAPER, own=False, **changed):
     )
 
 
-def rollout(env, steps=14):
+def rollout(env, steps=10):
     """Steps [B, T] over the ends of several episodes."""
     return env.rollout(steps, break_when_any_done=False)
 
@@ -53,6 +53,7 @@ def expected(env, data, begin, end, now, viewer=None):
     server = env.server
     found = []
     first = server.messages(data[keys.MESSAGE][begin])
+    region = int(server.region_of(first))
     sent = server.messages(data["next", *keys.MESSAGE])
     flag = data["next", *keys.MESSAGE_SENT]
     delay = data.get(("next", *keys.DELAY), torch.where(flag, 0, -1).unsqueeze(-1)).squeeze(-1)
@@ -60,7 +61,7 @@ def expected(env, data, begin, end, now, viewer=None):
         rows = rows_of(grid, sent, number).where(flag, grid.no_report)
         steps = [(rows[t].tolist(), delay[t].tolist()) for t in range(begin, end + 1)]
         first_rows = rows_of(grid, first, number).tolist()
-        found.append(belief(grid, 0, first_rows, steps, now - begin + 1, viewer))
+        found.append(belief(grid, region, first_rows, steps, now - begin + 1, viewer))
     return torch.tensor(found)
 
 
@@ -109,10 +110,14 @@ SCENARIOS = {
         ),
     ),
     "arrival": replace(tracking(), delay=DelayConfig(obs=PAPER, order="arrival")),
+    "several regions": replace(
+        tracking(own=True),
+        region=RegionConfig(min_area=20_000, max_area=60_000, pool=3, initial_conditions=12),
+        source=walking(emission="per_step", emission_probability=0.6),
+    ),
 }
 
 
-@pytest.mark.sample(2)
 @pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 def test_a_belief_knows_what_has_arrived_and_nothing_else(scenario):
     env = make_env(scenario, 2, extras=["message"])

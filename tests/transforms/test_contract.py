@@ -229,7 +229,7 @@ def some(cases, fast):
     return pytest.mark.parametrize("case", values)
 
 
-@some(AGENTS, fast=["ActionDelay, agents", "ServerNode"])
+@some(AGENTS, fast=["ServerNode"])
 def test_a_transform_works_in_worker_processes(case):
     env = ParallelEnv(2, case.build, mp_start_method="fork")
     try:
@@ -262,7 +262,14 @@ def test_a_copy_made_during_an_episode_continues_like_the_original(case, copied,
 
 @pytest.mark.sample(10)
 @every_case
-@pytest.mark.parametrize(("n_steps", "used"), [(5, True), (5, False), (0, True)])
+@pytest.mark.parametrize(
+    ("n_steps", "used"),
+    [
+        (5, True),
+        (5, False),
+        (0, True),
+    ],
+)
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_loaded_checkpoint_continues_bit_for_bit(case, whole, n_steps, used):
     env = case.build()
@@ -316,8 +323,8 @@ def test_in_the_middle_of_an_episode_no_other_state_is_loaded(case):
 # Graphs.
 
 
-@pytest.mark.sample(8)
-@some(CASES, fast=AGENTS)
+@pytest.mark.slow
+@every_case
 def test_a_step_compiles_into_one_graph_that_does_the_same(case):
     env = case.build()
     twin = case.build()
@@ -491,7 +498,7 @@ def worker_streams(env):
     return found
 
 
-@pytest.mark.parametrize("vector", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize("vector", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
 def test_workers_have_streams_of_their_own_that_follow_from_their_seeds(vector):
     options = {"mp_start_method": "fork"} if vector is ParallelEnv else {}
     found = []

@@ -92,51 +92,40 @@ def test_between_two_ticks_entries_and_actions_are_held_and_no_agent_is_ready(pe
             assert [held[reset][w][n], ready[reset][w][n]] == expected
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-@pytest.mark.parametrize("recorded_key", [None, "ready"])
-def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_key):
-    default = 2
-    chosen = choices()
-    history = ActionHistory(steps, ACTION, default=default, recorded_key=recorded_key)
-    outputs = play(delayed(history), chosen)
-    found = torch.stack([td["agents", "action_history"] for td in outputs])
-    ready = before(outputs, "agents", "ready")
-    done = after(outputs, "done")
-    for w, n in ROWS:
-        recorded = []
-        for t in range(STEPS):
-            recorded += [chosen[t][w, n].item()] * (recorded_key is None or ready[t][w][n])
-            for at in (2 * t + 1, 2 * t + 2):  # after the step, and after a reset
-                latest = [*[default] * steps, *recorded][-steps:]
-                assert found[at, w, n].equal(torch.tensor(latest) / 6)
-                recorded = [] if done[t][w][0] else recorded
+HISTORIES = [
+    (None, None, 1),
+    ("ready", None, 1),
+    (None, "age", 1),
+    ("ready", "age", 1),
+    ("ready", "age", 2),
+]
 
 
-@pytest.mark.sample(2)
-@pytest.mark.parametrize(
-    ("recorded_key", "reflected_after"), [(None, 1), ("ready", 1), ("ready", 2)]
-)
-def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_does_not_reflect(
-    law, recorded_key, reflected_after
+@pytest.mark.sample(3)
+@pytest.mark.parametrize(("recorded_key", "age_key", "reflected_after"), HISTORIES)
+def test_the_history_is_the_end_of_a_list_of_actions_without_those_that_the_observation_reflects(
+    law, recorded_key, age_key, reflected_after
 ):
     default = 2
     chosen = choices()
     late = ObservationDelay(law, [OBSERVATION])
     when = {"recorded_key": recorded_key, "reflected_after": reflected_after}
-    history = ActionHistory(3, ACTION, default=default, age_key="age", **when)
+    history = ActionHistory(3, ACTION, default=default, age_key=age_key, **when)
     outputs = play(delayed(late, history), chosen)
     found = torch.stack([td["agents", "action_history"] for td in outputs])
-    ages = column(outputs, "agents", "age")
+    ages = after(outputs, "agents", "age")
     ready = before(outputs, "agents", "ready")
     done = after(outputs, "done")
     for w, n in ROWS:
         recorded = []
         for t in range(STEPS):
             recorded += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
-            latest = [*[(-STEPS, default)] * 3, *recorded][-3:]
-            since = t + 1 - ages[2 * t + 1][w][n][0]  # when the observation was generated
-            expected = [
-                action if since - at < reflected_after else default for at, action in latest
-            ]
-            assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)
-            recorded = [] if done[t][w][0] else recorded
+            generated = t + 1 - ages[t][w][n][0]
+            for output in (2 * t + 1, 2 * t + 2):  # after the step, and after a reset
+                latest = [*[(-STEPS, default)] * 3, *recorded][-3:]
+                expected = [
+                    default if age_key and generated - at >= reflected_after else action
+                    for at, action in latest
+                ]
+                assert found[output, w, n].equal(torch.tensor(expected) / 6)
+                recorded = [] if done[t][w][0] else recorded

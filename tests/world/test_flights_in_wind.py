@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import both_kinds, clock, play
+from helpers import DENTED, both_kinds, clock, play
 
 from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.common import counter_rng
@@ -23,7 +23,6 @@ from damian.world.config import (
     WindConfig,
 )
 
-DENTED = [[0, 0], [600, 0], [600, 400], [320, 400], [300, 240], [280, 400], [0, 400]]
 SPEED = [8.0, 12.0, 20.0]
 HARDEST = [1.0, 2.0, 4.0]
 LEAST = 2.0
@@ -55,7 +54,13 @@ def through_the_air(way, wind, speed):
     return total, slowest
 
 
-@pytest.mark.parametrize("wind", [(7.0, 250.0), (15.0, 30.0)])
+@pytest.mark.parametrize(
+    "wind",
+    [
+        (7.0, 250.0),
+        (15.0, 30.0),
+    ],
+)
 def test_flights_in_wind_take_the_time_of_their_way_through_the_air(wind):
     speed, whence = wind
     env = UavEnv(replace(WORLD, wind=WindConfig(speed=speed, direction=whence)), 8, seed=1)
@@ -132,7 +137,13 @@ def test_gusts_and_drawn_settings_of_a_world_do_not_depend_on_the_others():
     assert set(seen[:, 1].tolist()) <= {1.0, 2.0, 3.0}
 
 
-@pytest.mark.parametrize(("kind", "belief"), [("instant", True), ("polynomial", False)])
+@pytest.mark.parametrize(
+    ("kind", "belief"),
+    [
+        ("instant", True),
+        ("polynomial", False),
+    ],
+)
 def test_worlds_with_a_drawn_level_are_those_of_this_level(kind, belief):
     levels = [138.0, 142.0, 145.0]
     flying = MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)

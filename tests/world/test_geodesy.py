@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import ring
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -41,7 +42,7 @@ def test_local_metres_within_50_km_survive_the_round_trip_over_degrees(lat, lon,
 
 
 def test_the_centroid_of_an_area_across_the_antimeridian_or_around_the_pole_is_inside():
-    strait = np.array([[179.0, 10], [181, 10], [181, 12], [179, 12], [179, 10]])
+    strait = np.array(ring(179.0, 10.0, 181.0, 12.0))
     shifted = area_centroid([strait - [20, 0]])
     assert area_centroid([strait]) == pytest.approx((shifted[0], -180), abs=1e-9)
     cap = np.array([[0.0, 80], [90, 80], [180, 80], [270, 80], [360, 80]])

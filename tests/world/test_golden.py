@@ -68,7 +68,13 @@ def test_recorded_actions_lead_to_the_recorded_points(case, compared, reasons):
     assert counts == reasons
 
 
-@pytest.mark.parametrize(("case", "n_flags", "after_detection"), [(1, 168, 24), (2, 564, 181)])
+@pytest.mark.parametrize(
+    ("case", "n_flags", "after_detection"),
+    [
+        (1, 168, 24),
+        (2, 564, 181),
+    ],
+)
 def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(
     case, n_flags, after_detection
 ):

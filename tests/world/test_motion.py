@@ -28,14 +28,13 @@ def derivatives(length, time, degree, n=2001):
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c['degree']}-{c['flight_level']}")
-def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(case):
+def test_recorded_flights_have_the_same_positions(case):
     start = {"takeoff": 0.0, "flight": case["T_takeoff"]}
     start["landing"] = case["T_takeoff"] + case["T_flight"]
     rows = case["continuous_samples_phase_t_pos_vel_acc"]
     assert len(rows) == 15
-    expected = torch.tensor([row[2:] for row in rows], dtype=torch.float64)
+    expected = torch.tensor([row[2:5] for row in rows], dtype=torch.float64)
     elapsed = torch.tensor([start[r[0]] + r[1] for r in rows], dtype=torch.float64)
-    elapsed.requires_grad_(True)
     names = ("A", "B", "flight_level", "T_takeoff", "T_flight")
     origin, target, level, *times = (
         torch.tensor([case[name]] * 15, dtype=torch.float64) for name in names
@@ -43,33 +42,19 @@ def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(c
     position, crossed = poses(
         torch.stack([origin, target], -2), level, elapsed, *times, case["degree"]
     )
-    velocity = []
-    acceleration = []
-    for axis in position.unbind(-1):
-        (v,) = torch.autograd.grad(axis.sum(), elapsed, create_graph=True)
-        velocity.append(v)
-        acceleration.append(torch.autograd.grad(v.sum(), elapsed, retain_graph=True)[0])
     torch.testing.assert_close(
-        position.detach(),
-        expected[:, :3],
+        position,
+        expected,
         atol=1e-4,
         rtol=0,
     )
     way = torch.linalg.vector_norm(expected[:, :2] - origin, dim=-1)
     length = torch.linalg.vector_norm(target - origin, dim=-1)
     torch.testing.assert_close(
-        (crossed * length).detach(),
+        crossed * length,
         way,
         atol=1e-4,
         rtol=0,
-    )
-    # Derivatives jump where two phases meet, so they are compared only inside the phases.
-    inside = [i for i in range(15) if i % 5 in (1, 2, 3)]
-    torch.testing.assert_close(
-        torch.stack(velocity, -1)[inside], expected[inside, 3:6], atol=1e-4, rtol=0
-    )
-    torch.testing.assert_close(
-        torch.stack(acceleration, -1)[inside], expected[inside, 6:], atol=1e-4, rtol=0
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import KEEPS_GOING, act, both_motions, clock, fresh, random_actions
+from helpers import DENTED, KEEPS_GOING, act, both_motions, clock, fresh, random_actions
 
 from damian import ScenarioConfig
 from damian.common import counter_rng
@@ -22,7 +22,6 @@ from damian.world.config import (
     RegionConfig,
 )
 
-DENTED = [[0, 0], [600, 0], [600, 400], [320, 400], [300, 240], [280, 400], [0, 400]]
 SPEED = 50.0
 HARDEST = 25.0
 CHANCES = [0.0, 0.3, 1.0, 0.6, 0.6, 0.6]

@@ -4,6 +4,7 @@ ones."""
 import json
 import math
 
+import helpers
 import numpy as np
 import pytest
 import torch
@@ -14,10 +15,8 @@ from damian.world.regions.geodesy import to_latlon
 from damian.world.regions.sources import RegionConfig, regions_of
 from damian.world.simulation import Simulation
 
-SQUARE = RegionConfig(
-    "vertices", vertices=[[0, 0], [200, 0], [200, 200], [0, 200]], initial_conditions=4
-)
-CORNERS = [[8.0, 45.0], [8.003, 45.0], [8.003, 45.002], [8.0, 45.002], [8.0, 45.0]]
+SQUARE = RegionConfig("vertices", vertices=helpers.SQUARE, initial_conditions=4)
+CORNERS = helpers.ring(8.0, 45.0, 8.003, 45.002)
 
 
 def build(region, **settings):

@@ -10,6 +10,7 @@ import pyogrio
 import pyproj
 import pytest
 import shapely
+from helpers import ring
 from shapely.geometry import Polygon
 
 import damian
@@ -57,7 +58,7 @@ def test_a_hole_stays_a_hole_and_heights_are_ignored():
     assert region.polygon.area == pytest.approx(outer_area * 8 / 9, rel=1e-3)
 
 
-RING = [[8.0, 45.0], [8.01, 45.0], [8.01, 45.01], [8.0, 45.01], [8.0, 45.0]]
+RING = ring(8.0, 45.0, 8.01, 45.01)
 POINT = {
     "type": "Feature",
     "properties": {},
@@ -125,12 +126,11 @@ def test_the_coordinate_reference_system_of_geojson_is_obeyed(tmp_path, holder):
 
 @pytest.mark.parametrize("turns", [-1, 0])
 def test_longitudes_of_an_area_across_the_antimeridian_may_go_beyond_180_degrees(tmp_path, turns):
-    corners = [[179.99, -17], [180.01, -17], [180.01, -16.99], [179.99, -16.99]]
-    lon, lat = np.array([*corners, corners[0]]).T
+    lon, lat = np.array(ring(179.99, -17, 180.01, -16.99)).T
     found = []
     for written in (lon + 360 * turns, (lon + 180) % 360 - 180):
-        ring = np.column_stack([written, lat]).tolist()
-        found.append(read_area(_written(tmp_path, "fiji.geojson", _polygon(ring))))
+        outline = np.column_stack([written, lat]).tolist()
+        found.append(read_area(_written(tmp_path, "fiji.geojson", _polygon(outline))))
     beyond, wrapped = found
     assert beyond.polygon.equals_exact(wrapped.polygon, 1e-6)
     assert beyond.origin == pytest.approx(wrapped.origin)
@@ -174,14 +174,14 @@ def test_maps_of_other_kinds_are_read_by_their_suffix(tmp_path, suffix):
 
 
 def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(tmp_path):
-    def fence(ring, inclusion):
+    def fence(outline, inclusion):
         return {
             "inclusion": inclusion,
-            "polygon": [[lat, lon] for lon, lat in ring[:-1]],
+            "polygon": [[lat, lon] for lon, lat in outline[:-1]],
             "version": 1,
         }
 
-    inner = [[8.0, 45.0], [8.005, 45.0], [8.005, 45.01], [8.0, 45.01], [8.0, 45.0]]
+    inner = ring(8.0, 45.0, 8.005, 45.01)
     fences = {"circles": [], "polygons": [fence(inner, False), fence(RING, True)]}
     plan = {"fileType": "Plan", "geoFence": fences}
     whole = read_area(_written(tmp_path, "square.geojson", _polygon(RING))).polygon.area
@@ -251,8 +251,8 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_parts_cut_at_the_antimeridian_are_united(tmp_path):
-    west = [[179.9, 1], [180, 1], [180, 1.1], [179.9, 1.1], [179.9, 1]]
-    east = [[-180, 1], [-179.9, 1], [-179.9, 1.1], [-180, 1.1], [-180, 1]]
+    west = ring(179.9, 1, 180, 1.1)
+    east = ring(-180, 1, -179.9, 1.1)
     parts = {"type": "MultiPolygon", "coordinates": [[west], [east]]}
     region = read_area(_written(tmp_path, "cut.geojson", parts))
     assert isinstance(region.polygon, Polygon)

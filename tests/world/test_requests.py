@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from helpers import corners
 
 from damian import ClockConfig, DelayConfig, ScenarioConfig, UavEnv, make_env
 from damian.baselines.script import script_policy
@@ -19,7 +20,7 @@ MOST = 3
 
 def scenario(**changed):
     settings = {
-        "region": RegionConfig(kind="vertices", vertices=[[0, 0], [400, 0], [400, 300], [0, 300]]),
+        "region": RegionConfig(kind="vertices", vertices=corners(0, 0, 400, 300)),
         "source": SourceConfig(level_db=138.0),
         "requests": RequestConfig(rate=RATE, most=MOST),
         "observation": ObservationConfig(
@@ -31,7 +32,14 @@ def scenario(**changed):
     return ScenarioConfig(agents=3, **settings | changed)
 
 
-@pytest.mark.parametrize(("kind", "dt"), [("instant", 1), ("polynomial", 1), ("instant", 5)])
+@pytest.mark.parametrize(
+    ("kind", "dt"),
+    [
+        ("instant", 1),
+        ("polynomial", 1),
+        ("instant", 5),
+    ],
+)
 def test_requests_appear_are_known_and_served_as_in_a_plain_loop(kind, dt):
     motion = MotionConfig(kind=kind, max_speed=40.0, max_acceleration=20.0)
     env = UavEnv(scenario(motion=motion, clock=ClockConfig(f"{dt}s")), 6, seed=2)

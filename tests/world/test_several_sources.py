@@ -3,6 +3,7 @@ out."""
 
 import pytest
 import torch
+from helpers import corners
 
 from damian import ScenarioConfig, UavEnv, make_env
 from damian.baselines.script import script_policy
@@ -13,8 +14,7 @@ from damian.world.state import Truth
 
 PLACES = [[60.0, 60.0], [340.0, 80.0], [200.0, 240.0]]
 LEVELS = [138.0, 141.0, 135.0]
-LAND = [[0, 0], [400, 0], [400, 300], [0, 300]]
-SQUARE = RegionConfig(kind="vertices", vertices=LAND, initial_conditions=8)
+SQUARE = RegionConfig(kind="vertices", vertices=corners(0, 0, 400, 300), initial_conditions=8)
 EACH = [
     {
         "position": place,

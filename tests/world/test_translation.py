@@ -37,7 +37,11 @@ def simulation(vertices, offset):
 
 
 @pytest.mark.parametrize(
-    ("vertices", "offset"), [(SQUARE, (1000.0, 1000.0)), (RAGGED, (-9_876_543.21, 0.1))]
+    ("vertices", "offset"),
+    [
+        (SQUARE, (1000.0, 1000.0)),
+        (RAGGED, (-9_876_543.21, 0.1)),
+    ],
 )
 def test_moving_the_region_and_all_places_changes_no_bit_of_what_a_step_reads(vertices, offset):
     worlds = before, after = simulation(vertices, (0.0, 0.0)), simulation(vertices, offset)
