@@ -5,10 +5,9 @@ arrive.
 
 Tanks far away send their water levels to a control room, where a message arrives three to seven
 steps later. The room computes rewards from the newest message that it holds, and ends an episode
-when it hears that a tank
-has overflowed: both tell of an earlier level. The replay buffer computes them again for each stored
-step that a message concerns, once that message has arrived. docs/backupdating.md explains each
-part.
+when it hears that a tank has overflowed: both tell of an earlier level. The replay buffer computes
+them again for each stored step that a message concerns, once that message has arrived.
+docs/backupdating.md explains each part.
 """
 
 import torch

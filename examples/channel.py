@@ -1,7 +1,7 @@
 """How old is what agents know of each other? Three robots of VMAS tell their positions over a slow
 radio.
 
-python examples/channel.py
+    python examples/channel.py
 """
 
 from torchrl.envs import TransformedEnv

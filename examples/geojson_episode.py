@@ -1,7 +1,9 @@
 """An episode of ``damian fly`` over a real region as GeoJSON (RFC 7946), which any map tool opens.
 
-damian fly region=llanbedr delay=paper "formats=[]" hydra.run.dir=runs/flight
-python examples/geojson_episode.py runs/flight/episode_0.json    # writes episode_0.geojson beside it
+    damian fly region=llanbedr delay=paper "formats=[]" hydra.run.dir=runs/flight
+    python examples/geojson_episode.py runs/flight/episode_0.json
+
+writes episode_0.geojson beside it.
 """
 
 import json

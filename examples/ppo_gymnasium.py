@@ -1,10 +1,11 @@
 """PPO of TorchRL on a Gymnasium environment whose observations and actions are late: one file, to
 be copied.
 
-python examples/ppo_gymnasium.py                 two minutes: CartPole, 1 to 3 steps late; returns
-325 to 396 python examples/ppo_gymnasium.py --no-history    without past actions in the observation:
-224 to 261 python examples/ppo_gymnasium.py --delay 0       without delay: 352 to 444
-(last ten batches, seeds 0 to 2)
+    python examples/ppo_gymnasium.py                 (two minutes: CartPole, 1 to 3 steps late)
+    python examples/ppo_gymnasium.py --no-history    (without past actions in the observation)
+    python examples/ppo_gymnasium.py --delay 0       (without delay)
+
+They return 325 to 396, 224 to 261, and 352 to 444 (last ten batches, seeds 0 to 2).
 """
 
 import argparse

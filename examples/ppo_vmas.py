@@ -1,9 +1,11 @@
 """Multi-agent PPO of TorchRL on a VMAS task whose observations are late: one file, to be copied.
 
-pip install vmas
-python examples/ppo_vmas.py                   a few minutes: navigation, 3 steps late; returns 3.1
-python examples/ppo_vmas.py --no-history      the same without past actions in the observation
-python examples/ppo_vmas.py --delay 0         the same without delay: 3.1, too
+    pip install vmas
+    python examples/ppo_vmas.py                 (a few minutes: navigation, 3 steps late)
+    python examples/ppo_vmas.py --no-history    (without past actions in the observation)
+    python examples/ppo_vmas.py --delay 0       (without delay)
+
+The first and the last return 3.1.
 """
 
 import argparse

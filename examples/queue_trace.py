@@ -8,9 +8,9 @@ Three network namespaces stand for a UAV, its modem and a server, with virtual c
 The modem sends at 512 kbit/s (``tc tbf``) from one queue, first in, first out, of 480,000 bytes:
 when it is full, it is 7.5 s long, and what comes is lost. The UAV sends a message every second by
 UDP, and uploads pictures by the kernel's TCP (Reno), the next one after 20 s in the mean, also
-while others are on their way. No delay is
-drawn or computed: packets wait in the kernel's queue, and both ends read one clock. Delays are
-rounded to tenths of a second, as a busy machine measures no better.
+while others are on their way. No delay is drawn or computed: packets wait in the kernel's queue, and
+both ends read one clock. Delays are rounded to tenths of a second, as a busy machine measures no
+better.
 """
 
 import argparse

@@ -1,10 +1,10 @@
 """An episode of ``damian fly`` for the viewer rerun (https://rerun.io): paths, beliefs, detections,
 ages.
 
-pip install "damian[rerun]"
-damian fly scenario=tracking delay=paper "formats=[]" hydra.run.dir=runs/flight
-python examples/rerun_episode.py runs/flight/episode_0.json
-rerun runs/flight/episode_0.rrd
+    pip install "damian[rerun]"
+    damian fly scenario=tracking delay=paper "formats=[]" hydra.run.dir=runs/flight
+    python examples/rerun_episode.py runs/flight/episode_0.json
+    rerun runs/flight/episode_0.rrd
 """
 
 import sys
@@ -23,12 +23,10 @@ def save_recording(episode: Episode, path: Path) -> None:
     """Write an episode as a recording with the timeline ``time``.
 
     Entities are ``region``, ``landing_points``, ``source`` (large while it emits) and, for each
-    UAV, in its
-    colour: ``uavs/NAME`` with ``paths/NAME``, ``believed/NAME``
-    (where the server believes it to be, on the ground), ``detections/NAME``
-    (while it spots the source), and the scalars ``age/NAME`` [s]
-    (of the message that the server holds), ``delay/NAME`` [steps] (of the message sent) and
-    ``reward/NAME``.
+    UAV, in its colour: ``uavs/NAME`` with ``paths/NAME``, ``believed/NAME`` (where the server
+    believes it to be, on the ground), ``detections/NAME`` (while it spots the source), and the
+    scalars ``age/NAME`` [s] (of the message that the server holds), ``delay/NAME`` [steps] (of the
+    message sent) and ``reward/NAME``.
     """
     rr: Any = import_module("rerun")
     recording = rr.RecordingStream("damian")

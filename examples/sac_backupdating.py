@@ -1,9 +1,8 @@
 """SAC of TorchRL with a ``BackupdateStorage``: a late actor, and critics that learn from the true
 states.
 
-    python examples/sac_backupdating.py                  five minutes: Pendulum, observations 6
-    steps late python examples/sac_backupdating.py --late-critics   critics read what the actor
-    knows, as in plain SAC
+    python examples/sac_backupdating.py                   (five minutes: Pendulum, 6 steps late)
+    python examples/sac_backupdating.py --late-critics    (critics read what the actor knows)
 
 It returns -190 to -136, and with late critics -580 to -196 (last ten episodes, seeds 0 to 2).
 

@@ -1,7 +1,7 @@
 """Search for better settings of a learner with Optuna; the same command continues the search.
 
-pip install optuna    (the extra tune)
-python examples/tune.py 30 scenario=delaybench/tracking delay=paper aware=belief
+    pip install optuna    (the extra tune)
+    python examples/tune.py 30 scenario=delaybench/tracking delay=paper aware=belief
 
 Each trial is a training of its own, in runs/tune. All have the same seed: what they find must be
 shown with other seeds.

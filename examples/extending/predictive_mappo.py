@@ -6,7 +6,6 @@ later.
 
 The actor asks the messages, by attention, one question for each action, predicts what they will
 have said when that action has ended, and chooses. It learns to predict from the replay buffer.
-docs/extending.md says more.
 """
 
 from dataclasses import dataclass

@@ -6,8 +6,7 @@
     damian train "reward.custom=[{term: rewards:together, weight: 0.1}]"
 
 A term reads features by name and returns a value for each UAV, [*, N]; its keyword-only arguments
-are
-parameters. Its name is its column in metrics.csv: ``reward/low_battery``.
+are parameters. Its name is its column in metrics.csv: ``reward/low_battery``.
 """
 
 from torch import Tensor

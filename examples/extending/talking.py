@@ -6,11 +6,10 @@
 
 What is known of the others stands in blocks of rows of the UAV's own observation (``env.layout``):
 those of ``others``, of ``requests``, or, where every UAV sends its message to every other one, of
-the feature ``heard`` below, with the age of each message
-(TarMAC, Das et al. 2019, with late messages). One network encodes the rows of a block, and
-attention weighs them, so that it works with any number of UAVs, in any order. Whoever
-receives a message can encode it as well as its sender: the gradient needs no way back through a
-link.
+the feature ``heard`` below, with the age of each message (TarMAC,
+Das et al. 2019, with late messages). One network encodes the rows of a block, and attention weighs
+them, so that it works with any number of UAVs, in any order. Whoever receives a message can encode
+it as well as its sender: the gradient needs no way back through a link.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Make the policies of the package, ``damian/data/NAME``, each with a card (docs/policies.md).
 
-    python examples/studies/pretrained.py      (three hours on one core; a run that has finished is
-    taken) python examples/studies/pretrained.py requests --runs runs/pretrained
+    python examples/studies/pretrained.py      (three hours on one core; finished runs are taken)
+    python examples/studies/pretrained.py requests --runs runs/pretrained
 
 A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half
 precision, ``config.yaml`` the settings, ``result.csv`` and the card ``README.md`` what it returns

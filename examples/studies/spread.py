@@ -1,10 +1,10 @@
 """Compare with a published table: MAPPO in PettingZoo's simple_spread_v3 or simple_tag_v3, observed
 late.
 
-    python examples/studies/spread.py
-    (an hour on one core; --jobs 2 takes two) python examples/studies/spread.py --game tag --methods
-    undelayed naive registered+backupdate python examples/studies/spread.py --delay 6 12 --out
-    runs/spread_6_12 python examples/studies/spread.py --seeds 0 --frames 100000 --out runs/spread0
+    python examples/studies/spread.py    (an hour on one core; --jobs 2 takes two)
+    python examples/studies/spread.py --game tag --methods undelayed naive registered+backupdate
+    python examples/studies/spread.py --delay 6 12 --out runs/spread_6_12
+    python examples/studies/spread.py --seeds 0 --frames 100000 --out runs/spread0
 
 Three agents cover three landmarks, or catch a prey, in episodes of 25 steps; the return is the sum
 of all agents' rewards. An agent knows its own velocity and position at once; it sees each landmark,

@@ -1,7 +1,7 @@
 """A replay buffer or a dataset of undelayed steps becomes a delayed one: a function to copy, and
 its use.
 
-python examples/transforms/late_replay_buffer.py
+    python examples/transforms/late_replay_buffer.py
 """
 
 from collections.abc import Sequence
