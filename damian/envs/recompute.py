@@ -61,12 +61,12 @@ def server_recompute(
             entries[keys.GLOBAL_OBSERVATION] = server.observe_all_commanded(
                 messages, sent, elapsed, belief, timeline
             )
-        if commanded and "actor" in corrected:
-            known = steps[next_key(keys.MESSAGE)] if server.observation.own else messages
-            beliefs = belief, steps.get(next_key(keys.OWN_BELIEF), None)
-            entries[keys.OBSERVATION] = server.observe_own_commanded(
-                messages, server.commanded(known, sent), elapsed, *beliefs, timeline
-            )
+            if "actor" in corrected:
+                known = steps[next_key(keys.MESSAGE)] if server.observation.own else messages
+                beliefs = belief, steps.get(next_key(keys.OWN_BELIEF), None)
+                entries[keys.OBSERVATION] = server.observe_own_commanded(
+                    messages, server.commanded(known, sent), elapsed, *beliefs, timeline
+                )
         if own:
             sent = steps[next_key(keys.MESSAGE)]
             own_belief = steps.get(next_key(keys.OWN_BELIEF), None)
