@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from damian.common import checks, counter_rng
 from damian.common.tensors import where_rows
 
-_LOSS_DRAW, _HOLD_DRAW, _PHASE_DRAW, _LINK_LOSS_DRAW, _DRAWN_LOSS_DRAW = range(5)
+_LOSS_DRAW, _HOLD_DRAW, _PHASE_DRAW, _LINK_LOSS_DRAW = 0, 1, 2, 3
 """Counters that tell the further draws of a message from the draw of its delay."""
 
 
@@ -247,7 +247,7 @@ class LossSampler(HeldSampler):
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
         delay, state = self.drawn(streams, clock, state, context)
-        draw = counter_rng.uniform(streams, clock, _DRAWN_LOSS_DRAW)
+        draw = counter_rng.uniform(streams, clock, _LOSS_DRAW)
         chance = cast(MessageContext, context).entries["loss"].view_as(draw)
         delay = torch.where(draw < chance, self.lost, delay)
         return delay, state

@@ -25,15 +25,15 @@ class ObservationConfig(Settings):
 
     local_features: list[str] = setting(
         ["spotted"],
-        "Features of the UAV itself: battery, spotted, served, place, time_left, number, kind.",
+        "Features of the UAV itself: battery, spotted, served, place, time_left, number, kind, "
+        "pending.",
     )
     global_features: list[str] = setting(
         ["source_distance", "source_bearing", "source_time"],
         "Features from the messages of all UAVs: source_distance, source_bearing, source_drift, "
-        "source_time, "
-        "agent_distances, coverage, mean_distance, mean_distance_not_spotting, "
-        "mean_distance_spotting, "
-        "spotting_agents, others, ages, coverage_map, requests, detections, events.",
+        "source_time, agent_distances, coverage, mean_distance, mean_distance_not_spotting, "
+        "mean_distance_spotting, spotting_agents, others, ages, coverage_map, requests, "
+        "detections, stops, events.",
     )
     ctde: bool = setting(False, "Whether the actor observes only the local features.")
     time_scale: float | None = setting(
