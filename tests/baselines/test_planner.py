@@ -58,15 +58,15 @@ def test_the_planner_equals_a_plain_loop_in_which_no_flight_is_aborted():
 
 
 def test_the_planner_returns_more_than_the_script_and_tells_its_time():
-    env = made(worlds=8)
+    env = made(worlds=4)
     returns = {}
     planner = planner_policy(env, 3)
     for name, policy in (("script", script_policy(env)), ("planner", planner)):
         env.set_seed(5)
-        rollout = env.rollout(15, policy, break_when_any_done=False)
+        rollout = env.rollout(8, policy, break_when_any_done=False)
         returns[name] = rollout["next"][keys.REWARD].sum((1, 2)).mean()
-    assert returns["planner"] > returns["script"] + 0.5
-    assert len(planner.module.milliseconds) == 15
+    assert returns["planner"] > returns["script"] + 0.2
+    assert len(planner.module.milliseconds) == 8
 
 
 def test_without_news_a_late_plan_is_the_undelayed_one():
@@ -80,7 +80,8 @@ def test_without_news_a_late_plan_is_the_undelayed_one():
 
 
 def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same():
-    env = make_env(compose_scenario("scenario=requests"), 2, seed=5, extras=["message"])
+    few = ["actions.distances=[0,90]", "actions.headings=[0,120,240]"]
+    env = make_env(compose_scenario("scenario=requests", *few), 2, seed=5, extras=["message"])
     planner = Planner(env.uav_env, env.uav_env.simulation, 6, 2)
     env.rollout(3, break_when_any_done=False)
     state = env.uav_env.state
