@@ -235,7 +235,7 @@ def legend_marks(episode: Episode) -> list:
         marks.append(_mark(f"wind, {speed:.2g} m/s", marker=blows, color=INK, markersize=14))
     if episode.belief is not None:
         marks += [
-            Patch(label=f"source, chance {p:g}", fc=HEAT(_NORM(p)), ec=_EDGE) for p in (0.1, 0.001)
+            Patch(label=f"source, p = {p:g}", fc=HEAT(_NORM(p)), ec=_EDGE) for p in (0.1, 0.001)
         ]
     return marks
 
