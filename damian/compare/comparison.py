@@ -73,7 +73,10 @@ def shown(line: Mapping, name: str) -> str:
     value, low, high = (line[name + end] for end in ENDS)
     if np.isnan(value):
         return "-"
-    texts = [f"{x:.3f}" if abs(x) < 10 else f"{x:.1f}" for x in (value, low, high)]
+    numbers = [value, low, high]
+    largest = np.nanmax(np.abs(numbers))
+    decimals = 3 - int(largest >= 1) - int(largest >= 10)
+    texts = [f"{x:.{decimals}f}" for x in numbers]
     return texts[0] if np.isnan(low) else "{} [{}, {}]".format(*texts)
 
 
