@@ -67,6 +67,8 @@ class Sampler(nn.Module, ABC):
     """Whether all agents of a world draw the same numbers."""
     constant_delay: int | None = None
     """The delay [steps] if it is always the same and no message is lost, else None."""
+    arrival_delay: int | None = None
+    """The delay of every message that arrives [steps]; None if it varies."""
 
     def __init__(self, longest: int, loses: bool = True, loss: float = 0.0) -> None:
         super().__init__()
@@ -143,6 +145,8 @@ class TableSampler(Sampler):
         is_certain = chances[:, likeliest] == 1
         if is_certain.all():
             self.constant_delay = likeliest
+        if (arrive[:, likeliest] == arrive.sum(-1)).all():
+            self.arrival_delay = likeliest
         change = torch.tensor(transitions or [[1.0]], dtype=torch.float64)
         # The next state and the delay are one outcome, so that a message takes a single draw.
         joint = (change.unsqueeze(-1) * chances).flatten(1)
@@ -186,8 +190,9 @@ class Recorded(Sampler):
     def __init__(self, delays: list[int], loss: float = 0.0) -> None:
         shortest = min(delays)
         super().__init__(max(*delays, 0), loses=shortest < 0, loss=loss)
-        if not self.loses and shortest == self.longest:
-            self.constant_delay = self.longest
+        if shortest == self.longest:
+            self.arrival_delay = self.longest
+            self.constant_delay = None if self.loses else self.longest
         codes = torch.tensor([self.lost if delay < 0 else delay for delay in delays])
         self.register_buffer("_delays", codes, persistent=False)
 
@@ -218,6 +223,7 @@ class HeldSampler(Sampler):
         self.reads = drawn.reads
         self.same_draws_for_all_agents = drawn.same_draws_for_all_agents
         self.constant_delay = None if self.loses else self.longest
+        self.arrival_delay = self.longest
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return self.drawn.initial_state(streams)
@@ -240,6 +246,7 @@ class LossSampler(HeldSampler):
         super().__init__(drawn)
         self.loses = True
         self.constant_delay = None
+        self.arrival_delay = drawn.arrival_delay
         self.sees_context = True
         self.reads = (*drawn.reads, "loss")
 
@@ -267,6 +274,7 @@ class LagSampler(Sampler):
         loss = table.chances[0, -1].item()
         super().__init__(table.longest, loses=False, loss=loss)
         self.constant_delay = table.constant_delay
+        self.arrival_delay = table.arrival_delay
         lags = [chance / arrives for chance in chances] if arrives else [1.0]
         self._lags = TableSampler([lags])
         self._period = period or _NEVER

@@ -61,7 +61,7 @@ class LearningSetup(NamedTuple):
     frames: int = 300_000
     """Environment steps of the run, over all worlds."""
     action_delay: int | None = 0
-    """Delay of every action [steps]; None if it differs between actions."""
+    """Delay of every action that arrives [steps]; None if it differs between actions."""
 
     @property
     def settle_steps(self) -> int:
@@ -172,8 +172,8 @@ class MappoConfig(LearnerConfig):
     )
     credit_executed: bool = setting(
         True,
-        "Whether a choice earns what follows the execution of its action, if all actions are "
-        "executed equally late; else what follows the choice.",
+        "Whether a choice earns what follows the execution of its action, if all actions that "
+        "arrive are executed equally late; else what follows the choice.",
     )
     warm_up: int = setting(0, "Updates in which only the critic learns.", low=0, high=checks.STEPS)
     anneal: bool = setting(

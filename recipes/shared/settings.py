@@ -48,7 +48,7 @@ def learning_setup(config: TrainConfig, delays: ScenarioDelays) -> LearningSetup
         critic_key=keys.PRIVILEGED_OBSERVATION if privileged else keys.GLOBAL_OBSERVATION,
         compile=config.compiles,
         frames=config.frames,
-        action_delay=delays.act.constant_delay,
+        action_delay=delays.act.arrival_delay,
     )
 
 

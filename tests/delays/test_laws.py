@@ -10,7 +10,17 @@ from delay_twin import drawn
 
 from damian import compose_scenario
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Constant, Geometric, Trace, Uniform, in_steps, law_of
+from damian.delays.laws import (
+    Burst,
+    Constant,
+    Geometric,
+    Trace,
+    Uniform,
+    in_steps,
+    law_of,
+    sampler_of,
+)
+from damian.delays.samplers import HeldSampler
 
 STREAMS, STEPS = 1000, 100
 """Size of a sample: 10^5 messages."""
@@ -218,3 +228,19 @@ def test_a_law_is_given_as_steps_a_time_or_a_mapping(setting, law):
 )
 def test_a_time_is_rounded_up_to_whole_steps(delay, dt, steps):
     assert in_steps("delay", delay, dt) == steps
+
+
+@pytest.mark.parametrize(
+    ("law", "loss", "arrival"),
+    [
+        (0, 0.0, 0),
+        (3, 0.2, 3),
+        (Uniform(1, 3), 0.2, None),
+        (Burst(enter=0.0, good=2, bad=2, good_loss=0.0), 0.2, 2),
+    ],
+)
+def test_what_arrives_may_be_equally_late_though_some_is_lost(law, loss, arrival):
+    sampler = sampler_of(law, 1.0, loss)
+    assert sampler.arrival_delay == arrival
+    assert sampler.constant_delay == (None if loss else arrival)
+    assert HeldSampler(sampler).arrival_delay == sampler.longest
