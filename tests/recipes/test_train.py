@@ -21,6 +21,7 @@ from damian.recipes import train as train_recipe
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.runs import seed_generators, stored_config
+from damian.recipes.shared.settings import learning_setup
 from damian.runs.training_state import load_networks
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
@@ -209,3 +210,15 @@ def test_long_trainings_are_compiled_unless_the_settings_say_otherwise():
     assert not TrainConfig(frames=999_999).compiles
     assert not TrainConfig(frames=1_000_000, compile=False).compiles
     assert not composed_config("frames=1000000", "sensors=[my_package:wind]").compiles
+
+
+@pytest.mark.parametrize(
+    ("words", "delay"),
+    [
+        (["delay.act=1..3"], None),
+        (["delay.act=1..3", "delay.act_hold=max", "delay.act_loss=0.2"], 3),
+    ],
+)
+def test_a_learner_knows_how_late_actions_are_executed_if_they_are(words, delay):
+    config = composed_config(*words)
+    assert learning_setup(config, config.make_delays()).action_delay == delay
