@@ -104,6 +104,8 @@ class Mappo:
         if self.teacher and self._imitation() > 0:
             corrected[keys.TEACHER_ACTION] = self.teacher(corrected)
         numbers = self.optimize(corrected)
+        if self.teacher is None:
+            del numbers["loss_teacher"]
         self.progress.updates += 1
         self.progress.frames += batch.numel()
         numbers["explained_variance"] = explained_variance(corrected).item()

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.baselines.planner import Planner
+from damian.common import checks
 from damian.envs.forward import ToldWorlds
 
 if TYPE_CHECKING:
@@ -23,9 +24,14 @@ class Teacher:
         worlds: environment of the training.
         name: ``script`` or ``planner``.
         horizon: steps that the planner looks ahead.
+
+    Raises:
+        InputError: actions are continuous.
     """
 
     def __init__(self, worlds: "UavEnv", name: str, horizon: int) -> None:
+        discrete = worlds.scenario.actions.kind == "discrete"
+        checks.require(discrete, "learner.teacher", name, "needs discrete actions")
         self.server = worlds.server
         self.simulation = ToldWorlds(worlds.simulation)
         planner = Planner(worlds, self.simulation, horizon, samples=1)
