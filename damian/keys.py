@@ -128,7 +128,7 @@ STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")
 ADVANTAGE = (AGENTS, "advantage")
 """Advantage of the action, [B, N, 1]."""
 TEACHER_ACTION = (AGENTS, "teacher_action")
-"""What a teacher would choose, [B, N]."""
+"""The actions of the teacher that a policy imitates, [B, N]."""
 BACKUPDATED = (AGENTS, "backupdated")
 """Has a late message changed the stored reward of this step, [T, B, N, 1] bool; if only rewards are
 late: has it been credited with a late reward."""

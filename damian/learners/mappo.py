@@ -143,7 +143,7 @@ class Mappo:
         return [moves, moves * self._left(), 1.0, imitation]
 
     def _imitation(self) -> float:
-        """Weight of what the teacher would choose in this update."""
+        """Weight of the imitation loss in this update."""
         if self.teacher is None:
             return 0.0
         fades = (self.progress.frames - self.config.imitate) / self.config.teacher_fades

@@ -1,4 +1,4 @@
-"""What the script or the planner would choose in the steps of a batch, for a policy to imitate."""
+"""Labels the steps of a batch with the actions of a teacher: the script or the planner."""
 
 from typing import TYPE_CHECKING
 

@@ -20,7 +20,7 @@ from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 
 Stored = dict[str, Any]
-"""What a ``state_dict`` returns, and a checkpoint holds."""
+"""Plain data by name, as ``state_dict`` returns and a checkpoint stores them."""
 _PLAIN = (bool, int, float, str, bytes, torch.Size, torch.device, torch.dtype, type(None))
 
 

@@ -344,7 +344,7 @@ class Server:
         own_belief: Tensor | None = None,
         timeline: Tensor | None = None,
     ) -> Tensor:
-        """Observations of actors, who know what they have sent themselves, [*, N, F].
+        """Observations of actors, which know their own commands under way, [*, N, F].
 
         ``own`` [*, N] is from ``commanded``, the other arguments are as in
         ``observe_with_own_messages``.

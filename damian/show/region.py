@@ -1,4 +1,4 @@
-"""A picture of the region of a training, to check what was read from a map."""
+"""Draws the region of a training, so that a user can check the map that was read."""
 
 from pathlib import Path
 

@@ -38,7 +38,7 @@ class Widths(NamedTuple):
     announced: int = 0
     """Number of commands under way of which messages tell, D."""
     pending: int = 0
-    """Number of latest commands of which a UAV keeps what it knows, P."""
+    """Number of its own latest commands that a UAV observes, P."""
 
 
 ONE_SOURCE = Widths()

@@ -83,8 +83,8 @@ def _timeline(v: FeatureCache) -> Tensor:
     rows="others",
 )
 def _stops(v: FeatureCache) -> Tensor:
-    """The ``observation.stops`` latest stops of which the newest messages of the four nearest other
-    UAVs tell, the newest first, [*, N, 4, S, 4].
+    """The latest stops of the four nearest other UAVs, as their newest messages list them, the
+    newest first, [*, N, 4, S, 4]; S is ``observation.stops``.
 
     Of each: the way to it, east and north, as in ``timeline``, how long ago it was, over 2 S steps,
     and 1. A timeline has the same places ordered by when they were, and those of older messages.
@@ -94,10 +94,19 @@ def _stops(v: FeatureCache) -> Tensor:
     since = v.context.now[..., None, None] - messages.landed
     age = since / (2 * messages.trail.shape[-1] * v.context.dt)
     known = (messages.landed >= 0).to(places.dtype)
-    ways = ways_to_nearest(v, torch.cat([places, known.unsqueeze(-1)], -1))
-    age = of_nearest(v, age.clamp(0, 1) * known).unsqueeze(-1)
-    stops = torch.cat([ways[..., :2], age, ways[..., 2:]], -1)
-    return four(stops.flatten(-2)).unflatten(-1, stops.shape[-2:])
+    return _timed_places(v, places, age, known)
+
+
+def _timed_places(v: FeatureCache, places: Tensor, time: Tensor, exists: Tensor) -> Tensor:
+    """Ways to places of the four nearest other UAVs, each with a time in [-1, 1], and 1; zeros
+    where none exists, [*, N, 4, P, 4].
+
+    ``places`` [*, N, P, 2] are in metres; ``time``, and ``exists`` of 0 and 1, [*, N, P].
+    """
+    ways = ways_to_nearest(v, torch.cat([places, exists.unsqueeze(-1)], -1))
+    times = of_nearest(v, (time * exists).clamp(-1, 1)).unsqueeze(-1)
+    rows = torch.cat([ways[..., :2], times, ways[..., 2:]], -1)
+    return four(rows.flatten(-2)).unflatten(-1, rows.shape[-2:])
 
 
 def columns_of_events(simulation: Simulation, _: ObservationConfig) -> tuple[str, ...]:
@@ -133,13 +142,10 @@ def _announced(v: FeatureCache) -> Tensor:
     Of each command, the newest first: the way to its place, east and north, as in ``timeline``,
     how many steps from now it will have been executed, over D, and 1. It may not come true.
     """
-    place, by, exists = v.messages.announced.split([2, 1, 1], -1)
-    now = v.context.now[..., None, None, None]
-    until = (by - now) / (v.context.dt * by.shape[-2])
-    until = of_nearest(v, (until * exists).clamp(-1, 1).flatten(-2)).unsqueeze(-1)
-    ways = ways_to_nearest(v, torch.cat([place, exists], -1))
-    announced = torch.cat([ways[..., :2], until, ways[..., 2:]], -1)
-    return four(announced.flatten(-2)).unflatten(-1, announced.shape[-2:])
+    announced = v.messages.announced
+    place, by, exists = announced[..., :2], announced[..., 2], announced[..., 3]
+    until = (by - v.context.now[..., None, None]) / (v.context.dt * by.shape[-1])
+    return _timed_places(v, place, until, exists)
 
 
 @feature(
