@@ -78,9 +78,7 @@ class CudaGraph:
 
 
 def compiled(function: Function, **options: Any) -> Function:
-    """Compile a pure function of tensors as one graph; ``options`` replace the defaults, tuned for
-    a CPU."""
-    options = options or {"options": _INDUCTOR}
+    """Compile a pure function of tensors as one graph, with options of ``torch.compile``."""
     # Recompiles are isolated, so that a function never runs a graph compiled for another's
     # settings.
     return torch.compile(  # type: ignore[call-overload]
@@ -88,12 +86,22 @@ def compiled(function: Function, **options: Any) -> Function:
     )
 
 
-_INDUCTOR: dict[str, Any] = {
-    # Guards on tensors stay, since shapes may change. Settings never do, and checking them takes as
-    # long as running a kernel.
-    "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
-    # The innermost loops run over a few UAVs: vectors of 16 lanes would be mostly idle, and slower.
-    "cpp.simdlen": 1,
-    # Whether the processor has vectors is read from its flags; a trial would take seconds for each.
-    "cpp.vec_isa_ok": True,
-}
+def world_options(n_agents: int) -> dict[str, Any]:
+    """Options of ``compiled`` for the steps of worlds on a CPU."""
+    return {
+        "options": {
+            # Guards on tensors stay, since shapes may change. Settings never do, and checking them
+            # takes as long as running a kernel.
+            "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
+            # The innermost loops run over UAVs: with a few of them vectors of 16 lanes are mostly
+            # idle, and slower.
+            "cpp.simdlen": 1 if n_agents < _FEWEST_IN_VECTORS else None,
+            # Whether the processor has vectors is read from its flags; a trial would take seconds
+            # for each.
+            "cpp.vec_isa_ok": True,
+        }
+    }
+
+
+_FEWEST_IN_VECTORS = 16
+"""Number of UAVs from which on loops over them are vectorised: 20 take three quarters of the time."""

@@ -12,7 +12,7 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian import keys
 from damian.common import devices
-from damian.common.compiling import CompiledMethods
+from damian.common.compiling import CompiledMethods, world_options
 from damian.common.tensors import where_rows
 from damian.delays.scenario import ScenarioDelays
 from damian.envs.forward import Assumed, Forward
@@ -125,8 +125,9 @@ class DelayedEnv(TransformedEnv):
             cuda_graph: on a GPU, launch all kernels at once, for the memory of a state and a step.
                 A step
                 then changes the state in place: clone what ``state`` or ``state_dict`` have given.
-            options: of ``torch.compile``.
+            options: of ``torch.compile``, in place of ours.
         """
+        options = options or world_options(self.uav_env.n_agents)
         methods = CompiledMethods(options, cuda_graph and self.uav_env.device.type == "cuda")
         object.__setattr__(self, "_compiled", methods)  # TransformedEnv's own is for specs
         return self

@@ -74,6 +74,49 @@ LAWS = {
 """Delays under which each is flown."""
 BATCHES, WORLDS, SEED = 5, 200, 20_000
 """Batches of episodes, each over regions of its own, and the seed of the first."""
+OUTLINES = Path(__file__).parents[2] / "tests" / "data" / "regions" / "outlines.geojson"
+"""Ten areas of 0.12 to 0.28 km² in the shape of countries (Natural Earth, public domain), with
+holes in four of them."""
+FLEETS = (3, 5, 8)
+"""Numbers of UAVs that fly over the outlines."""
+EPISODES = 20
+"""Episodes over each outline."""
+
+
+def over_outlines(name: str) -> pd.DataFrame:
+    """True returns over outlines that no training has seen, beside scripts in the same episodes.
+
+    A line for each outline and number of UAVs: mean returns of the policy (sampled, and most likely
+    actions), of the script on the same late messages, and of the script flown forward.
+    """
+    outlines = json.loads(OUTLINES.read_text(encoding="utf-8"))["features"]
+    lines = []
+    for agents in FLEETS:
+        for outline in (feature["properties"]["name"] for feature in outlines):
+            words = [f"region={OUTLINES}", f"region.where=name:{outline}", f"agents={agents}"]
+            policy, env = damian.load(f"damian:{name}", *words, num_worlds=EPISODES, seed=SEED)
+            forward = damian.load(
+                f"damian:{name}",
+                *words,
+                "observation.own=true",
+                "observation.forward=script",
+                num_worlds=EPISODES,
+                seed=SEED,
+            ).env
+            flights = {
+                "sampled": (env, policy, True),
+                "most likely": (env, policy, False),
+                "script": (env, script_policy(env), True),
+                "script+forward": (forward, script_policy(forward), True),
+            }
+            line: dict[str, object] = {"agents": agents, "outline": outline}
+            for kind, (world, flown, sample) in flights.items():
+                world.set_seed(SEED)
+                horizon = world.uav_env.scenario.episode.max_steps or 0
+                line[kind] = evaluate(world, flown, horizon, sample=sample)["return"]
+            lines.append(line)
+            print(name, line, flush=True)
+    return pd.DataFrame(lines)
 
 
 def returns(name: str, law: tuple[str, ...]) -> dict[str, list[float]]:

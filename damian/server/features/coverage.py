@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from damian.common import devices
-from damian.common.tensors import distances, gather_rows
+from damian.common.tensors import gather_rows, nearest_distance
 from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature, footprint_radii
 from damian.world.airspace import Airspace
@@ -104,13 +104,12 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     radius = v.radius
     offsets = ring_places(radius, standing.device).unsqueeze(-3)
     places = gather_rows(context.points, standing).unsqueeze(-2) + offsets
-    n_agents, window = trail.shape[-2:]
-    landed = gather_rows(context.points, trail.transpose(-2, -1))
-    landed = landed.flatten(-3, -2)  # [*, n N, 2]
-    distance = distances(landed, places.flatten(-3, -2))  # places last, over which minima are fast
-    nearest = distance.unflatten(-2, (window, n_agents)).amin(-2)  # of all UAVs, [*, n, N 24]
-    step = torch.arange(window, device=trail.device).unsqueeze(-1)
-    age = step / window
+    window = trail.shape[-1]
+    landed = gather_rows(context.points, trail.transpose(-2, -1))  # [*, n, N, 2]
+    # One instant of the window after the other compiles to a loop that is five times as fast.
+    about = places.flatten(-3, -2)
+    nearest = torch.stack([nearest_distance(each, about) for each in landed.unbind(-3)], -2)
+    age = torch.arange(window, device=trail.device).unsqueeze(-1) / window
     new = (nearest / (2 * radius) + _OLDEST * age).amin(-2)
     new = new.view(places.shape[:-1]).clamp(max=1)
     return new * gather_rows(v.table(map_places_inside), v.tabled(standing))
