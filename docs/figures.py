@@ -95,7 +95,7 @@ LEADERBOARD = """# Leaderboard
 Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by
 damian's own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-method);
 tasks and delays are those of [delaybench](delaybench.md). A submission needs five seeds; some of our own
-cells have three or four.
+cells have three or four. Rows of *0.18 or before* have no fingerprint of their task.
 """
 FEWEST = 3
 """Fewest seeds of which the leaderboard shows a mean: fewer have no interval."""

@@ -7,6 +7,8 @@ with it (docs/delaybench.md). What is submitted is the true return that damian's
 found.
 """
 
+import hashlib
+import json
 import shlex
 import sys
 from functools import cache
@@ -17,6 +19,7 @@ import pandas as pd
 from torch import Tensor
 
 from damian.common import checks
+from damian.common.fields import leaves
 from damian.common.tables import write_csv
 from damian.compare.comparison import HELD_OUT_MARK, LATE_DATA, RUN, SIMULATOR, TRAINED
 from damian.compare.config import EPISODES, Experiment
@@ -30,10 +33,22 @@ from damian.runs.run_folder import CHECKPOINT, RESULTS, read_results
 from damian.runs.run_record import read_record
 
 NUMBERS = ["frames", "episodes", "return"]
-WORDS = ["task", "delay", "method", "authors", "regime", "damian", "commit", "settings"]
+WORDS = [
+    "task",
+    "delay",
+    "method",
+    "authors",
+    "regime",
+    "fingerprint",
+    "damian",
+    "commit",
+    "settings",
+]
 COLUMNS = [*RUN, *NUMBERS, "parameters", *WORDS[3:]]
 """Columns of a submission, which has a row for each run; ``settings`` are those of ``damian
 train``."""
+OLDER = "older"
+"""The fingerprint of rows that were measured before tasks had one."""
 FEWEST_SEEDS = 5
 _NAMES = (
     "agents region motion wind source requests battery reward episode clock links randomise frames"
@@ -55,7 +70,6 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
     checks.one_of("method", method, [*rows["method"].unique()])
     rows = rows[(rows["method"] == method) & (rows["policy"] == TRAINED)].reset_index(drop=True)
     words = words_of_tasks(experiment)
-    composed = cache(cli.settings)  # the same for all runs of a task
     facts = list[dict[str, object]]()
     trained = dict[tuple[str, str], Path]()
     for task, delay, _, seed in rows[RUN].itertuples(index=False, name=None):
@@ -70,9 +84,11 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
             word for word in record.get("overrides", []) if key_of(word) not in ("logger", "seed")
         ]
         told = {name: record.get(name) for name in ("damian", "commit")}
-        facts.append({"return": found[TRAINED], "settings": shlex.join(settings), **told})
+        learnt = words[task.split(HELD_OUT_MARK)[0], delay]
+        told["fingerprint"] = fingerprint(*learnt)
         if (task, delay) in words:
-            check_task(run, composed(*words[task, delay]))
+            check_task(run, settings_of(*learnt))
+        facts.append({"return": found[TRAINED], "settings": shlex.join(settings), **told})
         if (run / CHECKPOINT).exists():  # flights elsewhere have no networks
             trained[task, delay] = run  # those of all seeds have the same sizes
     known = rows.drop(columns=["return"]).join(pd.DataFrame(facts))
@@ -85,6 +101,18 @@ def words_of_tasks(experiment: Experiment) -> dict[tuple[str, str], list[str]]:
     tasks = experiment.tasks
     delays = experiment.delays
     return {(task, delay): [*tasks[task], *delays[delay]] for task in tasks for delay in delays}
+
+
+settings_of = cache(cli.settings)
+"""The settings of a training that words compose."""
+
+
+@cache
+def fingerprint(*words: str) -> str:
+    """Twelve digits of the SHA-256 of what a task and its delay state: equal if nothing of it has
+    changed."""
+    stated = [leaf for leaf in leaves(settings_of(*words)) if f"{leaf[0]}.".startswith(OF_TASKS)]
+    return hashlib.sha256(json.dumps(stated).encode()).hexdigest()[:12]
 
 
 def check_task(run: Path, asked_for: TrainConfig) -> None:
@@ -133,6 +161,12 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
     for name in WORDS:
         empty = rows[name].astype(str).str.strip().isin(["", "nan", "None"])
         checks.require(not empty.any(), f"{path}: {name}", "it", "is empty")
+    words = words_of_tasks(experiment)
+    for (task, delay), found in rows.groupby(["task", "delay"])["fingerprint"]:
+        asked = fingerprint(*words[task.split(HELD_OUT_MARK)[0], delay])
+        should = f"is not {asked}, that of the task as it stands: run it again"
+        known = found.isin([asked, OLDER]).all()
+        checks.require(known, f"{path}: {task}/{delay}: fingerprint", found.iloc[0], should)
     changed = rows["commit"].astype(str).str.contains("+", regex=False)
     checks.require(
         not changed.any(), f"{path}: commit", rows["commit"].iloc[0], "has changes: commit them"

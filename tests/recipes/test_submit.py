@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 from helpers import check_refused
-from leaderboard import WORDS, check_submission, delaybench
+from leaderboard import WORDS, check_submission, delaybench, fingerprint, words_of_tasks
 from leaderboard import main as submit
 
 from damian.common.errors import InputError
@@ -73,6 +73,12 @@ def test_a_submission_holds_what_the_evaluations_of_the_runs_found(folder, capsy
     assert set(rows["parameters"]) == {12}
     one = "scenario=delaybench/crowded 'delay.obs={law: uniform, low: 1, high: 7}' aware=timeline"
     assert set(rows["settings"]) == {one}
+    other = fingerprint("scenario=delaybench/crowded", "delay.obs=4")
+    assert (
+        set(rows["fingerprint"])
+        == {fingerprint(*words_of_tasks(EXPERIMENT())["crowded", "1-7"])}
+        != {other}
+    )
     Path("mine.csv").rename("submitted.csv")
     Path("mine.csv").symlink_to("outside")
     check_refused(submit, "mine.csv is a link", capsys)
@@ -99,6 +105,7 @@ WRONG = {
     "mine.csv: regime: R0": {"regime": "R0"},
     "has changes: commit them": {"commit": "abc+changes"},
     "a number is not finite": {"return": float("nan")},
+    "crowded/1-7: fingerprint: 0123456789ab is not ": {"fingerprint": "0123456789ab"},
 }
 
 
