@@ -5,190 +5,179 @@
 
 A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half
 precision, ``config.yaml`` the settings, ``result.csv`` and the card ``README.md`` what it returns
-under which delays.
+over outlines that no training has seen.
 """
 
 import json
-import math
 import shlex
 import subprocess
 import sys
 from argparse import ArgumentParser
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 import torch
 import yaml
 from scipy.special import stdtrit
+from tqdm import tqdm
 
 import damian
-from damian.baselines.random import random_policy
 from damian.baselines.script import script_policy
 from damian.common.fields import nested
 from damian.common.tables import markdown_table, write_csv
-from damian.recipes.known import CONF
-from damian.recipes.shared.runs import stored_config
+from damian.recipes import cli
+from damian.recipes.shared.runs import run_settings
 from damian.runs.checkpoint import read_checkpoint, write_checkpoint
 from damian.runs.metrics import evaluate
 
+
+class Packaged(NamedTuple):
+    """A policy of the package."""
+
+    words: str
+    """The words after ``damian train`` that train it."""
+    limits: str
+    """What it is good for."""
+    flown: tuple[str, ...] = ()
+    """Settings that it flies with, if not with those of its training."""
+
+
+FORWARD = ("delay.obs=0..7", "observation.own=true", "observation.forward=policy")
+"""What is late is flown forward by a model of the world."""
+ANYWHERE = "region=random region.pool=256 region.max_area=300000 agents=5 seed=0"
+LATE = "aware=timeline delay.obs=0..7"
+REGIONS = "Two to eight UAVs in regions of 0.1 to 0.3 km²"
 POLICIES = {
-    "crowded-any-delay": (
-        "scenario=delaybench/crowded aware=timeline model=gru seed=0 "
-        '"delay.obs={law: lag, lag: {law: uniform, low: 1, high: 7}, update_period: episode}"',
-        "Three UAVs that are at their targets at once, in regions of 0.1 to 0.2 km²; footprints of "
-        "100 m.",
+    "crowded": Packaged(
+        f"scenario=tasks/crowded_five {ANYWHERE} frames=2000000",
+        f"{REGIONS}, at their targets at once; footprints of 71 m.",
+        FORWARD,
     ),
-    "flights": (
-        "scenario=delaybench/crowded motion=polynomial aware=timeline delay.obs=1..7 seed=10",
-        "As crowded-any-delay, but flights take time (20 m/s), and nothing is remembered.",
+    "flights": Packaged(
+        f"scenario=tasks/flights source.level_db=142 {ANYWHERE} frames=800000",
+        f"{REGIONS}, flights at up to 20 m/s; footprints of 71 m.",
+        FORWARD,
     ),
-    "requests": (
-        "scenario=requests aware=timeline delay.obs=1..7 seed=0",
-        "Three UAVs that are at their targets at once, in regions of 0.3 to 0.6 km², with 30 "
-        "requests a "
-        "minute, at most six of them open at once.",
+    "convoy": Packaged(
+        "scenario=convoy model=sets observation.actions=true motion.max_speed=15 "
+        '"observation.global_features=[detections,others]" '
+        '"observation.local_features=[spotted,place,number]" learner.team=1.0 '
+        "learner.anneal=true learner.epochs=4 learner.entropy_coeff=0.01 "
+        f"{LATE} {ANYWHERE} worlds=256 frames=800000",
+        f"{REGIONS}, all of 15 m/s, after two sources.",
     ),
-    "convoy": (
-        "scenario=convoy frames=600000 aware=timeline model=gru delay.obs=1..7 seed=0",
-        "UAVs of 10, 15 and 20 m/s that follow two sources in the paper's polygon, and no other "
-        "region.",
-    ),
-    "tracking": (
-        "scenario=delaybench/tracking frames=600000 aware=belief delay.obs=1..7 seed=0",
-        "Three UAVs that are at their targets at once, after one fast source in the paper's "
-        "polygon, and in "
-        "no other region. The filter, which knows how the source moves, does nearly all: "
-        "untrained, 19.5.",
+    "tracking": Packaged(
+        f"scenario=tasks/tracking {LATE} {ANYWHERE} frames=1000000",
+        f"{REGIONS}, at their targets at once, after one fast source.",
     ),
 }
-"""What each policy is trained with, and for what it is good."""
-LAWS = {
-    "as trained": (),
-    "no delay": ("delay.obs=0",),
-    "1 to 7 steps": ("delay.obs=1..7",),
-    "4 steps": ("delay.obs=4",),
-    "8 steps": ("delay.obs=8",),
-    "the paper's": ("delay=paper",),
-    "bursts": ("delay=burst",),
-}
-"""Delays under which each is flown."""
-BATCHES, WORLDS, SEED = 5, 200, 20_000
-"""Batches of episodes, each over regions of its own, and the seed of the first."""
+"""The policies, by name."""
 OUTLINES = Path(__file__).parents[2] / "tests" / "data" / "regions" / "outlines.geojson"
 """Ten areas of 0.12 to 0.28 km² in the shape of countries (Natural Earth, public domain), with
 holes in four of them."""
+KINDS = ("sampled", "most likely", "script", "script+forward")
+"""What flies: the policy's actions, drawn and most likely, and two scripts."""
 FLEETS = (3, 5, 8)
 """Numbers of UAVs that fly over the outlines."""
-EPISODES = 20
+EPISODES = 10
 """Episodes over each outline."""
+SEED = 20_000
+"""The seed of these episodes."""
 
 
-def over_outlines(name: str) -> pd.DataFrame:
-    """True returns over outlines that no training has seen, beside scripts in the same episodes.
+def over_outlines(run: str) -> pd.DataFrame:
+    """True returns of a policy over outlines that no training has seen, beside scripts in the same
+    episodes.
 
-    A line for each outline and number of UAVs: mean returns of the policy (sampled, and most likely
-    actions), of the script on the same late messages, and of the script flown forward.
+    A line for each number of UAVs and outline: mean returns of sampled and of most likely actions,
+    of the script on the same late messages, and of the script flown forward.
     """
     outlines = json.loads(OUTLINES.read_text(encoding="utf-8"))["features"]
+    places = [(n, each["properties"]["name"]) for n in FLEETS for each in outlines]
     lines = []
-    for agents in FLEETS:
-        for outline in (feature["properties"]["name"] for feature in outlines):
-            words = [f"region={OUTLINES}", f"region.where=name:{outline}", f"agents={agents}"]
-            policy, env = damian.load(f"damian:{name}", *words, num_worlds=EPISODES, seed=SEED)
-            forward = damian.load(
-                f"damian:{name}",
-                *words,
-                "observation.own=true",
-                "observation.forward=script",
-                num_worlds=EPISODES,
-                seed=SEED,
-            ).env
-            flights = {
-                "sampled": (env, policy, True),
-                "most likely": (env, policy, False),
-                "script": (env, script_policy(env), True),
-                "script+forward": (forward, script_policy(forward), True),
-            }
-            line: dict[str, object] = {"agents": agents, "outline": outline}
-            for kind, (world, flown, sample) in flights.items():
-                world.set_seed(SEED)
-                horizon = world.uav_env.scenario.episode.max_steps or 0
-                line[kind] = evaluate(world, flown, horizon, sample=sample)["return"]
-            lines.append(line)
-            print(name, line, flush=True)
+    for agents, outline in tqdm(places, run):
+        words = [f"region={OUTLINES}", f"region.where=name:{outline}", f"agents={agents}"]
+        ahead = ["observation.own=true", "observation.forward=script"]
+        policy, env = damian.load(run, *words, num_worlds=EPISODES, seed=SEED)
+        late, forward = (
+            damian.load(run, *words, *changed, num_worlds=EPISODES, seed=SEED).env
+            for changed in (["observation.forward=null"], ahead)
+        )
+        flights = {
+            "sampled": (env, policy),
+            "most likely": (env, policy),
+            "script": (late, script_policy(late)),
+            "script+forward": (forward, script_policy(forward)),
+        }
+        line: dict[str, object] = {"agents": agents, "outline": outline}
+        for kind, (world, flown) in flights.items():
+            world.set_seed(SEED)
+            horizon = world.uav_env.scenario.episode.max_steps or 0
+            line[kind] = evaluate(world, flown, horizon, sample=kind == "sampled")["return"]
+        lines.append(line)
     return pd.DataFrame(lines)
 
 
-def returns(name: str, law: tuple[str, ...]) -> dict[str, list[float]]:
-    """True mean returns of the policy in each batch, and of others where it flies as it was
-    trained."""
-    found: dict[str, list[float]] = {}
-    for seed in range(SEED, SEED + BATCHES):
-        policy, env = damian.load(f"damian:{name}", *law, num_worlds=WORLDS, seed=seed)
-        others = {"most likely": policy, "script": script_policy(env), "random": random_policy(env)}
-        for kind, flown in {"sampled": policy, **({} if law else others)}.items():
-            env.set_seed(seed)
-            horizon = env.uav_env.scenario.episode.max_steps or 0
-            mean = evaluate(env, flown, horizon, sample=kind != "most likely")["return"]
-            found.setdefault(kind, []).append(mean)
-    return found
+def differences(lines: pd.DataFrame) -> pd.DataFrame:
+    """For each number of UAVs: mean returns over outlines, and how much more the most likely actions
+    return than the script on the same messages, with a 95 % interval over outlines."""
+    known = lines.drop(columns="outline").groupby("agents").mean()
+    won = (lines["most likely"] - lines["script"]).groupby(lines["agents"])
+    n = won.count()
+    half = won.std() / n**0.5 * [float(stdtrit(each - 1, 0.975)) for each in n]
+    return known.assign(difference=won.mean(), low=won.mean() - half, high=won.mean() + half)
 
 
 def ship(name: str, run: Path) -> None:
     """Store the policy of a run in the package, fly it, and write its card."""
-    folder, (words, limits) = Path(damian.__file__).parent / "data" / name, POLICIES[name]
+    folder = Path(damian.__file__).parent / "data" / name
+    policy = POLICIES[name]
     folder.mkdir(exist_ok=True)
     actor = read_checkpoint(run / "checkpoint.pt", "checkpoint")["components"]["actor"]
     half = {
         key: each.half() if isinstance(each, torch.Tensor) else each for key, each in actor.items()
     }
     write_checkpoint(folder / "checkpoint.pt", {"components": {"actor": half}})
-    settings = nested(stored_config(run, "checkpoint"))
+    words = [f"checkpoint='{run}'", *policy.flown]
+    with run_settings(cli.composed(*words), words) as config:
+        settings = nested(config) | {"checkpoint": None}
     (folder / "config.yaml").write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
-    rows = []
-    for law, changes in LAWS.items():
-        for policy, means in returns(name, changes).items():
-            found = torch.tensor(means, dtype=torch.float64)
-            half_width = float(stdtrit(BATCHES - 1, 0.975) * found.std()) / math.sqrt(BATCHES)
-            mean = float(found.mean())
-            rows.append({"law": law, "policy": policy, "return": mean, "interval": half_width})
-            print(name, rows[-1], flush=True)
-    table = pd.DataFrame(rows).round(3)
-    write_csv(folder / "result.csv", table)
-    (folder / "README.md").write_text(card(name, run, words, limits, table), encoding="utf-8")
+    lines = over_outlines(f"damian:{name}")
+    write_csv(folder / "result.csv", lines.round(3))
+    (folder / "README.md").write_text(card(name, run, lines), encoding="utf-8")
 
 
-def card(name: str, run: Path, words: str, limits: str, table: pd.DataFrame) -> str:
+def card(name: str, run: Path, lines: pd.DataFrame) -> str:
     """The card of a policy."""
+    policy = POLICIES[name]
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    scenario = (CONF / f"{shlex.split(words)[0].replace('=', '/')}.yaml").read_text(
-        encoding="utf-8"
-    )
-    task = " ".join(line[2:] for line in scenario.splitlines()[2:] if line.startswith("# "))
-    cells = {
-        (law, policy): f"{mean:.1f} ± {interval:.1f}"
-        for law, policy, mean, interval in table.itertuples(index=False, name=None)
-    }
-    columns = [*table["policy"].unique()]
-    lines = [[law, *(cells.get((law, policy), "") for policy in columns)] for law in LAWS]
+    data = "without delay" if policy.flown else "from late data only"
+    flown = "Its settings for flights: `" + " ".join(policy.flown) + "`.\n\n"
+    rows = [
+        [
+            f"{agents}",
+            *(f"{line[kind]:.1f}" for kind in KINDS),
+            f"{line['difference']:.1f} [{line['low']:.1f}, {line['high']:.1f}]",
+        ]
+        for agents, line in differences(lines).iterrows()
+    ]
     return f"""# {name}
 
 `policy, env = damian.load("damian:{name}")`
 
-**Task.** {task} ({shlex.split(words)[0]})
+**Limits.** {policy.limits}
 
-**Limits.** {limits}
-
-**Trained** from late data only, by damian {record["damian"]}, commit {record["commit"][:7]}:
+**Trained** {data}, by damian {record["damian"]}, commit {record["commit"][:7]}:
 
 ```bash
-damian train {words} compile=true
+damian train {policy.words} compile=true
 ```
 
-**True returns** of {BATCHES * WORLDS} episodes, with 95 % intervals over {BATCHES} batches, by the delay
-of the flight; *sampled* and *most likely* are the policy's actions, *script* and *random* fly as late:
+{flown * bool(policy.flown)}**True returns** over [ten outlines](../../../docs/policies.md), {EPISODES}
+episodes each, messages none to seven steps late; difference: of the most likely actions to the *script*, 95 % over outlines:
 
-{markdown_table(["delay", *columns], lines)}
+{markdown_table(["UAVs", *KINDS, "difference"], rows)}
 """
 
 
@@ -207,7 +196,7 @@ def main(words: list[str] | None = None) -> None:
             command = [
                 Path(sys.executable).with_name("damian"),
                 "train",
-                *shlex.split(POLICIES[name][0]),
+                *shlex.split(POLICIES[name].words),
             ]
             subprocess.run([*command, "compile=true", f"hydra.run.dir={run}"], check=True)
         ship(name, run)
