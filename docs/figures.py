@@ -95,8 +95,14 @@ LEADERBOARD = """# Leaderboard
 Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by
 damian's own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-method);
 tasks and delays are those of [delaybench](delaybench.md). A submission needs five seeds; some of our own
-cells have three or four. Rows of *0.18 or before* have no fingerprint of their task.
-"""
+cells have three or four. Rows of *0.18 or before* have no fingerprint of their task. Where these policies
+flew without being trained for it is [a page of its own](leaderboard_matrix.md)."""
+MATRIX = """# Flown where they were not trained
+
+Policies of the [leaderboard](leaderboard.md) over the delay of the flight: four UAVs (`agents`), and other
+delays. Mean over seeds [95 % interval] (seeds).
+
+![Returns over the delay of the flight](results/delaybench/matrix.png)"""
 FEWEST = 3
 """Fewest seeds of which the leaderboard shows a mean: fewer have no interval."""
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
@@ -198,13 +204,14 @@ def plot_world(path: Path, words: list[str], step: int, worlds: int) -> None:
 
 
 def write_leaderboard() -> None:
-    """Write docs/leaderboard.md."""
-    (IMAGES.parent / "leaderboard.md").write_text(leaderboard_page(), encoding="utf-8")
+    """Write docs/leaderboard.md and docs/leaderboard_matrix.md."""
+    for name, page in leaderboard_pages().items():
+        (IMAGES.parent / name).write_text(page, encoding="utf-8")
 
 
-def leaderboard_page() -> str:
+def leaderboard_pages() -> dict[str, str]:
     """The submissions as tables, with our runs of the same methods that are too few for a
-    submission."""
+    submission: a page for each file."""
     files = sorted((DELAYBENCH.parent / "leaderboard").glob("*.csv"))
     submitted = pd.concat([read_csv(file, text=WORDS) for file in files], ignore_index=True)
     stored = stored_results(DELAYBENCH).rows
@@ -214,21 +221,29 @@ def leaderboard_page() -> str:
     ours = ours.groupby(RUN[:-1]).filter(lambda runs: FEWEST <= len(runs) < FEWEST_SEEDS)
     facts = submitted.drop(columns=[*RUN[:2], "seed", *NUMBERS]).drop_duplicates("method")
     few = ours.merge(facts[facts["authors"] == "DAMIAN"], on="method")
-    return f"{LEADERBOARD}\n{leaderboard([submitted, few], delaybench().delays)}"
-
-
-def leaderboard(submissions: Sequence[pd.DataFrame], delays: Collection[str]) -> str:
-    """Tables of all submissions, as Markdown: for each track and task, and of flights elsewhere."""
-    rows = pd.concat(submissions, ignore_index=True)
+    rows = pd.concat([submitted, few], ignore_index=True)
     away = rows["task"].str.contains(HELD_OUT_MARK, regex=False)
-    parts = []
+    return {
+        "leaderboard.md": by_task(rows[~away], delaybench().delays),
+        "leaderboard_matrix.md": by_flight(rows[away]),
+    }
+
+
+def by_task(rows: pd.DataFrame, delays: Collection[str]) -> str:
+    """The leaderboard, as Markdown: a table for each track and task."""
+    parts = [LEADERBOARD]
     for regime in (LATE_DATA, SIMULATOR):
-        for task in rows.loc[~away & (rows["regime"] == regime), "task"].unique():
-            of_task = rows[~away & (rows["regime"] == regime) & (rows["task"] == task)]
+        for task in rows.loc[rows["regime"] == regime, "task"].unique():
+            of_task = rows[(rows["regime"] == regime) & (rows["task"] == task)]
             parts += [f"## {task}, {regime}", _methods(of_task, [*delays])]
-    for method in rows.loc[away, "method"].unique():
-        flights = _flights(rows[away & (rows["method"] == method)])
-        parts += [f"## {method}, flown where it was not trained", flights]
+    return "\n\n".join(parts) + "\n"
+
+
+def by_flight(rows: pd.DataFrame) -> str:
+    """What policies return where they were not trained, as Markdown: a table for each method."""
+    parts = [MATRIX]
+    for method in rows["method"].unique():
+        parts += [f"## {method}", _flights(rows[rows["method"] == method])]
     return "\n\n".join(parts) + "\n"
 
 

@@ -175,7 +175,8 @@ damian train {policy.words} compile=true
 ```
 
 {flown * bool(policy.flown)}**True returns** over [ten outlines](../../../docs/policies.md), {EPISODES}
-episodes each, messages none to seven steps late; difference: of the most likely actions to the *script*, 95 % over outlines:
+episodes each, messages none to seven steps late; difference: of the most likely actions to the *script*,
+95 % over outlines:
 
 {markdown_table(["UAVs", *KINDS, "difference"], rows)}
 """
