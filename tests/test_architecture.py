@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import damian
+from damian.world.messages import Messages
 
 ROOT = Path(damian.__file__).parent
 RECIPES = ROOT.parent / "recipes"
@@ -159,3 +160,11 @@ def test_every_public_name_exists_and_is_loaded_on_demand():
     assert all(getattr(damian, name).__name__ == name for name in damian._MODULE_OF)
     with pytest.raises(AttributeError, match="no attribute nothing"):
         _ = damian.nothing
+
+
+def test_the_service_for_fleets_fills_every_column_of_a_message():
+    """Its own tests need further packages, and run by ``make fleet``."""
+    path = ROOT.parent / "examples/fleet/damian_fleet/known.py"
+    called = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
+    (made,) = [each for each in called if getattr(each.func, "id", "") == "Messages"]
+    assert {each.arg for each in made.keywords} == {*Messages._fields}

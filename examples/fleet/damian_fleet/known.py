@@ -273,6 +273,7 @@ def messages_of(
         serves=at.new_zeros(len(at), 0),
         executed=at.new_zeros(len(at), 0),
         announced=at.new_zeros(len(at), 0, 4),
+        pending=at.new_zeros(len(at), 0, 5),
         trail=stops[..., 0],
         landed=torch.where(stops[..., 1] >= 0, stops[..., 1] * dt, -1.0),
         events=at.new_zeros(*stops.shape[:-1], 0),

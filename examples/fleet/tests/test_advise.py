@@ -52,7 +52,7 @@ def test_a_table_is_answered_with_landing_points(advise, capsys):
 def test_a_trained_policy_answers_as_it_was_trained(advise, capsys):
     rows = TABLE.splitlines()
     Path("three.csv").write_text("\n".join(rows), encoding="utf-8")
-    words = ["checkpoint=damian:crowded-any-delay", "region=llanbedr", "table=three.csv"]
+    words = ["checkpoint=damian:tracking", "region=llanbedr", "table=three.csv"]
     with pytest.raises(SystemExit):
         advise(*words)
     assert capsys.readouterr().err.startswith(
