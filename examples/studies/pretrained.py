@@ -1,7 +1,7 @@
 """Make the policies of the package, ``damian/data/NAME``, each with a card (docs/policies.md).
 
-    python examples/studies/pretrained.py      (three hours on one core; finished runs are taken)
-    python examples/studies/pretrained.py requests --runs runs/pretrained
+    python examples/studies/pretrained.py      (two hours on two cores; finished runs are taken)
+    python examples/studies/pretrained.py convoy --runs runs/pretrained
 
 A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half
 precision, ``config.yaml`` the settings, ``result.csv`` and the card ``README.md`` what it returns
@@ -65,11 +65,11 @@ POLICIES = {
         '"observation.local_features=[spotted,place,number]" learner.team=1.0 '
         "learner.anneal=true learner.epochs=4 learner.entropy_coeff=0.01 "
         f"{LATE} {ANYWHERE} worlds=256 frames=800000",
-        f"{REGIONS}, all of 15 m/s, after two sources.",
+        f"{REGIONS}, all of 15 m/s, after two sources; footprints of 45 m.",
     ),
     "tracking": Packaged(
         f"scenario=tasks/tracking {LATE} {ANYWHERE} frames=1000000",
-        f"{REGIONS}, at their targets at once, after one fast source.",
+        f"{REGIONS}, at their targets at once, after one fast source; footprints of 32 m.",
     ),
 }
 """The policies, by name."""

@@ -46,10 +46,7 @@ def test_settings_help_and_misspelt_words_need_neither_torch_nor_pandas(code):
 
 
 FILES = "is not one of damian:fir.csv, damian:queue_trace.csv"
-POLICIES = (
-    "is not one of damian:convoy, damian:crowded-any-delay, damian:flights, damian:requests, "
-    "damian:tracking"
-)
+POLICIES = "is not one of damian:convoy, damian:crowded, damian:flights, damian:tracking"
 
 
 @pytest.mark.parametrize(
@@ -74,7 +71,7 @@ POLICIES = (
             f"checkpoint: nowhere holds no config.yaml: damian:nowhere {POLICIES}",
         ),
         (["fly", "policy=deterministic"], "policy: deterministic needs checkpoint"),
-        (["fly", "checkpoint=damian:crowded"], f"checkpoint: damian:crowded {POLICIES}"),
+        (["fly", "checkpoint=damian:covered"], f"checkpoint: damian:covered {POLICIES}"),
         (["fly", "agents=3", "shown=[0,3]"], "shown: ['0', '3'] is not a list of UAVs from 0 to 2"),
         (
             ["train", "resume=nowhere", "agents=4"],

@@ -23,6 +23,7 @@ from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon
 DATA = Path(__file__).parents[1] / "data" / "regions"
 FIR = DATA / "fir.csv"
 ZONES = DATA / "zones.geojson"
+OUTLINES = DATA / "outlines.geojson"
 SHIPPED = Path(damian.__file__).parent / "data" / "fir.csv"
 DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 
@@ -56,6 +57,16 @@ def test_a_hole_stays_a_hole_and_heights_are_ignored():
     region = read_area(ZONES, where="name=lake")
     outer_area = Polygon(region.polygon.exterior).area
     assert region.polygon.area == pytest.approx(outer_area * 8 / 9, rel=1e-3)
+
+
+def test_policies_are_measured_over_ten_outlines_of_which_four_have_a_hole():
+    names = [each["properties"]["name"] for each in json.loads(OUTLINES.read_text())["features"]]
+    polygons = [read_area(OUTLINES, where=f"name:{name}").polygon for name in names]
+    assert len({*names}) == 10
+    assert sum(len(polygon.interiors) for polygon in polygons) == 4
+    areas = [polygon.area for polygon in polygons]
+    assert min(areas) == pytest.approx(120_000, rel=0.01)
+    assert max(areas) == pytest.approx(280_000, rel=0.01)
 
 
 RING = ring(8.0, 45.0, 8.01, 45.01)
