@@ -34,31 +34,6 @@ def distances(places: Tensor, others: Tensor) -> Tensor:
     )  # no matrix product
 
 
-def nearest_distance(places: Tensor, others: Tensor) -> Tensor:
-    """Distance of each of the others [*, Q, 2] from the nearest of the places [*, P, 2], [*, Q]."""
-    if places.is_cuda or torch.compiler.is_compiling():
-        (east, north), (others_east, others_north) = map(_coordinates, (places, others))
-        square = (east.unsqueeze(-1) - others_east.unsqueeze(-2)).square()
-        square = square + (north.unsqueeze(-1) - others_north.unsqueeze(-2)).square()
-        return square.amin(-2).sqrt()
-    return distances(places, others).amin(-2)
-
-
-@torch.library.custom_op("damian::coordinates", mutates_args=())
-def _coordinates(places: Tensor) -> Tensor:
-    """The coordinates [2, *] of places [*, 2], each in one piece of memory.
-
-    A compiler cannot look into it, so that it does not gather the places anew for each of their
-    pairs with others, which kept the loop over pairs from being vectorised.
-    """
-    return places.movedim(-1, 0).clone(memory_format=torch.contiguous_format)
-
-
-@_coordinates.register_fake
-def _(places):  # compilers need only the shape
-    return places.new_empty(places.shape[-1:] + places.shape[:-1])
-
-
 def next_true(flags: Tensor) -> Tensor:
     """Index of the next true flag at or after each place, T if there is none; flags [T, ...] by
     time."""

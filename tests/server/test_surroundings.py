@@ -7,8 +7,9 @@ import shapely
 import torch
 
 from damian import DelayConfig, ScenarioConfig, keys, make_env
+from damian.common.tensors import distances
 from damian.server.config import ObservationConfig
-from damian.server.features.coverage import RINGS, SECTORS
+from damian.server.features.coverage import RINGS, SECTORS, nearest_distance
 from damian.server.features.others import OTHERS
 from damian.world.config import MotionConfig, RegionConfig
 
@@ -106,3 +107,12 @@ def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
                 values = torch.tensor([number for name in REST for number in expected[name]])
                 assert rest.allclose(values, atol=1e-5), (world, step, i)
                 check_others(others.view(OTHERS, 5), expected["others"])
+
+
+def test_the_nearest_place_compiled_is_at_the_smallest_distance():
+    places = torch.rand(4, 3, 5, 2) * 400
+    others = torch.rand(4, 3, 7, 2) * 400
+    expected = torch.stack([distances(one, others) for one in places.split(1, -2)]).amin(0)
+    compiled = torch.compile(nearest_distance, fullgraph=True, backend="aot_eager")
+    for found in (nearest_distance(places, others), compiled(places, others)):
+        torch.testing.assert_close(found, expected.squeeze(-2))

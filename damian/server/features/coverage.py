@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from damian.common import devices
-from damian.common.tensors import gather_rows, nearest_distance
+from damian.common.tensors import distances, gather_rows
 from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature, footprint_radii
 from damian.world.airspace import Airspace
@@ -113,3 +113,28 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     new = (nearest / (2 * radius) + _OLDEST * age).amin(-2)
     new = new.view(places.shape[:-1]).clamp(max=1)
     return new * gather_rows(v.table(map_places_inside), v.tabled(standing))
+
+
+def nearest_distance(places: Tensor, others: Tensor) -> Tensor:
+    """Distance of each of the others [*, Q, 2] from the nearest of the places [*, P, 2], [*, Q]."""
+    if places.is_cuda or torch.compiler.is_compiling():
+        (east, north), (others_east, others_north) = map(_coordinates, (places, others))
+        square = (east.unsqueeze(-1) - others_east.unsqueeze(-2)).square()
+        square = square + (north.unsqueeze(-1) - others_north.unsqueeze(-2)).square()
+        return square.amin(-2).sqrt()
+    return distances(places, others).amin(-2)
+
+
+@torch.library.custom_op("damian::coordinates", mutates_args=())
+def _coordinates(places: Tensor) -> Tensor:
+    """The coordinates [2, *] of places [*, 2], each in one piece of memory.
+
+    A compiler cannot look into it, so that it does not gather the places anew for each of their
+    pairs with others, which kept the loop over pairs from being vectorised.
+    """
+    return places.movedim(-1, 0).clone(memory_format=torch.contiguous_format)
+
+
+@_coordinates.register_fake
+def _(places):  # compilers need only the shape
+    return places.new_empty(places.shape[-1:] + places.shape[:-1])
