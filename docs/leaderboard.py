@@ -84,9 +84,9 @@ def submission(folder: Path, method: str, authors: str, experiment: Experiment) 
             word for word in record.get("overrides", []) if key_of(word) not in ("logger", "seed")
         ]
         told = {name: record.get(name) for name in ("damian", "commit")}
-        learnt = words[task.split(HELD_OUT_MARK)[0], delay]
-        told["fingerprint"] = fingerprint(*learnt)
-        if (task, delay) in words:
+        learnt = words.get((trained_in(task), delay))
+        told["fingerprint"] = fingerprint(*learnt) if learnt else None
+        if learnt and task == trained_in(task):
             check_task(run, settings_of(*learnt))
         facts.append({"return": found[TRAINED], "settings": shlex.join(settings), **told})
         if (run / CHECKPOINT).exists():  # flights elsewhere have no networks
@@ -103,14 +103,19 @@ def words_of_tasks(experiment: Experiment) -> dict[tuple[str, str], list[str]]:
     return {(task, delay): [*tasks[task], *delays[delay]] for task in tasks for delay in delays}
 
 
+def trained_in(task: str) -> str:
+    """The task in which a policy learnt that flies in a task, which may be held out."""
+    return task.partition(HELD_OUT_MARK)[0]
+
+
 settings_of = cache(cli.settings)
 """The settings of a training that words compose."""
 
 
 @cache
 def fingerprint(*words: str) -> str:
-    """Twelve digits of the SHA-256 of what a task and its delay state: equal if nothing of it has
-    changed."""
+    """A hash, of twelve hexadecimal digits, of all settings of a task and its delay that ``words``
+    compose; it changes with any of them."""
     stated = [leaf for leaf in leaves(settings_of(*words)) if f"{leaf[0]}.".startswith(OF_TASKS)]
     return hashlib.sha256(json.dumps(stated).encode()).hexdigest()[:12]
 
@@ -163,7 +168,7 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         checks.require(not empty.any(), f"{path}: {name}", "it", "is empty")
     words = words_of_tasks(experiment)
     for (task, delay), found in rows.groupby(["task", "delay"])["fingerprint"]:
-        asked = fingerprint(*words[task.split(HELD_OUT_MARK)[0], delay])
+        asked = fingerprint(*words[trained_in(task), delay])
         should = f"is not {asked}, that of the task as it stands: run it again"
         known = found.isin([asked, OLDER]).all()
         checks.require(known, f"{path}: {task}/{delay}: fingerprint", found.iloc[0], should)

@@ -86,6 +86,10 @@ def compiled(function: Function, **options: Any) -> Function:
     )
 
 
+_FEWEST_IN_VECTORS = 16
+"""Smallest number of UAVs for which loops over them are vectorised."""
+
+
 def world_options(n_agents: int) -> dict[str, Any]:
     """Options of ``compiled`` for the steps of worlds on a CPU."""
     return {
@@ -101,7 +105,3 @@ def world_options(n_agents: int) -> dict[str, Any]:
             "cpp.vec_isa_ok": True,
         }
     }
-
-
-_FEWEST_IN_VECTORS = 16
-"""Number of UAVs from which on loops over them are vectorised: 20 take three quarters of the time."""

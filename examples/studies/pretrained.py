@@ -1,6 +1,6 @@
 """Make the policies of the package, ``damian/data/NAME``, each with a card (docs/policies.md).
 
-    python examples/studies/pretrained.py      (two hours on two cores; finished runs are taken)
+    python examples/studies/pretrained.py      (two hours; finished runs are taken)
     python examples/studies/pretrained.py convoy --runs runs/pretrained
 
 A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half
@@ -174,7 +174,7 @@ def card(name: str, run: Path, lines: pd.DataFrame) -> str:
 damian train {policy.words} compile=true
 ```
 
-{flown * bool(policy.flown)}**True returns** ([what is measured](../../../docs/policies.md)):
+{flown * bool(policy.flown)}Mean true returns over [ten areas](../../../docs/policies.md):
 
 {markdown_table(["UAVs", *KINDS, "difference"], rows)}
 """

@@ -99,6 +99,13 @@ def test_runs_of_another_task_or_without_their_folders_are_refused(folder, capsy
     check_refused(submit, "seed_8 is not the folder of a finished run", capsys)
 
 
+def test_runs_of_a_task_that_is_not_of_the_leaderboard_are_refused(folder, capsys):
+    (folder / "crowded").rename(folder / "crowded_mini")
+    table = folder / "results.csv"
+    table.write_text(table.read_text().replace("crowded,", "crowded_mini,"))
+    check_refused(submit, "task: crowded_mini is not of the leaderboard", capsys)
+
+
 WRONG = {
     "seed: [0, 1, 2, 3, 4] are too few, or too small: run compare again": {"seed": range(5)},
     "task: crowded_mini is not of the leaderboard: train in one that is": {"task": "crowded_mini"},
