@@ -18,7 +18,8 @@ own latest actions. Of these
 - timeline shows all that has arrived of the latest steps, registered, by when it was true
   (``ObservationTimeline``).
 
-With backupdate the critic learns from what has arrived since (``BackupdateStorage``);
+With backupdate the critic learns from what has arrived since (``BackupdateStorage``), with gru the
+actor has a memory;
 undelayed+registered acts as undelayed does, but is flown late with what is registered. Each policy
 is evaluated under several delays, by its most likely actions, in episodes that begin alike for all.
 
@@ -32,6 +33,7 @@ import math
 import statistics
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -66,6 +68,7 @@ from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.models.config import MlpConfig, ModelConfig
+from damian.models.memory import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms.base import Correction
 from damian.transforms.entries import Entries
@@ -93,6 +96,13 @@ class Method(NamedTuple):
     """Whether agents observe timelines."""
     backupdate: bool = False
     """Whether the critic learns from what has arrived since."""
+    memory: bool = False
+    """Whether the actor's last hidden layer is a gated recurrent unit."""
+
+    @property
+    def model(self) -> MlpConfig:
+        """The networks."""
+        return replace(MODEL, rnn="gru") if self.memory else MODEL
 
 
 METHODS: dict[str, Method | None] = {
@@ -103,6 +113,9 @@ METHODS: dict[str, Method | None] = {
     "backupdate": Method(backupdate=True),
     "registered": Method(history=True, registered=True),
     "registered+backupdate": Method(history=True, registered=True, backupdate=True),
+    "registered+backupdate+gru": Method(
+        history=True, registered=True, backupdate=True, memory=True
+    ),
     "buffer": Method(history=True, registered=True, buffer=True),
     "timeline": Method(history=True, timeline=True),
     "timeline+backupdate": Method(history=True, timeline=True, backupdate=True),
@@ -174,7 +187,7 @@ def make_learner(env: TransformedEnv, method: Method, longest: int) -> Mappo:
     """The learner that also trains UAVs: MAPPO, with back-updating if the method says so."""
     config = OrthogonalMappo(**LEARNER)
     late = {"backupdate": method.backupdate, "settle": method.backupdate}
-    setup = LearningSetup(MODEL, WORLDS, HORIZON, HORIZON, longest, **late)
+    setup = LearningSetup(method.model, WORLDS, HORIZON, HORIZON, longest, **late)
     size = config.buffer_size(setup)
     if size is None:
         return config.make(env, setup, None)
@@ -198,6 +211,7 @@ def train(method: Method, seed: int, args: Namespace, bar: tqdm) -> nn.Module:
     set_seed(env, seed)
     learner = make_learner(env, method, longest)
     done = 0
+    add_recurrent_state(env, learner.actor)
     collector = Collector(
         env,
         learner.actor,
@@ -226,6 +240,8 @@ def returns_in(batch: TensorDictBase) -> float:
 @torch.no_grad()
 def evaluate(env: TransformedEnv, actor: nn.Module | None) -> float:
     """Mean return of the most likely actions, in episodes that begin alike at every call."""
+    if actor:
+        add_recurrent_state(env, actor)
     set_seed(env, EVALUATION_SEED)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return returns_in(env.rollout(HORIZON, actor, break_when_any_done=False))

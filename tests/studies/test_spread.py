@@ -10,6 +10,7 @@ from spread import METHODS, SLOTS, make_env, make_learner
 
 from damian import keys, set_seed
 from damian.models.config import MlpConfig
+from damian.models.memory import add_recurrent_state
 
 WORLDS = 3
 LATE = (3, 9)
@@ -78,6 +79,7 @@ def corrected(method):
     env = make_env(METHODS[method], 4, LATE, 9)
     set_seed(env, 0)
     learner = make_learner(env, METHODS[method], 9)
+    add_recurrent_state(env, learner.actor)
     with torch.no_grad():
         batches = env.rollout(3 * HORIZON, learner.actor, break_when_any_done=False).split(
             HORIZON, 1
@@ -85,7 +87,9 @@ def corrected(method):
     return [learner.backupdated_batch(batch) for batch in batches][1:]
 
 
-@pytest.mark.parametrize("method", ["backupdate", "registered+backupdate", "timeline+backupdate"])
+@pytest.mark.parametrize(
+    "method", ["backupdate", "registered+backupdate+gru", "timeline+backupdate"]
+)
 def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, method):
     for late in corrected(method):
         kinematics = late["next", *KINEMATICS]
