@@ -26,6 +26,7 @@ from damian.compare.comparison import (
     ENDS,
     HELD_OUT_MARK,
     LATE_DATA,
+    NOT_LATE,
     RUN,
     SIMULATOR,
     TRAINED,
@@ -39,7 +40,7 @@ from damian.recipes import cli
 from damian.recipes.compare import includes
 from damian.recipes.shared.environments import compose_scenario
 from damian.recipes.shared.sweeps import stored_results
-from damian.runs.run_folder import RANDOM
+from damian.runs.run_folder import RANDOM, SCRIPT
 from damian.show.episode import record
 from damian.show.frame import frame_of
 from damian.show.views import MapView, legend_marks
@@ -90,6 +91,26 @@ WORLDS = {
     "requests": (["scenario=requests"], 20),
 }
 """Pictures of docs/world.md: what is flown by the script, and the step that is shown."""
+TASKS = {
+    "crowded ground": ("delaybench", "crowded"),
+    "two UAVs": ("delaybench", "crowded_pair"),
+    "with flights": ("delaybench", "crowded_flights"),
+    "flights that end\nelsewhere (news)": ("delaybench", "crowded_news"),
+    "one moving\nsource (news)": ("delaybench", "tracking"),
+    "two moving\nsources (news)": ("tasks", "convoy"),
+}
+"""Tasks of the figure that tells who wins where: where their rows are stored, and their names."""
+WINNERS = {
+    "newest messages": ("naive+gru", "naive"),
+    "newest messages, back-updating": ("backupdate+gru", "backupdate"),
+    "the same, jitter buffer": ("backupdate+gru+hold",),
+    "timeline, back-updating": ("timeline",),
+    "the same, memory": ("timeline+gru",),
+    "a Bayes filter of the source": ("belief",),
+    "script, flown forward": ("script+forward",),
+}
+"""Labels of methods in that figure; of several the first is shown that has been run."""
+UNDELAYED = "undelayed"
 LEADERBOARD = """# Leaderboard
 
 Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by
@@ -105,6 +126,7 @@ delays. Mean over seeds [95 % interval] (seeds).
 ![Returns over the delay of the flight](results/delaybench/matrix.png)"""
 FEWEST = 3
 """Fewest seeds of which the leaderboard shows a mean: fewer have no interval."""
+LOOKS = (*COLOURS, "0.3")
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 
 
@@ -178,6 +200,7 @@ def main() -> None:
         panel.set_xlabel("step", fontsize=8)
     figure.savefig(IMAGES / "delay_laws.png", dpi=110)
     plot_matrix(DELAYBENCH / "matrix.png")
+    plot_tasks(IMAGES / "tasks.png")
     write_leaderboard()
     for name, (words, step) in WORLDS.items():
         plot_world(IMAGES / f"world_{name}.png", words, step, 1 + (name == "randomisation"))
@@ -333,6 +356,38 @@ def plot_matrix(path: Path) -> None:
         right.set(xlabel="delays that vary")
         handles = left.get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=2, frameon=False)
+        figure.savefig(path, dpi=150)
+
+
+def plot_tasks(path: Path) -> None:
+    """Draw who wins where: normalised returns under one to seven steps, a column for each task."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+        axes = figure.subplots()
+        for place, (folder, task) in enumerate(TASKS.values()):
+            results = stored_results(DELAYBENCH.parent / folder)
+            methods = cli.settings(f"experiment={folder}", program="compare").experiment.methods
+            rows, points = (each[each["task"] == task] for each in results)
+            rows = rows[rows["delay"].isin(("1-7", NOT_LATE))]
+            seeds = rows.groupby("method")["seed"].nunique()
+            for number, names in enumerate(WINNERS.values()):
+                run = [name for name in names if seeds.get(name, 0) >= FEWEST]
+                if run:
+                    compared = rows[rows["method"].isin((UNDELAYED, run[0]))]
+                    table = Comparison(compared, points, methods).table
+                    flown = table["policy"].isin((TRAINED, SCRIPT))
+                    known = table[(table["method"] == run[0]) & flown].iloc[0]
+                    value, low, high = (known["J_norm" + end] for end in ENDS)
+                    x = place + 0.1 * (number - len(WINNERS) / 2)
+                    error = [[value - low], [high - value]]
+                    axes.errorbar(x, value, error, marker="o", color=LOOKS[number], markersize=4)
+        for number, label in enumerate(WINNERS):
+            axes.plot([], [], "o", color=LOOKS[number], markersize=4, label=label)
+        for level in (0, 1):
+            axes.axhline(level, color="0.5", linewidth=0.8, linestyle="--" if level else ":")
+        axes.set_xticks(range(len(TASKS)), TASKS)
+        axes.set(ylabel="return (0 random, 1 undelayed)", xlim=(-0.6, len(TASKS) - 0.4))
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
         figure.savefig(path, dpi=150)
 
 

@@ -2,6 +2,10 @@
 
     python examples/studies/pretrained.py      (two hours; finished runs are taken)
     python examples/studies/pretrained.py convoy --runs runs/pretrained
+    python examples/studies/pretrained.py crowded --fly planner.horizon=4 --agents 3 --planner
+
+The last one trains nothing: it flies policies of the package over the outlines, with settings of
+the user's own, and prints the table.
 
 A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half
 precision, ``config.yaml`` the settings, ``result.csv`` and the card ``README.md`` what it returns
@@ -13,6 +17,7 @@ import shlex
 import subprocess
 import sys
 from argparse import ArgumentParser
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +28,7 @@ from scipy.special import stdtrit
 from tqdm import tqdm
 
 import damian
+from damian.baselines.planner import planner_policy
 from damian.baselines.script import script_policy
 from damian.common.fields import nested
 from damian.common.tables import markdown_table, write_csv
@@ -76,8 +82,6 @@ POLICIES = {
 OUTLINES = Path(__file__).parents[2] / "tests" / "data" / "regions" / "outlines.geojson"
 """Ten areas of 0.12 to 0.28 km² in the shape of countries (Natural Earth, public domain), with
 holes in four of them."""
-KINDS = ("sampled", "most likely", "script", "script+forward")
-"""What flies: the policy's actions, drawn and most likely, and two scripts."""
 FLEETS = (3, 5, 8)
 """Numbers of UAVs that fly over the outlines."""
 EPISODES = 10
@@ -86,18 +90,31 @@ SEED = 20_000
 """The seed of these episodes."""
 
 
-def over_outlines(run: str) -> pd.DataFrame:
+def over_outlines(
+    run: str,
+    settings: Sequence[str] = (),
+    fleets: Sequence[int] = FLEETS,
+    planner: bool = False,
+) -> pd.DataFrame:
     """True returns of a policy over outlines that no training has seen, beside scripts in the same
     episodes.
 
     A line for each number of UAVs and outline: mean returns of sampled and of most likely actions,
-    of the script on the same late messages, and of the script flown forward.
+    of the script on the same late messages, and of the script flown forward; with ``planner`` also
+    of the planner on what is flown forward.
+
+    Args:
+        run: folder of a run, or the name of a policy of the package.
+        settings: with which all fly, if not with those of the policy.
+        fleets: numbers of UAVs.
+        planner: whether it flies, too.
     """
     outlines = json.loads(OUTLINES.read_text(encoding="utf-8"))["features"]
-    places = [(n, each["properties"]["name"]) for n in FLEETS for each in outlines]
+    places = [(n, each["properties"]["name"]) for n in fleets for each in outlines]
     lines = []
     for agents, outline in tqdm(places, run):
         words = [f"region={OUTLINES}", f"region.where=name:{outline}", f"agents={agents}"]
+        words += settings
         ahead = ["observation.own=true", "observation.forward=script"]
         policy, env = damian.load(run, *words, num_worlds=EPISODES, seed=SEED)
         late, forward = (
@@ -110,6 +127,8 @@ def over_outlines(run: str) -> pd.DataFrame:
             "script": (late, script_policy(late)),
             "script+forward": (forward, script_policy(forward)),
         }
+        if planner:
+            flights["planner"] = (forward, planner_policy(forward))
         line: dict[str, object] = {"agents": agents, "outline": outline}
         for kind, (world, flown) in flights.items():
             world.set_seed(SEED)
@@ -154,14 +173,6 @@ def card(name: str, run: Path, lines: pd.DataFrame) -> str:
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))
     data = "without delay" if policy.flown else "from late data only"
     flown = "Its settings for flights: `" + " ".join(policy.flown) + "`.\n\n"
-    rows = [
-        [
-            f"{agents}",
-            *(f"{line[kind]:.1f}" for kind in KINDS),
-            f"{line['difference']:.1f} [{line['low']:.1f}, {line['high']:.1f}]",
-        ]
-        for agents, line in differences(lines).iterrows()
-    ]
     return f"""# {name}
 
 `policy, env = damian.load("damian:{name}")`
@@ -176,8 +187,22 @@ damian train {policy.words} compile=true
 
 {flown * bool(policy.flown)}Mean true returns over [ten areas](../../../docs/policies.md):
 
-{markdown_table(["UAVs", *KINDS, "difference"], rows)}
+{table(lines)}
 """
+
+
+def table(lines: pd.DataFrame) -> str:
+    """Mean returns over outlines, for each number of UAVs."""
+    kinds = [*lines.columns.drop(["agents", "outline"])]
+    rows = [
+        [
+            f"{agents}",
+            *(f"{line[kind]:.1f}" for kind in kinds),
+            f"{line['difference']:.1f} [{line['low']:.1f}, {line['high']:.1f}]",
+        ]
+        for agents, line in differences(lines).iterrows()
+    ]
+    return markdown_table(["UAVs", *kinds, "difference"], rows)
 
 
 def main(words: list[str] | None = None) -> None:
@@ -187,9 +212,16 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument(
         "--runs", type=Path, default=Path("runs/pretrained"), help="folder of the runs"
     )
+    parser.add_argument("--fly", nargs="+", metavar="KEY=VALUE", help="settings to fly with")
+    parser.add_argument("--agents", nargs="+", type=int, default=FLEETS, help="with --fly")
+    parser.add_argument("--planner", action="store_true", help="with --fly: beside the planner")
     args = parser.parse_args(words)
     torch.set_num_threads(1)
     for name in args.names:
+        if args.fly:
+            lines = over_outlines(f"damian:{name}", args.fly, args.agents, args.planner)
+            print(f"{name}\n\n{table(lines)}\n")
+            continue
         run = args.runs / name
         if not (run / "result.csv").exists():
             command = [
