@@ -90,7 +90,7 @@ def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(tm
     assert "ActionHistory" in page("api/transforms")
     for picture, page_name in (
         ("images/flight.gif", "."),
-        ("results/delaybench/curves.png", "report"),
+        ("results/delaybench/matrix.png", "report"),
     ):
         assert (tmp_path / picture).stat().st_size > 10_000
         assert picture in page(page_name)
