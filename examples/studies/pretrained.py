@@ -16,6 +16,7 @@ import json
 import shlex
 import subprocess
 import sys
+import time
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ import pandas as pd
 import torch
 import yaml
 from scipy.special import stdtrit
+from tensordict.nn import TensorDictModule
 from tqdm import tqdm
 
 import damian
@@ -32,6 +34,7 @@ from damian.baselines.planner import planner_policy
 from damian.baselines.script import script_policy
 from damian.common.fields import nested
 from damian.common.tables import markdown_table, write_csv
+from damian.envs.delayed_env import DelayedEnv
 from damian.recipes import cli
 from damian.recipes.shared.runs import run_settings
 from damian.runs.checkpoint import read_checkpoint, write_checkpoint
@@ -88,6 +91,8 @@ EPISODES = 10
 """Episodes over each outline."""
 SEED = 20_000
 """The seed of these episodes."""
+TIMED = 40
+"""Steps of which the mean time is told."""
 
 
 def over_outlines(
@@ -114,28 +119,48 @@ def over_outlines(
     lines = []
     for agents, outline in tqdm(places, run):
         words = [f"region={OUTLINES}", f"region.where=name:{outline}", f"agents={agents}"]
-        words += settings
-        ahead = ["observation.own=true", "observation.forward=script"]
-        policy, env = damian.load(run, *words, num_worlds=EPISODES, seed=SEED)
-        late, forward = (
-            damian.load(run, *words, *changed, num_worlds=EPISODES, seed=SEED).env
-            for changed in (["observation.forward=null"], ahead)
-        )
-        flights = {
-            "sampled": (env, policy),
-            "most likely": (env, policy),
-            "script": (late, script_policy(late)),
-            "script+forward": (forward, script_policy(forward)),
-        }
-        if planner:
-            flights["planner"] = (forward, planner_policy(forward))
+        flights = made_flights(run, [*words, *settings], EPISODES, planner)
         line: dict[str, object] = {"agents": agents, "outline": outline}
-        for kind, (world, flown) in flights.items():
-            world.set_seed(SEED)
-            horizon = world.uav_env.scenario.episode.max_steps or 0
-            line[kind] = evaluate(world, flown, horizon, sample=kind == "sampled")["return"]
+        for kind, (env, policy) in flights.items():
+            env.set_seed(SEED)
+            horizon = env.uav_env.scenario.episode.max_steps or 0
+            line[kind] = evaluate(env, policy, horizon, sample=kind == "sampled")["return"]
         lines.append(line)
     return pd.DataFrame(lines)
+
+
+def made_flights(
+    run: str, words: Sequence[str], worlds: int, planner: bool
+) -> dict[str, tuple[DelayedEnv, TensorDictModule]]:
+    """What flies, by name: the policy of a run, sampled and most likely, and its rivals."""
+    ahead = ["observation.own=true", "observation.forward=script"]
+    policy, env = damian.load(run, *words, num_worlds=worlds, seed=SEED)
+    late, forward = (
+        damian.load(run, *words, *changed, num_worlds=worlds, seed=SEED).env
+        for changed in (["observation.forward=null"], ahead)
+    )
+    flights = {
+        "sampled": (env, policy),
+        "most likely": (env, policy),
+        "script": (late, script_policy(late)),
+        "script+forward": (forward, script_policy(forward)),
+    }
+    if planner:
+        flights["planner"] = (forward, planner_policy(forward))
+    return flights
+
+
+def milliseconds(run: str, settings: Sequence[str], agents: int) -> dict[str, float]:
+    """Processor time of a step of one world [ms], the decision and the simulation of late messages
+    included, by what flies."""
+    found = {}
+    flights = made_flights(run, [*settings, f"agents={agents}"], 1, planner=True)
+    for kind, (env, policy) in flights.items():
+        env.rollout(5, policy, break_when_any_done=False)
+        began = time.process_time()
+        env.rollout(TIMED, policy, break_when_any_done=False)
+        found[kind] = 1e3 * (time.process_time() - began) / TIMED
+    return found
 
 
 def differences(lines: pd.DataFrame) -> pd.DataFrame:
@@ -221,6 +246,9 @@ def main(words: list[str] | None = None) -> None:
         if args.fly:
             lines = over_outlines(f"damian:{name}", args.fly, args.agents, args.planner)
             print(f"{name}\n\n{table(lines)}\n")
+            times = milliseconds(f"damian:{name}", args.fly, args.agents[0])
+            told = ", ".join(f"{kind} {ms:.0f}" for kind, ms in times.items())
+            print(f"processor time of a step with {args.agents[0]} UAVs [ms]: {told}")
             continue
         run = args.runs / name
         if not (run / "result.csv").exists():
