@@ -80,7 +80,8 @@ class TrainConfig(ScenarioConfig):
     )
     compile: Any = setting(
         "auto",
-        "Compile the steps, the actor and MAPPO's loss; auto does from a million ``frames`` on.",
+        "Compile the steps, the actor, MAPPO's loss and the planner; auto does in a training from a "
+        "million ``frames`` on.",
         choices=("auto", True, False),
     )
     trust: bool = setting(

@@ -163,7 +163,8 @@ def report(
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
     if planner is not None:
-        policy = planner_policy(env, planner.horizon, planner.samples)
+        compile = config.compile is True
+        policy = planner_policy(env, planner.horizon, planner.samples, compile=compile)
         rows[PLANNER] = fly(policy)
         spent = cast(Planner, policy.module).milliseconds
         print(f"planner: {statistics.median(spent):.0f} ms for a decision in all worlds at once")

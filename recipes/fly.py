@@ -52,7 +52,9 @@ def fly(config: FlyConfig) -> list[Episode]:
 def unlearnt_policy(config: FlyConfig, env: DelayedEnv) -> TensorDictModuleBase:
     """The script, the planner, or random actions."""
     if config.flown == PLANNER:
-        return planner_policy(env, config.planner.horizon, config.planner.samples)
+        planner = config.planner
+        compile = config.compile is True
+        return planner_policy(env, planner.horizon, planner.samples, compile=compile)
     return script_policy(env) if config.flown == SCRIPT else random_policy(env)
 
 

@@ -2,6 +2,7 @@
 script flies on (one-at-a-time rollout; Bertsekas 2021)."""
 
 import time
+from collections.abc import Callable
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -10,18 +11,21 @@ from torch import Tensor
 from damian import keys
 from damian.baselines.script import script_without_belief
 from damian.common import checks, counter_rng
+from damian.common.compiling import CompiledMethods, world_options
 from damian.common.tensors import tree_map
 from damian.envs.commands import destination
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.forward import ForetoldWorlds, ToldWorlds
 from damian.envs.uav_env import UavEnv
 from damian.world.simulation import Simulation
-from damian.world.state import State
+from damian.world.state import PackedState, State
 
 _STREAM = counter_rng.number_of("planner")
 
 
-def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> TensorDictModule:
+def planner_policy(
+    env: DelayedEnv, horizon: int = 4, samples: int = 1, *, compile: bool = False
+) -> TensorDictModule:
     """Build a policy that plans in copies of the worlds of an environment.
 
     For each UAV in turn, in index order, every legal action is tried, with what the UAVs before it
@@ -39,6 +43,7 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
         env: environment whose worlds the policy flies, [B]; with ``message`` among its extras.
         horizon: steps to look ahead.
         samples: copies of a world for each action.
+        compile: compile the steps of the copies, which decide the same in a fraction of the time.
 
     Raises:
         InputError: actions are continuous, or late messages are not flown forward.
@@ -50,11 +55,12 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
     checks.require(relative, "policy", "planner", "plans for actions.command=relative")
     if not env.delays.obs.late:
         worlds = ForetoldWorlds(env.uav_env.simulation)
-        planner = Planner(env.uav_env, worlds, horizon, samples)
+        planner = Planner(env.uav_env, worlds, horizon, samples, compile)
         return TensorDictModule(planner, [keys.MESSAGE], [keys.ACTION])
     should = "plans from late messages with observation.own=true observation.forward=script"
     checks.require(keys.RECALLED in available, "policy", "planner", should)
-    planner = LatePlanner(env.uav_env, ToldWorlds(env.uav_env.simulation), horizon, samples)
+    worlds = ToldWorlds(env.uav_env.simulation)
+    planner = LatePlanner(env.uav_env, worlds, horizon, samples, compile)
     read = [keys.RECALLED, keys.RECEIVED, keys.MESSAGE]
     if keys.ACTION_MASK in available:
         read.append(keys.ACTION_MASK)
@@ -64,10 +70,17 @@ def planner_policy(env: DelayedEnv, horizon: int = 4, samples: int = 1) -> Tenso
 class Planner:
     """Function from the messages of B worlds, whose states it reads, to actions.
 
-    It plans in copies that ``simulation`` steps.
+    It plans in copies that ``simulation`` steps, compiled if ``compile``.
     """
 
-    def __init__(self, worlds: UavEnv, simulation: Simulation, horizon: int, samples: int) -> None:
+    def __init__(
+        self,
+        worlds: UavEnv,
+        simulation: Simulation,
+        horizon: int,
+        samples: int,
+        compile: bool = False,
+    ) -> None:
         checks.whole("planner.horizon", horizon, 1, 1000)
         checks.whole("planner.samples", samples, 1, 1000)
         self.worlds = worlds
@@ -75,6 +88,7 @@ class Planner:
         self.horizon = horizon
         self.samples = samples
         self.script = script_without_belief(worlds)
+        self._compiled = CompiledMethods(world_options(worlds.n_agents)) if compile else None
         self.milliseconds: list[float] = []
         """How long each decision took, of all worlds together."""
 
@@ -89,9 +103,12 @@ class Planner:
     def plan(self, state: State) -> Tensor:
         """The actions of all UAVs, [B, N], from a state."""
         legal = self.simulation.action_mask(state)
-        joint = self.script(state.sent.pack(), mask=legal)
+        copies = self.copies(state)
+        each = len(copies.flags) // len(legal)
+        # Of copies, as later: for another number of worlds a graph would be compiled anew.
+        joint = self._fast(self.usual)(copies)[::each]
         for uav in range(joint.shape[1]):
-            value = self.values(state, joint, uav).where(legal[:, uav], -torch.inf)
+            value = self.values(copies, joint, uav).where(legal[:, uav], -torch.inf)
             usual = value.gather(-1, joint[:, uav : uav + 1]).squeeze(-1)
             better = value.amax(-1) > usual + 1e-6
             joint[:, uav] = torch.where(better, value.argmax(-1), joint[:, uav])
@@ -102,29 +119,52 @@ class Planner:
         mask = self.simulation.action_mask(state)
         return self.script(state.sent.pack(), mask=mask)
 
-    def values(self, state: State, joint: Tensor, uav: int) -> Tensor:
+    def copies(self, state: State) -> PackedState:
+        """C = B A S copies of worlds [B], each A S times: S for each action."""
+        n_copies = self.worlds.scenario.actions.n_actions * self.samples
+        copies = tree_map(lambda each: each.repeat_interleave(n_copies, 0), state)
+        copy = torch.arange(len(copies.seed), device=copies.seed.device)
+        # Every action meets the same draws.
+        number = copy % self.samples
+        seed = counter_rng.bits64(copies.seed, _STREAM, copies.steps, number)
+        return self.simulation.layout.pack(copies._replace(seed=seed))
+
+    def values(self, copies: PackedState, joint: Tensor, uav: int) -> Tensor:
         """The sum of rewards, over the horizon, for each action of a UAV, [B, A], if the others
         choose as in ``joint`` [B, N]."""
         n_actions = self.worlds.scenario.actions.n_actions
         n_copies = n_actions * self.samples
-        copies = tree_map(lambda each: each.repeat_interleave(n_copies, 0), state)
-        copy = torch.arange(len(copies.seed), device=joint.device)
-        # Every action meets the same draws.
-        number = copy % self.samples
-        seed = counter_rng.bits64(copies.seed, _STREAM, copies.steps, number)
-        copies = copies._replace(seed=seed)
         actions = joint.repeat_interleave(n_copies, 0)
+        copy = torch.arange(len(actions), device=joint.device)
         actions[:, uav] = copy // self.samples % n_actions
-        total = torch.zeros_like(actions[:, 0], dtype=torch.float32)
+        total = torch.zeros_like(copy, dtype=torch.float32)
         alive = torch.ones_like(total)
         for step in range(self.horizon):
             if step:
-                actions = self.choice(copies)
-            copies = self.simulation.step(copies, actions)
-            served = self.worlds.server(copies.sent, copies.steps, copies.source_over, observers=())
-            total += served.reward.sum(-1) * alive
-            alive *= ~(served.status.terminated | served.status.truncated)
+                actions = self._fast(self.usual)(copies)
+            copies, reward, ended = self._fast(self.advance)(copies, actions)
+            total += reward * alive
+            alive *= ~ended
         return total.view(len(joint), n_actions, self.samples).mean(-1)
+
+    # Pure functions of copies, which can be compiled.
+
+    def usual(self, copies: PackedState) -> Tensor:
+        """The actions that the script chooses in copies, [C, N]."""
+        return self.choice(self.simulation.layout.unpack(copies))
+
+    def advance(self, copies: PackedState, actions: Tensor) -> tuple[PackedState, Tensor, Tensor]:
+        """The copies one step later, the sums of their rewards, and whether they have ended,
+        [C]."""
+        layout = self.simulation.layout
+        state = self.simulation.step(layout.unpack(copies), actions)
+        served = self.worlds.server(state.sent, state.steps, state.source_over, observers=())
+        ended = served.status.terminated | served.status.truncated
+        return layout.pack(state), served.reward.sum(-1), ended
+
+    def _fast(self, function: Callable) -> Callable:
+        """A function of this object, compiled if that is wanted."""
+        return function if self._compiled is None else self._compiled.get(function)
 
 
 class LatePlanner(Planner):
@@ -132,8 +172,15 @@ class LatePlanner(Planner):
 
     simulation: ToldWorlds
 
-    def __init__(self, worlds: UavEnv, simulation: ToldWorlds, horizon: int, samples: int) -> None:
-        super().__init__(worlds, simulation, horizon, samples)
+    def __init__(
+        self,
+        worlds: UavEnv,
+        simulation: ToldWorlds,
+        horizon: int,
+        samples: int,
+        compile: bool = False,
+    ) -> None:
+        super().__init__(worlds, simulation, horizon, samples, compile)
         self.steps: Tensor | None = None
         """Steps of each world since its reset, [B]."""
         self.plans: Tensor | None = None
@@ -158,15 +205,21 @@ class LatePlanner(Planner):
         begins = (sent.time == 0).all(-1)
         now = torch.where(begins, 0, self.steps + 1)
         plans = self.plans
-
-        def as_planned(state: State, back: int) -> Tensor:
-            mask = self.simulation.action_mask(state)
-            return self.simulation.towards(state.goal, plans[:, back - 1], mask)
-
-        state = self.simulation.flown(recalled, received, now, as_planned)
+        rows = self._fast(self.flown)(recalled, received, now, plans)
+        state = self.simulation.layout.unpack(rows)
         goals = destination(self.simulation.candidates, state.goal, self.plan(state))
         self.steps = now
         self.plans = torch.cat([goals.unsqueeze(1), plans[:, :-1]], 1)
         action = self.simulation.towards(self.simulation.bound_for(sent), goals, mask)
         self.milliseconds.append(1000 * (time.perf_counter() - begin))
         return action
+
+    def flown(self, recalled: Tensor, received: Tensor, now: Tensor, plans: Tensor) -> PackedState:
+        """The worlds ``now`` [B] steps after their reset, flown to by ``plans`` [B, S, N]."""
+
+        def as_planned(state: State, back: int) -> Tensor:
+            mask = self.simulation.action_mask(state)
+            return self.simulation.towards(state.goal, plans[:, back - 1], mask)
+
+        state = self.simulation.flown(recalled, received, now, as_planned)
+        return self.simulation.layout.pack(state)

@@ -24,17 +24,18 @@ class Teacher:
         worlds: environment of the training.
         name: ``script`` or ``planner``.
         horizon: steps that the planner looks ahead.
+        compile: compile what the planner simulates.
 
     Raises:
         InputError: actions are continuous.
     """
 
-    def __init__(self, worlds: "UavEnv", name: str, horizon: int) -> None:
+    def __init__(self, worlds: "UavEnv", name: str, horizon: int, compile: bool = False) -> None:
         discrete = worlds.scenario.actions.kind == "discrete"
         checks.require(discrete, "learner.teacher", name, "needs discrete actions")
         self.server = worlds.server
         self.simulation = ToldWorlds(worlds.simulation)
-        planner = Planner(worlds, self.simulation, horizon, samples=1)
+        planner = Planner(worlds, self.simulation, horizon, samples=1, compile=compile)
         self.choose = planner.plan if name == "planner" else planner.choice
 
     @torch.no_grad()

@@ -11,6 +11,8 @@ from damian.recipes.shared.environments import compose_scenario
 WORDS = ["scenario=delaybench/crowded", "region.initial_conditions=16", "agents=2"]
 WORDS += ["actions.distances=[0,90]", "actions.headings=[0,72,144,216,288]", "source.level_db=147"]
 
+LATE = ["delay.obs=1..3", "observation.own=true", "observation.forward=script"]
+
 
 def made(*words, worlds=2):
     return make_env(compose_scenario(*WORDS, *words), worlds, seed=5, extras=["message"])
@@ -71,12 +73,31 @@ def test_the_planner_returns_more_than_the_script_and_tells_its_time():
 
 def test_without_news_a_late_plan_is_the_undelayed_one():
     chosen = []
-    for words in ([], ["delay.obs=1..3", "observation.own=true", "observation.forward=script"]):
+    for words in ([], LATE):
         env = made(*words)
         env.assume(assumed_script(env))
         rollout = env.rollout(5, planner_policy(env, 2), break_when_any_done=False)
         chosen.append(rollout[keys.ACTION])
     assert chosen[0].equal(chosen[1])
+
+
+@pytest.mark.parametrize("words", [["motion.abort=0.9"], LATE])
+@pytest.mark.parametrize(
+    "options", [{"backend": "eager"}, pytest.param({}, marks=pytest.mark.slow)]
+)
+def test_a_compiled_planner_decides_as_one_that_is_not(words, options):
+    env = made(*words)
+    env.assume(assumed_script(env))
+    planner, compiled = planner_policy(env, 2), planner_policy(env, 2, compile=True)
+    graphs = compiled.module._compiled
+    graphs._options |= options
+    td = env.reset()
+    for _ in range(5):
+        chosen = planner(td.clone())[keys.ACTION]
+        assert compiled(td.clone())[keys.ACTION].equal(chosen)
+        td = env.step_and_maybe_reset(td.set(keys.ACTION, chosen))[1]
+    late = words is LATE
+    assert {*graphs._graphs} == {("usual",), ("advance",), *[("flown",)] * late}
 
 
 def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same():
@@ -86,13 +107,15 @@ def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same(
     env.rollout(3, break_when_any_done=False)
     state = env.uav_env.state
     joint = planner.choice(state)
-    first = planner.values(state, joint, 0)
-    assert first.equal(planner.values(state, joint, 0)), "no hidden state"
+    copies = planner.copies(state)
+    first = planner.values(copies, joint, 0)
+    assert first.equal(planner.values(copies, joint, 0)), "no hidden state"
     held = joint.clone()
     held[:, 0] = 0
-    same = planner.values(state, held, 0)
+    same = planner.values(copies, held, 0)
     assert first.equal(same), "its own choice is replaced"
-    assert not planner.values(state._replace(seed=state.seed + 1), joint, 0).equal(first)
+    others = planner.copies(state._replace(seed=state.seed + 1))
+    assert not planner.values(others, joint, 0).equal(first)
 
 
 @pytest.mark.parametrize(
