@@ -88,7 +88,9 @@ class Planner:
         self.horizon = horizon
         self.samples = samples
         self.script = script_without_belief(worlds)
-        self._compiled = CompiledMethods(world_options(worlds.n_agents)) if compile else None
+        # The number of copies stays: a graph for any number of them takes several times as long.
+        options = {"dynamic": False, **world_options(worlds.n_agents)}
+        self._compiled = CompiledMethods(options) if compile else None
         self.milliseconds: list[float] = []
         """How long each decision took, of all worlds together."""
 
@@ -205,8 +207,7 @@ class LatePlanner(Planner):
         begins = (sent.time == 0).all(-1)
         now = torch.where(begins, 0, self.steps + 1)
         plans = self.plans
-        rows = self._fast(self.flown)(recalled, received, now, plans)
-        state = self.simulation.layout.unpack(rows)
+        state = self.flown(recalled, received, now, plans)
         goals = destination(self.simulation.candidates, state.goal, self.plan(state))
         self.steps = now
         self.plans = torch.cat([goals.unsqueeze(1), plans[:, :-1]], 1)
@@ -214,12 +215,11 @@ class LatePlanner(Planner):
         self.milliseconds.append(1000 * (time.perf_counter() - begin))
         return action
 
-    def flown(self, recalled: Tensor, received: Tensor, now: Tensor, plans: Tensor) -> PackedState:
+    def flown(self, recalled: Tensor, received: Tensor, now: Tensor, plans: Tensor) -> State:
         """The worlds ``now`` [B] steps after their reset, flown to by ``plans`` [B, S, N]."""
 
         def as_planned(state: State, back: int) -> Tensor:
             mask = self.simulation.action_mask(state)
             return self.simulation.towards(state.goal, plans[:, back - 1], mask)
 
-        state = self.simulation.flown(recalled, received, now, as_planned)
-        return self.simulation.layout.pack(state)
+        return self.simulation.flown(recalled, received, now, as_planned)

@@ -96,8 +96,7 @@ def test_a_compiled_planner_decides_as_one_that_is_not(words, options):
         chosen = planner(td.clone())[keys.ACTION]
         assert compiled(td.clone())[keys.ACTION].equal(chosen)
         td = env.step_and_maybe_reset(td.set(keys.ACTION, chosen))[1]
-    late = words is LATE
-    assert {*graphs._graphs} == {("usual",), ("advance",), *[("flown",)] * late}
+    assert {*graphs._graphs} == {("usual",), ("advance",)}
 
 
 def test_copies_draw_anew_what_has_not_happened_and_every_action_meets_the_same():
