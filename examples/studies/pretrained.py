@@ -2,7 +2,7 @@
 
     python examples/studies/pretrained.py      (two hours; finished runs are taken)
     python examples/studies/pretrained.py convoy --runs runs/pretrained
-    python examples/studies/pretrained.py crowded --fly planner.horizon=4 --agents 3 --planner
+    python examples/studies/pretrained.py crowded --fly delay.obs=1..7 --agents 3 --planner
 
 The last one trains nothing: it flies policies of the package over the outlines, with settings of
 the user's own, and prints the table.
@@ -146,7 +146,7 @@ def made_flights(
         "script+forward": (forward, script_policy(forward)),
     }
     if planner:
-        flights["planner"] = (forward, planner_policy(forward))
+        flights["planner"] = (forward, planner_policy(forward, compile=True))
     return flights
 
 
