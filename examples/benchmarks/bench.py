@@ -7,10 +7,12 @@ and memory.
 
 Everything runs on one CPU thread. The measured environments take turns, episodes end at different
 times (``bench_timing.py``), and medians with the lowest and the highest time are reported. The
-tables are printed and written to runs/bench.md, with a figure in runs/bench.png.
+tables are printed and written to runs/bench.md, with a figure in runs/bench.png. Ratios stand
+beside those that were stored before, in docs/results/bench.csv, which ``--store`` renews.
 """
 
 import importlib.util
+import statistics
 import subprocess
 import sys
 from argparse import ArgumentParser
@@ -18,11 +20,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import pandas as pd
 import torch
 from bench_timing import Measured, collector_times, in_turn, rollout_times, rollouts, staggered
-from bench_training import HEADER, training, vmas_actor
+from bench_training import HEADER, WARM_UP, damian, method_config, training, vmas_actor
 from matplotlib.figure import Figure
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -30,7 +33,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
 from tqdm import tqdm
 
-from damian.common.tables import markdown_table
+from damian.common.tables import markdown_table, read_csv, write_csv
 from damian.delays.config import DelayConfig
 from damian.envs.config import ClockConfig, ScenarioConfig
 from damian.envs.delayed_env import DelayedEnv
@@ -70,6 +73,40 @@ TABLE_2 += [
 """Global features of the paper."""
 
 Scenarios = dict[str, ScenarioConfig]
+STORED = Path(__file__).parents[2] / "docs" / "results" / "bench.csv"
+"""Ratios of an earlier run: table, row, column, ratio."""
+
+
+class Table(NamedTuple):
+    """What a part measured; the first cell of a row is its name, and columns of "times" hold ratios."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: list[tuple[Any, ...]]
+
+    def ratios(self) -> pd.DataFrame:
+        """The ratios of this table, a line for each."""
+        lines = [
+            (self.title, row[0], column, cell)
+            for row in self.rows
+            for column, cell in zip(self.header, row, strict=True)
+            if "times" in column
+        ]
+        return pd.DataFrame(lines, columns=["table", "row", "column", "ratio"])
+
+    def markdown(self, stored: pd.DataFrame) -> str:
+        """This table in Markdown, with the stored ratios in brackets."""
+        known = {tuple(line[:3]): line[3] for line in stored.itertuples(index=False)}
+        rows = [
+            [
+                f"{cell} ({before})"
+                if (before := known.get((self.title, row[0], column)))
+                else cell
+                for column, cell in zip(self.header, row, strict=True)
+            ]
+            for row in self.rows
+        ]
+        return f"## {self.title}\n\n{markdown_table(self.header, rows)}\n"
 
 
 @dataclass(frozen=True)
@@ -202,7 +239,7 @@ def policy_for(env: EnvBase) -> torch.nn.Module:
     return vmas_actor(env, 3, [64, 64])
 
 
-def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE, WHOLE)) -> str:
+def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE, WHOLE)) -> Table:
     """Speed beside VMAS, through rollouts and collectors; the figure is written to
     runs/bench.png."""
     others = rivals(sizes.worlds)
@@ -229,7 +266,7 @@ def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE,
     )
     header = ("ms/step", "lowest to highest", f"times VMAS {', '.join(RIVAL_TASKS)}")
     columns = (*(f"rollout: {name}" for name in header), *(f"collector: {name}" for name in header))
-    return table(title, ("environment", *columns, "compile [s]"), rows)
+    return Table(title, ("environment", *columns, "compile [s]"), rows)
 
 
 def jaxmarl_ms(worlds: int) -> float | None:
@@ -263,7 +300,7 @@ def beside_first(scenario: str, times: Mapping[str, Measured]) -> list[tuple[str
     ]
 
 
-def limit_of_speed(presets: Scenarios, sizes: Sizes) -> str:
+def limit_of_speed(presets: Scenarios, sizes: Sizes) -> Table:
     """Time of a compiled step of the whole chain with ever less of TorchRL around it."""
     rows = []
     for name, scenario in presets.items():
@@ -279,7 +316,7 @@ def limit_of_speed(presets: Scenarios, sizes: Sizes) -> str:
         times = in_turn(chunks, sizes.steps, sizes.repeats)
         rows += beside_first(name, times)
     title = f"The limit: {sizes.worlds} worlds, 3 UAVs, whole chain, compiled"
-    return table(title, ("what is timed", "ms/step", "times the rollout"), rows)
+    return Table(title, ("what is timed", "ms/step", "times the rollout"), rows)
 
 
 def steps_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
@@ -299,7 +336,7 @@ def graphs_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
             worlds, memories, _, _ = step(worlds, memories, entries)
 
 
-def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
+def cost_of_delays(presets: Scenarios, sizes: Sizes) -> Table:
     """Time of a step with each kind of delay beside the bare environment, not compiled."""
     rows = []
     for name, scenario in presets.items():
@@ -309,10 +346,10 @@ def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
         times = rollout_times(envs, sizes.steps, sizes.repeats)
         rows += beside_first(name, times)
     title = f"What delays cost: {sizes.worlds} worlds, 3 UAVs, eager"
-    return table(title, ("environment", "ms/step", "times bare"), rows)
+    return Table(title, ("environment", "ms/step", "times bare"), rows)
 
 
-def cost_of_belief(sizes: Sizes) -> str:
+def cost_of_belief(sizes: Sizes) -> Table:
     """Time of a step of a tracking task under the paper's delay, without and with a belief."""
     envs = {
         f"{name}, {mode}": delayed(scenario, delays()[WHOLE], sizes.worlds, mode)
@@ -325,10 +362,10 @@ def cost_of_belief(sizes: Sizes) -> str:
         without = times[f"{NO_BELIEF}, {name.rpartition(', ')[2]}"].median
         rows.append((name, f"{measured.median:.2f}", f"{measured.median / without:.2f}"))
     title = f"What a belief costs: delaybench/tracking, {sizes.worlds} worlds, 3 UAVs, whole chain"
-    return table(title, ("environment", "ms/step", "times without"), rows)
+    return Table(title, ("environment", "ms/step", "times without"), rows)
 
 
-def growth(presets: Scenarios, sizes: Sizes, what: str, numbers: tuple[int, ...]) -> str:
+def growth(presets: Scenarios, sizes: Sizes, what: str, numbers: tuple[int, ...]) -> Table:
     """Time of a step for each number of worlds (with 3 UAVs) or of UAVs, whole chain, not
     compiled."""
     rows = []
@@ -347,10 +384,10 @@ def growth(presets: Scenarios, sizes: Sizes, what: str, numbers: tuple[int, ...]
         rows.append((number, *costs))
     fixed = "3 UAVs" if what == "worlds" else f"{sizes.worlds} worlds, starting anywhere"
     header = [f"{name}: {cost}" for name in presets for cost in ("ms/step", "environment steps/s")]
-    return table(f"Growth with {what}: {fixed}, whole chain, eager", (what, *header), rows)
+    return Table(f"Growth with {what}: {fixed}, whole chain, eager", (what, *header), rows)
 
 
-def many_beside_few(presets: Scenarios, sizes: Sizes) -> str:
+def many_beside_few(presets: Scenarios, sizes: Sizes) -> Table:
     """Time of a step with 20 UAVs over that with 3, whole chain, in turns."""
     envs = {
         (name, mode, number): delayed(fleet(scenario, number), delays()[WHOLE], sizes.worlds, mode)
@@ -365,12 +402,15 @@ def many_beside_few(presets: Scenarios, sizes: Sizes) -> str:
     pairs = [
         (key[:2], found[key].median, found[*key[:2], 3].median) for key in envs if key[2] == 20
     ]
-    rows = [(*key, f"{few:.2f}", f"{many:.2f}", f"{many / few:.2f}") for key, many, few in pairs]
-    header = ("scenario", "mode", "3 UAVs [ms/step]", "20 UAVs", "times")
-    return table(f"20 UAVs beside 3: {sizes.worlds} worlds, whole chain", header, rows)
+    rows = [
+        (", ".join(key), f"{few:.2f}", f"{many:.2f}", f"{many / few:.2f}")
+        for key, many, few in pairs
+    ]
+    header = ("scenario", "3 UAVs [ms/step]", "20 UAVs", "times")
+    return Table(f"20 UAVs beside 3: {sizes.worlds} worlds, whole chain", header, rows)
 
 
-def memory(presets: Scenarios) -> str:
+def memory(presets: Scenarios) -> Table:
     """Bytes of the state and of a step's output for each world, and of the tables that all worlds
     share."""
     rows = []
@@ -386,20 +426,43 @@ def memory(presets: Scenarios) -> str:
             x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), vars(bare.server)])
         }
         rows.append((name, state, *outputs, f"{sum(shared.values()) / 2**20:.1f} MiB"))
-    return table(
+    return Table(
         "Memory: bytes of a world with 3 UAVs",
         ("scenario", "state", "output, bare", "output, all extras", "shared tables"),
         rows,
     )
 
 
-def training_speed(sizes: Sizes) -> str:
+def cost_of_forward(sizes: Sizes) -> Table:
+    """Time of a training iteration whose late messages are flown forward, over that without."""
+    worlds, steps = sizes.training
+    words = "scenario=delaybench/crowded aware=timeline compile=true"
+    trainings = {
+        f"{delay} steps late{told}": damian(
+            method_config(f"{words} delay.obs={delay} {forward}", [64, 64], worlds, steps)
+        )
+        for delay in (1, 4, 7)
+        for told, forward in (("", ""), (", flown forward", "observation.forward=script"))
+    }
+    measured: dict[str, list[float]] = {name: [] for name in trainings}
+    for _ in tqdm(range(WARM_UP + sizes.repeats), "forward", leave=False):
+        for name, iterations in trainings.items():
+            measured[name].append(1e3 * sum(next(iterations)))
+    ms = {name: statistics.median(each[WARM_UP:]) for name, each in measured.items()}
+    rows = [
+        (name, f"{ms[name]:.0f}", f"{ms[name] / ms[name.partition(',')[0]]:.2f}") for name in ms
+    ]
+    title = f"What flying forward costs a compiled training: {worlds} worlds, 3 UAVs, {steps} steps"
+    return Table(title, ("training", "an iteration [ms]", "times without"), rows)
+
+
+def training_speed(sizes: Sizes) -> Table:
     """Environment steps per second of training, and the time that each part of it takes."""
     worlds, steps = sizes.training
     title = (
         f"Training: {worlds} worlds, 3 UAVs, {steps} steps; median of {sizes.repeats} iterations"
     )
-    return table(title, HEADER, training(worlds, steps, sizes.repeats))
+    return Table(title, HEADER, training(worlds, steps, sizes.repeats))
 
 
 def tensors(tree: Any) -> Iterator[Tensor]:
@@ -415,11 +478,6 @@ def tensors(tree: Any) -> Iterator[Tensor]:
         branches = getattr(tree, "__dict__", {}).values()
     for branch in branches:
         yield from tensors(branch)
-
-
-def table(title: str, header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    """A Markdown table under a heading."""
-    return f"## {title}\n\n{markdown_table(header, rows)}\n"
 
 
 def plot_ratios(ratios: Mapping[str, list[float]], path: Path) -> None:
@@ -444,13 +502,13 @@ def plot_ratios(ratios: Mapping[str, list[float]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def measure(names: Sequence[str]) -> None:
-    """Measure the parts of these names, print their tables, and write them to runs/bench.md."""
+def measure(names: Sequence[str], store: bool) -> None:
+    """Measure the parts of these names, print their tables, and write them to runs/bench.md; with
+    ``store`` their ratios stand for those of the same tables that were stored before."""
     torch.set_num_threads(1)
     Path("runs").mkdir(exist_ok=True)
     presets = scenarios()
     sizes = Sizes()
-    report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
     parts = {
         "rivals": lambda: comparison(presets, sizes),
         "quick": lambda: comparison(presets, replace(sizes, steps=25, repeats=3), (WHOLE,)),
@@ -462,12 +520,20 @@ def measure(names: Sequence[str]) -> None:
         "twenty": lambda: many_beside_few(presets, sizes),
         "memory": lambda: memory(presets),
         "training": lambda: training_speed(sizes),
+        "forward": lambda: cost_of_forward(sizes),
     }
     if unknown := [name for name in names if name not in parts]:
         sys.exit(f"{unknown[0]} is none of the parts {', '.join(parts)}")
+    report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
+    stored = read_csv(STORED, text=["table", "row", "column", "ratio"])
     for name in names or [name for name in parts if name != "quick"]:
-        report.append(parts[name]())
+        table = parts[name]()
+        report.append(table.markdown(stored))
         print(report[-1])
+        if store:
+            others = stored[stored["table"] != table.title]
+            stored = pd.concat([others, table.ratios()])
+            write_csv(STORED, stored)
     target = Path("runs/bench.md")
     target.write_text("\n".join(report), encoding="utf-8")
     print(f"results: {target}, figure: {target.with_suffix('.png')}")
@@ -476,4 +542,6 @@ def measure(names: Sequence[str]) -> None:
 if __name__ == "__main__":
     options = ArgumentParser(description="Measure the speed of the environment and of training.")
     options.add_argument("parts", nargs="*", help="quick, rivals, limit, delays, ...: see measure")
-    measure(options.parse_args().parts)
+    options.add_argument("--store", action="store_true", help="keep the ratios to compare with")
+    chosen = options.parse_args()
+    measure(chosen.parts, chosen.store)
