@@ -39,6 +39,9 @@ ALL_EXTRAS = (*EXTRAS, "position", "privileged")
 """All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments
 only."""
 
+_PAIRS_AT_ONCE = 2**20
+"""Pairs of UAVs whose features are computed together for the initial conditions."""
+
 
 class UavEnv(EnvBase):
     """B worlds, in each of which N UAVs search for and track a source or cover a region, without
@@ -107,11 +110,9 @@ class UavEnv(EnvBase):
         checks.require(allowed, "observation.belief", belief, problem)
         told = messages_only or stops >= observation.timeline
         checks.require(told, "observation.stops", stops, problem)
-        initial = self.simulation.initial
-        features = checked_features(self.server, initial.sent, initial.steps)
-        self.layout = self._layouts(features)
+        self.layout: dict[str, Layout] = {}
         """What the columns of each observation mean, by the last part of its key."""
-        self._reset_outputs = self._outputs_at_reset(initial, features)
+        self._reset_outputs = self._reset_tables()
         self._make_specs()
         self.set_seed(seed)
         self.to(torch.device(device))
@@ -296,6 +297,23 @@ class UavEnv(EnvBase):
         to_source = nearest_way(ways) / scale.view(-1, 1, 1)
         to_source = to_source.clamp(-1, 1)
         return torch.cat([global_observation, to_source], -1)
+
+    def _reset_tables(self) -> Outputs:
+        """Outputs of a reset for each initial condition, with the layouts that their features
+        have."""
+        initial = self.simulation.initial
+        n = len(initial.steps)
+        tables: Outputs = {}
+        # Some at a time: features of pairs of UAVs would take gigabytes.
+        for rows in torch.arange(n).split(max(1, _PAIRS_AT_ONCE // self.n_agents**2)):
+            some = tree_map(lambda field, rows=rows: field[rows], initial)
+            features = checked_features(self.server, some.sent, some.steps)
+            self.layout = self._layouts(features)
+            for key, values in self._outputs_at_reset(some, features).items():
+                if key not in tables:
+                    tables[key] = values.new_empty(n, *values.shape[1:])
+                tables[key][rows] = values
+        return tables
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         """Outputs of a reset, [Q, ...] by key, from Q first states of episodes and their
