@@ -94,9 +94,10 @@ class Table(NamedTuple):
         ]
         return pd.DataFrame(lines, columns=["table", "row", "column", "ratio"])
 
-    def markdown(self, stored: pd.DataFrame) -> str:
+    def markdown(self, stored: pd.DataFrame | None = None) -> str:
         """This table in Markdown, with the stored ratios in brackets."""
-        known = {tuple(line[:3]): line[3] for line in stored.itertuples(index=False)}
+        lines = [] if stored is None else stored.itertuples(index=False)
+        known = {tuple(line[:3]): line[3] for line in lines}
         rows = [
             [
                 f"{cell} ({before})"

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pandas as pd
 import torch
-from bench import BARE, WHOLE, delays, policy_for, scenarios, steps_of, table
+from bench import BARE, WHOLE, Table, delays, policy_for, scenarios, steps_of
 from bench_timing import staggered
 from bench_training import damian
 from torchrl.collectors import Collector
@@ -217,10 +217,10 @@ def measure(options: Namespace) -> Iterator[str]:
         for kind in KINDS
         for mode in ("eager", "CUDA graph")[:n_modes]
     ]
-    yield table("The same as on the CPU?", header, rows)
+    yield Table("The same as on the CPU?", header, rows).markdown()
     if device != "cpu":
         rows = [(kind, waits(kind, options.worlds[0])) for kind in KINDS]
-        yield table("Does a step wait for the host?", ("environment", "waits"), rows)
+        yield Table("Does a step wait for the host?", ("environment", "waits"), rows).markdown()
     rows = []
     for name, worlds, job in jobs(options):
         try:
@@ -236,10 +236,10 @@ def measure(options: Namespace) -> Iterator[str]:
         "random actions [million world steps/s]",
         "a policy in a collector",
     )
-    yield table("World steps a second", header, rows)
+    yield Table("World steps a second", header, rows).markdown()
     rows = [long_training(name, max(options.trainings), options) for name in LONG]
     header = ("training", "worlds", "steps", "seconds", "trained", "script", "untrained")
-    yield table("Long trainings, one to seven steps late: true returns", header, rows)
+    yield Table("Long trainings, one to seven steps late: true returns", header, rows).markdown()
 
 
 if __name__ == "__main__":

@@ -29,21 +29,27 @@ def presets():
 
 @pytest.mark.slow
 def test_every_environment_of_the_delay_table_is_measured(presets):
-    text = bench.cost_of_delays({"everything": presets["everything"]}, TINY)
-    assert [f"everything: {kind} " in text for kind in delays()] == [True] * len(delays())
-    assert "| everything: bare | " in text
+    table = bench.cost_of_delays({"everything": presets["everything"]}, TINY)
+    assert [row[0] for row in table.rows] == [f"everything: {kind}" for kind in delays()]
 
 
 @pytest.mark.slow
 def test_the_comparison_has_a_row_for_each_method_and_a_figure(presets, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
-    text = bench.comparison(presets, TINY)
+    table = bench.comparison(presets, TINY)
     names = [*rivals(1), *methods(presets, 1, (BARE, WHOLE), ("eager",))]
-    assert [line.split(" | ")[0] for line in text.strip().splitlines()[4:]] == [
-        f"| {name}" for name in names
-    ]
+    assert [row[0] for row in table.rows] == names
     assert (tmp_path / "runs" / "bench.png").exists()
+
+
+def test_a_ratio_stands_beside_that_which_was_stored():
+    before = bench.Table("t", ("what", "ms", "times"), [("a", "4", "1.00"), ("b", "8", "2.00")])
+    now = before._replace(rows=[("b", "9", "1.50"), ("c", "6", "1.00")])
+    assert now.markdown(before.ratios()).splitlines()[4:] == [
+        "| b | 9 | 1.50 (2.00) |",
+        "| c | 6 | 1.00 |",
+    ]
 
 
 # The training part.
@@ -61,13 +67,14 @@ def test_every_method_trains_and_has_a_row_for_each_width(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_script_for_gpus_compares_and_skips_rows_for_which_no_time_is_left():
+def test_the_script_for_gpus_compares_and_skips_rows_for_which_no_time_is_left(monkeypatch):
     options = Namespace(
         device="cpu",
         worlds=[4],
         trainings=[4],
         minutes=0,
     )
-    _, compared, speed = bench_gpu.measure(options)
+    monkeypatch.setattr(bench_gpu, "LONG", {})
+    _, compared, speed, _ = bench_gpu.measure(options)
     assert [f"| {kind}, eager | 0.00e+00 |" in compared for kind in bench_gpu.KINDS] == [True] * 3
     assert speed.count("no time left") == len(bench_gpu.KINDS) + len(bench.RIVAL_TASKS) + 1

@@ -16,6 +16,7 @@ from torchrl.envs.utils import check_env_specs
 from twin import GLOBAL, LOCAL
 
 from damian import DelayConfig, ScenarioConfig, UavEnv, make_env
+from damian.envs import uav_env
 from damian.keys import ACTION
 from damian.server.config import ObservationConfig
 from damian.world.config import ActionConfig
@@ -90,3 +91,13 @@ def test_a_seed_repeats_its_episodes_and_worlds_and_episodes_differ():
     assert not starts[0].equal(starts[2])
     assert len(starts[0].unique(dim=0)) > 3
     assert not starts[2].equal(env.reset()["state"])
+
+
+def test_a_reset_shows_the_same_if_its_tables_are_made_in_parts(monkeypatch):
+    monkeypatch.setattr(uav_env, "_PAIRS_AT_ONCE", 10**9)
+    whole = UavEnv(everything(), 2)
+    monkeypatch.setattr(uav_env, "_PAIRS_AT_ONCE", 20)
+    parts = UavEnv(everything(), 2)
+    assert len(parts.simulation.initial.steps) > 20 // parts.n_agents**2
+    for key, table in whole._reset_outputs.items():
+        assert table.equal(parts._reset_outputs[key]), key
