@@ -80,7 +80,8 @@ class Interval(NamedTuple):
         return cls(mean, mean - half, mean + half)
 
     def __str__(self) -> str:
-        return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
+        interval = "" if math.isnan(self.low) else f" [{self.low:.2f}, {self.high:.2f}]"
+        return f"{self.mean:.2f}{interval}"
 
 
 def differences(rows: Mapping[str, Evaluation]) -> str:
@@ -89,6 +90,10 @@ def differences(rows: Mapping[str, Evaluation]) -> str:
     others = {name: row for name, row in rows.items() if name not in (SCRIPT, RANDOM)}
     if SCRIPT not in rows:
         return ""
+    if len(rows[SCRIPT].returns) == 1:
+        return (
+            "one episode has no interval: for the difference to the script set eval_episodes=200\n"
+        )
     sentences = []
     for name, evaluation in others.items():
         gain = evaluation.returns - rows[SCRIPT].returns
