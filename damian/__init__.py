@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
 
-__version__ = "0.18.0.dev0"
+__version__ = "0.19.0"
 
 _MODULES = {
     "damian.delays.laws": [

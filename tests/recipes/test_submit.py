@@ -13,6 +13,7 @@ from helpers import check_refused
 from leaderboard import WORDS, check_submission, delaybench, fingerprint, words_of_tasks
 from leaderboard import main as submit
 
+import damian
 from damian.common.errors import InputError
 from damian.common.tables import read_csv, write_csv
 from damian.recipes.cli import settings
@@ -43,7 +44,7 @@ def folder(tmp_path, monkeypatch):
         run.mkdir(parents=True)
         save_config(config, run)
         overrides = ["logger=csv", *words, f"seed={seed}"]
-        record = {"damian": "0.18.0", "commit": "abc", "overrides": overrides, "wall_time_s": 1.0}
+        record = {"damian": damian.__version__, "commit": "abc", "overrides": overrides, "wall_time_s": 1.0}
         (run / "run.json").write_text(json.dumps(record))
         evaluated = {"policy": "trained", "return": 20.0 + seed, "episodes": 200.0}
         write_csv(run / "result.csv", pd.DataFrame([evaluated]))
