@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.modules import set_recurrent_mode
 from twin import GLOBAL, LOCAL, Uav
 
-from damian import ClockConfig, LearningSetup, ScenarioConfig, UavEnv
+from damian import ClockConfig, LearningSetup, ScenarioConfig, UavEnv, keys
+from damian.models.config import MlpConfig
+from damian.recipes.config import TrainConfig
+from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
+from damian.runs.config import LoggerConfig
 from damian.server.config import BUILT_IN, EpisodeConfig, ObservationConfig, RewardConfig
 from damian.server.features import ServerContext
 from damian.server.features.place import battery_settings
@@ -373,3 +378,24 @@ def check_refused(recipe, message, capsys):
     assert message in error, error
     assert error.startswith("error: ")
     assert error.count("\n") == 1
+
+
+def backupdating_learner(scenario, learner):
+    """A learner of four worlds of a scenario, with back-updating, and its environment."""
+    config = TrainConfig(
+        **vars(scenario),
+        learner=learner,
+        model=MlpConfig(hidden=[16, 8]),
+        logger=LoggerConfig(tensorboard=False),
+        worlds=4,
+        backupdate=True,
+    )
+    torch.manual_seed(0)
+    env = learning_env(config)
+    return make_learner(config, env, replay_buffer(config, env)), env
+
+
+def log_prob_in_learning(actor, batch):
+    """Log-probabilities of a batch's actions, as a loss computes them."""
+    with set_recurrent_mode(True):
+        return actor.get_dist(batch.clone()).log_prob(batch[keys.ACTION])

@@ -3,15 +3,10 @@ learns from what it has read."""
 
 import pytest
 import torch
-from helpers import both_kinds, square
-from torchrl.modules import set_recurrent_mode
+from helpers import backupdating_learner, both_kinds, log_prob_in_learning, square
 
 from damian import DelayConfig, keys
 from damian.keys import next_key
-from damian.models.config import MlpConfig
-from damian.recipes.config import TrainConfig
-from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
-from damian.runs.config import LoggerConfig
 from damian.server.config import EpisodeConfig, ObservationConfig, RewardConfig
 from damian.world.config import ActionConfig
 
@@ -30,29 +25,20 @@ def build(example, kind="discrete", encoder="transformer", agents=3):
         reward=RewardConfig(coverage=1.0),
         episode=EpisodeConfig(max_steps=13, success_share=None),
     )
-    config = TrainConfig(
-        **vars(scenario),
-        learner=example.ForecastConfig(
-            name="forecasting:ForecastConfig",
-            encoder=encoder,
-            steps=30,
-            epochs=1,
-            minibatches=2,
-            forecast_steps=2,
-            forecast_batch=40,
-            forecast_lr=0.005,
-            forecast_buffer=200,
-            width=16,
-            layers=1,
-        ),
-        model=MlpConfig(hidden=[16, 8]),
-        logger=LoggerConfig(tensorboard=False),
-        worlds=4,
-        backupdate=True,
+    learner = example.ForecastConfig(
+        name="forecasting:ForecastConfig",
+        encoder=encoder,
+        steps=30,
+        epochs=1,
+        minibatches=2,
+        forecast_steps=2,
+        forecast_batch=40,
+        forecast_lr=0.005,
+        forecast_buffer=200,
+        width=16,
+        layers=1,
     )
-    torch.manual_seed(0)
-    env = learning_env(config)
-    return make_learner(config, env, replay_buffer(config, env)), env
+    return backupdating_learner(scenario, learner)
 
 
 @torch.no_grad()
@@ -109,18 +95,13 @@ def test_it_learns_to_forecast_better_than_the_newest_messages(example, encoder)
 def test_learning_to_forecast_does_not_change_what_the_policy_has_done(example, kind):
     learner, env = build(example, kind)
     batch = collected(env, learner.actor)
-
-    def log_prob():
-        with set_recurrent_mode(True):
-            return learner.actor.get_dist(batch.clone()).log_prob(batch[keys.ACTION])
-
-    before = log_prob()
+    before = log_prob_in_learning(learner.actor, batch)
     torch.testing.assert_close(before, batch[keys.ACTION_LOG_PROB])
     learner.buffer.extend(batch)
     shown = batch[example.FORECAST]
     for _ in range(5):
         learner.learn_forecast()
-    assert log_prob().equal(before)
+    assert log_prob_in_learning(learner.actor, batch).equal(before)
     assert not learner.actor(batch.clone())[example.FORECAST].equal(shown)
 
 

@@ -2,15 +2,11 @@
 learns."""
 
 import torch
-from helpers import both_kinds, square, walking
-from torchrl.modules import set_recurrent_mode
+from helpers import backupdating_learner, both_kinds, log_prob_in_learning, square, walking
 
 from damian import DelayConfig, keys
 from damian.keys import next_key
 from damian.models.config import MlpConfig
-from damian.recipes.config import TrainConfig
-from damian.recipes.shared.learning import learning_env, make_learner, replay_buffer
-from damian.runs.config import LoggerConfig
 from damian.server.config import EpisodeConfig
 from damian.world.config import ActionConfig
 
@@ -26,25 +22,16 @@ def build(example, kind="discrete"):
         delay=DelayConfig(obs="0..3", loss=0.1, messages=4),
         episode=EpisodeConfig(max_steps=7),
     )
-    config = TrainConfig(
-        **vars(scenario),
-        learner=example.PredictiveMappoConfig(
-            name="predictive_mappo:PredictiveMappoConfig",
-            steps=12,
-            epochs=1,
-            minibatches=2,
-            prediction_steps=2,
-            prediction_batch=16,
-            prediction_buffer=200,
-        ),
-        model=SMALL,
-        logger=LoggerConfig(tensorboard=False),
-        worlds=4,
-        backupdate=True,
+    learner = example.PredictiveMappoConfig(
+        name="predictive_mappo:PredictiveMappoConfig",
+        steps=12,
+        epochs=1,
+        minibatches=2,
+        prediction_steps=2,
+        prediction_batch=16,
+        prediction_buffer=200,
     )
-    torch.manual_seed(0)
-    env = learning_env(config)
-    return make_learner(config, env, replay_buffer(config, env)), env
+    return backupdating_learner(scenario, learner)
 
 
 @torch.no_grad()
@@ -124,14 +111,9 @@ def test_targets_use_nothing_that_has_not_arrived_by_now(example):
 def test_learning_to_predict_does_not_change_what_the_policy_has_done(example, kind):
     learner, env = build(example, kind)
     batch = collected(learner, env)
-
-    def log_prob():
-        with set_recurrent_mode(True):
-            return learner.actor.get_dist(batch.clone()).log_prob(batch[keys.ACTION])
-
-    torch.testing.assert_close(log_prob(), batch[keys.ACTION_LOG_PROB])
-    before = log_prob()
+    before = log_prob_in_learning(learner.actor, batch)
+    torch.testing.assert_close(before, batch[keys.ACTION_LOG_PROB])
     learner.buffer.extend(batch)
     for _ in range(5):
         learner.learn_prediction(learner.last_steps())
-    assert log_prob().equal(before)
+    assert log_prob_in_learning(learner.actor, batch).equal(before)

@@ -44,7 +44,12 @@ def folder(tmp_path, monkeypatch):
         run.mkdir(parents=True)
         save_config(config, run)
         overrides = ["logger=csv", *words, f"seed={seed}"]
-        record = {"damian": damian.__version__, "commit": "abc", "overrides": overrides, "wall_time_s": 1.0}
+        record = {
+            "damian": damian.__version__,
+            "commit": "abc",
+            "overrides": overrides,
+            "wall_time_s": 1.0,
+        }
         (run / "run.json").write_text(json.dumps(record))
         evaluated = {"policy": "trained", "return": 20.0 + seed, "episodes": 200.0}
         write_csv(run / "result.csv", pd.DataFrame([evaluated]))
