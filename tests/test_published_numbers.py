@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 import yaml
 from leaderboard import delaybench
 from pretrained import POLICIES, differences
@@ -26,7 +27,7 @@ from damian.compare.comparison import (
     means_over_seeds,
 )
 from damian.compare.statistics import normalised
-from damian.runs.run_folder import DETERMINISTIC, RANDOM, TRAINED, read_results
+from damian.runs.run_folder import DETERMINISTIC, RANDOM, TRAINED, Interval, read_results
 
 KNOWN = yaml.safe_load((ROOT / "tests" / "data" / "published_numbers.yaml").read_text("utf-8"))
 WORDS, TABLES, CLAIMS, NOT_STORED = (
@@ -137,6 +138,13 @@ def recomputed(text, asked):
     if place not in means():
         return f"nothing ({', '.join(place)} is not stored)", 0
     values, n = estimated(place, asked.get("measure", "return"), asked.get("first"))
+    if "beside" in asked:  # paired by seed
+        runs, others = (
+            stored().get_group(tuple(each[name] for name in PLACE)).set_index("seed")["return"]
+            for each in (asked, asked | asked["beside"])
+        )
+        gain = (runs - others).dropna()
+        return like(text, Interval.of(torch.tensor(gain.to_numpy()))), len(gain)
     if "minus" in asked:
         values = values - mean_of(asked | asked["minus"])
     if "from" in asked:  # as a share of the way from one mean to another
