@@ -14,7 +14,7 @@ import pytest
 import torch
 import yaml
 from leaderboard import delaybench
-from pretrained import POLICIES, differences
+from pretrained import POLICIES, differences, written
 from sites import DOCS, ROOT
 
 from damian.common.tables import read_csv
@@ -220,7 +220,8 @@ def test_the_table_of_packaged_policies_follows_from_their_rows():
     printed = [line.split(" | ", 1)[1] for line in PUBLISHED[PACKAGED][1].splitlines()[2:]]
     assert printed == [
         f"{agents:.0f} | {line['most likely']:.1f} | {line['script']:.1f} | {line['difference']:.1f} "
-        f"[{line['low']:.1f}, {line['high']:.1f}] | {line['script+forward']:.1f} |"
+        f"[{line['low']:.1f}, {line['high']:.1f}] | {line['script+forward']:.1f} | "
+        f"{written(line['planner'])} |"
         for lines in packaged("script").values()
         for agents, line in lines.iterrows()
     ]

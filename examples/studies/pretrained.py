@@ -13,6 +13,7 @@ over outlines that no training has seen.
 """
 
 import json
+import math
 import shlex
 import subprocess
 import sys
@@ -187,7 +188,7 @@ def ship(name: str, run: Path) -> None:
     with run_settings(cli.composed(*words), words) as config:
         settings = nested(config) | {"checkpoint": None}
     (folder / "config.yaml").write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
-    lines = over_outlines(f"damian:{name}")
+    lines = over_outlines(f"damian:{name}", planner=True)
     write_csv(folder / "result.csv", lines.round(3))
     (folder / "README.md").write_text(card(name, run, lines), encoding="utf-8")
 
@@ -216,13 +217,18 @@ damian train {policy.words} compile=true
 """
 
 
+def written(mean: float) -> str:
+    """A mean return in a table, "-" if it was not measured."""
+    return "-" if math.isnan(mean) else f"{mean:.1f}"
+
+
 def table(lines: pd.DataFrame) -> str:
     """Mean returns over outlines, for each number of UAVs."""
     kinds = [*lines.columns.drop(["agents", "outline"])]
     rows = [
         [
             f"{agents}",
-            *(f"{line[kind]:.1f}" for kind in kinds),
+            *(written(line[kind]) for kind in kinds),
             f"{line['difference']:.1f} [{line['low']:.1f}, {line['high']:.1f}]",
         ]
         for agents, line in differences(lines).iterrows()
