@@ -147,21 +147,6 @@ def write_journal(path):
 
 
 @pytest.mark.slow
-def test_the_python_of_every_recipe_runs(trained):
-    pytest.importorskip("vmas")
-    blocks = re.findall(
-        r"```python\n(.*?)```", (ROOT / "docs" / "recipes.md").read_text(), re.DOTALL
-    )
-    assert len(blocks) == 5
-    for block in blocks:
-        command = [sys.executable, "-W", "ignore", "-c", block]
-        done = subprocess.run(
-            command, cwd=trained, capture_output=True, text=True, timeout=600, check=False
-        )
-        assert done.returncode == 0, (block, done.stderr[-2000:])
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_commands_of_a_document_run(name, trained, tmp_path):
     folder = tmp_path / "folder"

@@ -8,8 +8,8 @@ The last one trains nothing: it flies policies of the package over the outlines,
 the user's own, and prints the table.
 
 A policy is a run folder of plain data: ``checkpoint.pt`` holds the actor's weights in half
-precision, ``config.yaml`` the settings, ``result.csv`` and the card ``README.md`` what it returns
-over outlines that no training has seen.
+precision, ``config.yaml`` the settings, ``result.csv`` what it returns over outlines that no
+training has seen, and ``README.md`` is its card.
 """
 
 import json
@@ -188,12 +188,11 @@ def ship(name: str, run: Path) -> None:
     with run_settings(cli.composed(*words), words) as config:
         settings = nested(config) | {"checkpoint": None}
     (folder / "config.yaml").write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
-    lines = over_outlines(f"damian:{name}", planner=True)
-    write_csv(folder / "result.csv", lines.round(3))
-    (folder / "README.md").write_text(card(name, run, lines), encoding="utf-8")
+    write_csv(folder / "result.csv", over_outlines(f"damian:{name}", planner=True).round(3))
+    (folder / "README.md").write_text(card(name, run), encoding="utf-8")
 
 
-def card(name: str, run: Path, lines: pd.DataFrame) -> str:
+def card(name: str, run: Path) -> str:
     """The card of a policy."""
     policy = POLICIES[name]
     record = json.loads((run / "run.json").read_text(encoding="utf-8"))
@@ -211,9 +210,7 @@ def card(name: str, run: Path, lines: pd.DataFrame) -> str:
 damian train {policy.words} compile=true
 ```
 
-{flown * bool(policy.flown)}Mean true returns over [ten areas](../../../docs/policies.md):
-
-{table(lines)}
+{flown * bool(policy.flown)}What it returns stands in [docs/policies.md](../../../docs/policies.md).
 """
 
 
