@@ -40,7 +40,7 @@ from damian.recipes import cli
 from damian.recipes.compare import includes
 from damian.recipes.shared.environments import compose_scenario
 from damian.recipes.shared.sweeps import stored_results
-from damian.runs.run_folder import RANDOM, SCRIPT
+from damian.runs.run_folder import PLANNER, RANDOM, SCRIPT
 from damian.show.episode import record
 from damian.show.frame import frame_of
 from damian.show.views import MapView, legend_marks
@@ -106,10 +106,14 @@ WINNERS = {
     "the same, jitter buffer": ("backupdate+gru+hold",),
     "timeline, back-updating": ("timeline",),
     "the same, memory": ("timeline+gru",),
+    "a filter that forecasts the others": ("forecast+filter",),
     "a Bayes filter of the source": ("belief",),
     "script, flown forward": ("script+forward",),
+    "planner": ("planner",),
 }
 """Labels of methods in that figure; of several the first is shown that has been run."""
+SCRIPTED = {"script+forward": SCRIPT, "planner": PLANNER}
+"""Policies of methods that train none."""
 UNDELAYED = "undelayed"
 LEADERBOARD = """# Leaderboard
 
@@ -126,7 +130,7 @@ delays. Mean over seeds [95 % interval] (seeds).
 ![Returns over the delay of the flight](results/delaybench/matrix.png)"""
 FEWEST = 3
 """Fewest seeds of which the leaderboard shows a mean: fewer have no interval."""
-LOOKS = (*COLOURS, "0.3")
+LOOKS = [*((colour, "o") for colour in COLOURS), *(("0.3", marker) for marker in "os^")]
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 
 
@@ -375,14 +379,17 @@ def plot_tasks(path: Path) -> None:
                 if run:
                     compared = rows[rows["method"].isin((UNDELAYED, run[0]))]
                     table = Comparison(compared, points, methods).table
-                    flown = table["policy"].isin((TRAINED, SCRIPT))
-                    known = table[(table["method"] == run[0]) & flown].iloc[0]
+                    policy = SCRIPTED.get(run[0], TRAINED)
+                    (known,) = table.loc[
+                        (table["method"] == run[0]) & (table["policy"] == policy)
+                    ].to_dict("records")
                     value, low, high = (known["J_norm" + end] for end in ENDS)
-                    x = place + 0.1 * (number - len(WINNERS) / 2)
+                    x = place + 0.09 * (number - (len(WINNERS) - 1) / 2)
                     error = [[value - low], [high - value]]
-                    axes.errorbar(x, value, error, marker="o", color=LOOKS[number], markersize=4)
-        for number, label in enumerate(WINNERS):
-            axes.plot([], [], "o", color=LOOKS[number], markersize=4, label=label)
+                    colour, marker = LOOKS[number]
+                    axes.errorbar(x, value, error, marker=marker, color=colour, markersize=4)
+        for (colour, marker), label in zip(LOOKS, WINNERS, strict=True):
+            axes.plot([], [], marker, color=colour, markersize=4, label=label)
         for level in (0, 1):
             axes.axhline(level, color="0.5", linewidth=0.8, linestyle="--" if level else ":")
         axes.set_xticks(range(len(TASKS)), TASKS)
