@@ -130,7 +130,7 @@ pictures: $(VENV)/base
 	$(PY) docs/figures.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
 	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench "tasks=[crowded]" \
-	  "delays=['1-7',lag,paper]" "methods=[undelayed,naive,naive+gru,naive+timeline,backupdate,backupdate+gru,backupdate+gru+hold,timeline,timeline+gru]" > build/delaybench.md
+	  "delays=['1-7',lag,paper]" "methods=[undelayed,naive,naive+gru,naive+timeline,backupdate,backupdate+gru,backupdate+gru+hold,timeline,timeline+gru,forecast+filter]" > build/delaybench.md
 
 # The documentation site, in build/site.
 docs: $(VENV)/docs

@@ -234,9 +234,10 @@ def _places(comparison: Comparison, undelayed: Sequence[str] = ()) -> list[tuple
 
 
 def _line_of(comparison: Comparison, name: str) -> Style:
-    """Style of the line of a method, with its entry in the legend: only the first six are
-    coloured."""
-    grey = {"color": "0.75"} if [*comparison.methods].index(name) > 5 else {}
+    """Style of the line of a method, with its entry in the legend: only the six best are coloured."""
+    trained = comparison.table[comparison.table["policy"] == TRAINED]
+    best = trained.groupby("method")["return"].mean().nlargest(6).index
+    grey = {} if name in best else {"color": "0.75"}
     return look(comparison.methods, name) | {"marker": "", "label": name} | grey
 
 
