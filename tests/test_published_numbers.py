@@ -46,7 +46,7 @@ SAID = re.compile(
     r"(?:\*([\w+]+)\*|(?<!trained )\b(script|[Uu]ndelayed|untrained|random|jitter buffer)\b(?!,))"
     rf"[^\d*.;:]{{0,30}}?({MEAN}(?:(?:,| and)? \(?{MEAN}\)?)*)(?![\d%]| \[| for)"
 )
-"""The name of a method, or of what is no method of its own, and means behind it."""
+"""The name of a method or of a policy that is not trained, and the means that follow it."""
 
 
 def documents():
@@ -155,7 +155,8 @@ def recomputed(text, asked):
 
 
 def asked_by(label, words):
-    """What the label of a row or a column asks for, for each number of a cell; empty if nothing."""
+    """The stored rows that the label of a row or a column names, one for each number of a cell; empty
+    if it names none."""
     plain = re.sub(r"[*`\[\]]", "", label)
     if plain in words:
         return words[plain] if isinstance(words[plain], list) else [words[plain]]
@@ -172,7 +173,8 @@ def seeds_said(text):
 
 
 def numbers(name):
-    """The numbers of a table: where each stands, its text, what it asks for, and its seeds."""
+    """The numbers of a table: the place of each, its text, the stored rows from which it must follow,
+    and the numbers of seeds that the table allows."""
     above, table = PUBLISHED[name]
     words = WORDS | TABLES[name].get("words", {})
     header, _, *rows = [

@@ -211,9 +211,12 @@ def _curve_panel(comparison: Comparison, axis: Axes, content: tuple[str, str, st
     """Draw a measure of all methods in a task under a delay."""
     task, delay, measure = content
     table = comparison.table.set_index(_LINE)[_flown(measure)]
+    best = _best(comparison)
     for name, method in comparison.methods.items():
         run = (task, delay if method.delayed else NOT_LATE, name)
-        style = _line_of(comparison, name)
+        style: Style = look(comparison.methods, name) | {"marker": "", "label": name}
+        if name not in best:
+            style["color"] = "0.75"
         if run in comparison.curves:
             place, values = curve(comparison.curves[run], measure)
             mean, low, high = bootstrap(lambda drawn: drawn.mean(-1), values, draws=500)
@@ -233,12 +236,12 @@ def _places(comparison: Comparison, undelayed: Sequence[str] = ()) -> list[tuple
     return [(task, delay) for task in tasks for delay in comparison.delays(task) or undelayed]
 
 
-def _line_of(comparison: Comparison, name: str) -> Style:
-    """Style of the line of a method, with its entry in the legend: only the six best are coloured."""
-    trained = comparison.table[comparison.table["policy"] == TRAINED]
-    best = trained.groupby("method")["return"].mean().nlargest(6).index
-    grey = {} if name in best else {"color": "0.75"}
-    return look(comparison.methods, name) | {"marker": "", "label": name} | grey
+def _best(comparison: Comparison) -> set[str]:
+    """The six methods of the best mean score, whose learning curves are coloured."""
+    lines = comparison.table.set_index(["method", "policy"])[comparison.score]
+    own = lines[lines.index.isin([(n, comparison.policy_of(n)) for n in comparison.methods])]
+    means = own.groupby("method").mean() * sign_of(comparison.score)
+    return {*means.nlargest(6).index}
 
 
 def _flown(measure: str) -> str:

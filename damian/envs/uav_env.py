@@ -110,9 +110,8 @@ class UavEnv(EnvBase):
         checks.require(allowed, "observation.belief", belief, problem)
         told = messages_only or stops >= observation.timeline
         checks.require(told, "observation.stops", stops, problem)
-        self.layout: dict[str, Layout] = {}
+        self.layout, self._reset_outputs = self._reset_tables()
         """What the columns of each observation mean, by the last part of its key."""
-        self._reset_outputs = self._reset_tables()
         self._make_specs()
         self.set_seed(seed)
         self.to(torch.device(device))
@@ -298,22 +297,23 @@ class UavEnv(EnvBase):
         to_source = to_source.clamp(-1, 1)
         return torch.cat([global_observation, to_source], -1)
 
-    def _reset_tables(self) -> Outputs:
-        """Outputs of a reset for each initial condition, with the layouts that their features
-        have."""
+    def _reset_tables(self) -> tuple[dict[str, Layout], Outputs]:
+        """Layouts of the observations, and outputs of a reset for each initial condition."""
         initial = self.simulation.initial
         n = len(initial.steps)
+        layouts: dict[str, Layout] = {}
         tables: Outputs = {}
         # Some at a time: features of pairs of UAVs would take gigabytes.
         for rows in torch.arange(n).split(max(1, _PAIRS_AT_ONCE // self.n_agents**2)):
             some = tree_map(lambda field, rows=rows: field[rows], initial)
             features = checked_features(self.server, some.sent, some.steps)
-            self.layout = self._layouts(features)
-            for key, values in self._outputs_at_reset(some, features).items():
-                if key not in tables:
-                    tables[key] = values.new_empty(n, *values.shape[1:])
+            outputs = self._outputs_at_reset(some, features)
+            if not tables:
+                layouts = self._layouts(features)
+                tables = {key: x.new_empty(n, *x.shape[1:]) for key, x in outputs.items()}
+            for key, values in outputs.items():
                 tables[key][rows] = values
-        return tables
+        return layouts, tables
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         """Outputs of a reset, [Q, ...] by key, from Q first states of episodes and their

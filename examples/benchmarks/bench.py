@@ -78,7 +78,8 @@ STORED = Path(__file__).parents[2] / "docs" / "results" / "bench.csv"
 
 
 class Table(NamedTuple):
-    """What a part measured; the first cell of a row is its name, and columns of "times" hold ratios."""
+    """A table of measurements. Each row begins with its name; columns whose name contains "times"
+    hold ratios."""
 
     title: str
     header: tuple[str, ...]

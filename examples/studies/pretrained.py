@@ -210,7 +210,7 @@ def card(name: str, run: Path) -> str:
 damian train {policy.words} compile=true
 ```
 
-{flown * bool(policy.flown)}What it returns stands in [docs/policies.md](../../../docs/policies.md).
+{flown * bool(policy.flown)}[docs/policies.md](../../../docs/policies.md) lists its returns.
 """
 
 

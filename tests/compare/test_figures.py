@@ -8,9 +8,13 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from test_comparison import row
 
-from damian.compare.figures import METHOD_COLOURS, plot_sweep
+from damian.compare.comparison import Comparison
+from damian.compare.config import Method
+from damian.compare.figures import METHOD_COLOURS, _best, plot_sweep
 from damian.compare.paired import means
+from damian.runs.run_folder import SCRIPT, TRAINED
 
 TO_CONES = [[0.41222, 0.53633, 0.05145], [0.21190, 0.68070, 0.10740], [0.08830, 0.28172, 0.62998]]
 TO_LAB = [[0.21045, 0.79362, -0.00407], [1.97800, -2.42859, 0.45059], [0.02590, 0.78277, -0.80868]]
@@ -79,3 +83,18 @@ def test_a_sweep_has_a_curve_for_each_value_of_the_settings_that_are_not_along_t
         "none",
         "timeline",
     ]
+
+
+@pytest.mark.parametrize(("score", "best"), [("return", range(2, 8)), ("steps", range(6))])
+def test_the_six_best_methods_are_coloured(score, best):
+    methods = {
+        f"{i}": Method(naive=True, delayed=i > 0, flies=SCRIPT if i == 7 else None)
+        for i in range(8)
+    }
+    rows = [
+        row("task", "4" if i else "none", f"{i}", seed, float(i), SCRIPT if i == 7 else TRAINED)
+        for i in range(8)
+        for seed in (8, 9)
+    ]
+    found = Comparison(pd.DataFrame(rows), pd.DataFrame(), methods, score)
+    assert _best(found) == {f"{i}" for i in best}
