@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import InitTracker, TensorDictPrimer, TransformedEnv
+from torchrl.envs import EnvBase, InitTracker, TensorDictPrimer, TransformedEnv
 from torchrl.modules import recurrent_mode
 
 from damian import keys
@@ -16,7 +16,16 @@ RECURRENT_KEYS: list[NestedKey] = [keys.HIDDEN_BEFORE, keys.IS_INIT]
 """Entries, besides observations, that ``AgentGRU`` reads in recurrent mode."""
 
 
-class AgentGRU(TensorDictModuleBase):
+class RecurrentModule(TensorDictModuleBase):
+    """A module of a policy whose state an environment carries from step to step
+    (``add_recurrent_state``)."""
+
+    def state_spec(self, env: EnvBase) -> Composite:
+        """The entries of the state, for an environment [B]; they are zeros at a reset."""
+        raise NotImplementedError
+
+
+class AgentGRU(RecurrentModule):
     """Gated recurrent unit from observations to hidden states, for each UAV by itself
     (Cho et al. 2014).
 
@@ -45,6 +54,12 @@ class AgentGRU(TensorDictModuleBase):
             keys.HIDDEN, self.step(features, before)
         )
 
+    def state_spec(self, env: EnvBase) -> Composite:
+        shape = cast(Composite, env.observation_spec[keys.AGENTS]).shape
+        hidden = Unbounded(torch.Size((*shape, self.cell.hidden_size)))
+        agents = Composite(hidden=hidden, shape=shape)
+        return Composite(agents=agents, shape=env.batch_size, device=cast(torch.device, env.device))
+
     def step(self, features: Tensor, hidden: Tensor) -> Tensor:
         """Return the next hidden state from features [*, N, E] and the previous hidden state
         [*, N, H]."""
@@ -62,13 +77,14 @@ class AgentGRU(TensorDictModuleBase):
 
 
 def add_recurrent_state(env: TransformedEnv, policy: nn.Module) -> None:
-    """Make an environment carry the hidden states of a policy, if it is recurrent, with zeros at a
+    """Make an environment carry the states of a policy's recurrent modules, with zeros at a
     reset."""
-    cells = [module.cell for module in policy.modules() if isinstance(module, AgentGRU)]
-    if not cells or keys.HIDDEN in env.observation_spec.keys(True, True):
-        return
-    shape = cast(Composite, env.observation_spec[keys.AGENTS]).shape
-    agents = Composite(hidden=Unbounded(torch.Size((*shape, cells[0].hidden_size))), shape=shape)
-    primer = Composite(agents=agents, shape=env.batch_size, device=cast(torch.device, env.device))
-    env.append_transform(InitTracker(keys.IS_INIT))
-    env.append_transform(TensorDictPrimer(primer))
+    for module in policy.modules():
+        if not isinstance(module, RecurrentModule):
+            continue
+        spec = module.state_spec(env)
+        known = set(env.observation_spec.keys(True, True))
+        if known.issuperset(spec.keys(True, True)):
+            continue
+        env.append_transform(InitTracker(keys.IS_INIT))
+        env.append_transform(TensorDictPrimer(spec))
