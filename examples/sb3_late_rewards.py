@@ -8,12 +8,12 @@ They return 358 to 363, and 53 to 248; without delay 367 to 373 (latest 100 epis
 
 import sys
 
+from delay_wrapper import DelayWrapper
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from damian import Uniform
-from damian.interop import DelayWrapper
 
 LATE = Uniform(10, 30)  # steps
 

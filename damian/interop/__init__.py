@@ -3,10 +3,9 @@ PettingZoo."""
 
 import gymnasium
 
-from damian.interop.delay_wrapper import DelayWrapper
 from damian.interop.gym import UavGymEnv, UavVectorEnv
 
-__all__ = ["DelayWrapper", "UavGymEnv", "UavVectorEnv"]
+__all__ = ["UavGymEnv", "UavVectorEnv"]
 
 TASKS = ("spotting", "tracking", "coverage", "energy", "mixed")
 """Scenarios of conf/scenario that are registered, each as ``damian/NAME-v0``."""

@@ -1,4 +1,4 @@
-"""PettingZoo: an environment of several UAVs, and a wrapper that delays any environment."""
+"""An environment of several UAVs for PettingZoo."""
 
 from typing import Any
 
@@ -7,14 +7,15 @@ from gymnasium.spaces import Space
 
 from damian.common.errors import InputError
 from damian.envs.config import ScenarioConfig
-from damian.interop.delay_wrapper import ByName, Delays
 from damian.interop.flight import METADATA, Array, Flight, actions_in, row
 
 try:
     from pettingzoo import ParallelEnv
-    from pettingzoo.utils import BaseParallelWrapper
 except ImportError as error:
     raise InputError("pettingzoo: it is not installed; pip install pettingzoo") from error
+
+ByName = dict[str, Any]
+"""Something of each agent."""
 
 
 class UavParallelEnv(ParallelEnv[str, Array, Any]):
@@ -89,79 +90,3 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
 
     def _infos(self, infos: dict[str, Array]) -> ByName:
         return {name: row(infos, 0, number) for number, name in enumerate(self.possible_agents)}
-
-
-class DelayParallelWrapper(BaseParallelWrapper[str, Any, Any]):
-    """Delays what the agents of any ``ParallelEnv`` observe, do and earn, each as ``DelayWrapper``
-    does.
-
-    An agent may leave the episode, with all its rewards, or join it (again), with an observation
-    that is not late and nothing of its former life.
-    ``state()`` is not late.
-
-    Args:
-        env, history, timeline, dt: as in ``DelayWrapper``.
-        observation, action, reward, loss: a law for all agents, or by agent; those not named are
-            not late. A function knows the agent as ``message.sender``, its place among
-            ``possible_agents``.
-        default: the action that is executed until the first one arrives, by agent; if not given, 0.
-    """
-
-    def __init__(
-        self,
-        env: ParallelEnv[str, Any, Any],
-        observation: Any = 0,
-        action: Any = 0,
-        reward: Any = 0,
-        *,
-        loss: Any = 0.0,
-        history: int = 0,
-        timeline: int = 0,
-        default: ByName | None = None,
-        dt: float = 1.0,
-    ) -> None:
-        super().__init__(env)
-        told = {
-            "observation": observation,
-            "action": action,
-            "reward": reward,
-            "loss": loss,
-            "history": history,
-            "timeline": timeline,
-            "default": default or {},
-            "dt": dt,
-        }
-        observed = {agent: env.observation_space(agent) for agent in env.possible_agents}
-        self._delays = Delays(
-            observed, {agent: env.action_space(agent) for agent in observed}, told
-        )
-        self._spaces = {
-            agent: self._delays.space(agent, space) for agent, space in observed.items()
-        }
-
-    def observation_space(self, agent: str) -> Space:
-        return self._spaces[agent]
-
-    def reset(
-        self, seed: int | None = None, options: ByName | None = None
-    ) -> tuple[ByName, ByName]:
-        observations, infos = self.env.reset(seed=seed, options=options)
-        told, more = self._delays.reset(observations, seed)
-        return told, {agent: infos.get(agent, {}) | info for agent, info in more.items()}
-
-    def step(self, actions: ByName) -> tuple[ByName, ByName, ByName, ByName, ByName]:
-        observations, rewards, terminated, truncated, infos = self.env.step(
-            self._delays.act(actions)
-        )
-        ended = [agent for agent in rewards if terminated[agent] or truncated[agent]]
-        ended += self._delays.present.difference(
-            self.env.agents, ended
-        )  # some leave without a flag
-        told, rewards, more = self._delays.step(observations, rewards, ended)
-        return (
-            told,
-            rewards,
-            terminated,
-            truncated,
-            {a: infos.get(a, {}) | info for a, info in more.items()},
-        )

@@ -15,22 +15,15 @@ BLOCKS = re.findall(
 
 
 def test_every_example_is_found():
-    assert len(BLOCKS) == TEXT.count("```python") == 6
+    assert len(BLOCKS) == TEXT.count("```python") == 4
 
 
 @pytest.mark.parametrize("code", [block for _, block in BLOCKS], ids=[title for title, _ in BLOCKS])
-def test_an_example_runs(code, capsys):
+def test_an_example_runs(code):
     found = {}
     exec(code.replace("num_envs=256", "num_envs=4"), found)
     if "picture" in found:
         assert found["picture"].ndim == 3
-    if "late" in found and "env" in found:
-        assert found["observation"]["timeline"].shape == (8, 4 + 1)
-        assert found["observation"]["action_history"].shape == (6 * 2,)
-    if "spread" in found:
-        by_agent, by_sender = capsys.readouterr().out.split("\n", 1)
-        assert by_agent == "{'agent_0': 1, 'agent_1': 1, 'agent_2': 0}"
-        assert [float(age) for age in re.findall(r"\d+(?=\.)", by_sender)] == [4, 3, 0]
 
 
 def test_the_callback_for_stable_baselines3_moves_each_reward_to_the_step_that_earned_it():
