@@ -15,15 +15,18 @@ from typing import Any
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.show.episode import Episode, Floats
 from damian.show.frame import frame_of
-from damian.show.geojson import on_earth
+from damian.world.regions.geodesy import LatLon, to_latlon
 
 _CORNERS = 16
 """Corners of a quarter of a footprint."""
+_DIGITS = 7
+"""Decimals of longitudes and latitudes: a centimetre."""
 
 
 def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
@@ -45,7 +48,7 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
         {
             "type": "Feature",
             "properties": properties,
-            "geometry": on_earth(geometry, episode.origin),
+            "geometry": _on_earth(geometry, episode.origin),
         }
         for geometry, properties in _features(episode, step)
     ]
@@ -81,6 +84,18 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
         yield _path(places[: step + 1]), {"kind": "source track", "source": number, **times}
     for area, probability in frame.cells:
         yield area, {"kind": "belief", "probability": round(probability, 5)}
+
+
+def _on_earth(geometry: Any, origin: LatLon) -> dict[str, Any]:
+    """A geometry of local metres in longitude and latitude, with holes clockwise."""
+
+    def degrees(metres: NDArray[np.float64]) -> NDArray[np.float64]:
+        latitude, longitude = to_latlon(metres[:, 0], metres[:, 1], origin)
+        longitude = origin[1] + (longitude - origin[1] + 180) % 360 - 180
+        return np.column_stack([longitude, latitude]).round(_DIGITS)
+
+    placed = shapely.transform(geometry, degrees)
+    return json.loads(shapely.to_geojson(shapely.orient_polygons(placed)))
 
 
 def _path(places: Floats) -> shapely.LineString | shapely.Point:

@@ -27,7 +27,6 @@ damian.server.belief: report_rows
 damian.server.server: Features, Server
 damian.show.episode: Episode, at_instant, episode_of
 damian.show.files: save_episode, summary
-damian.show.geojson: on_earth
 damian.show.replay_page: PAGE
 damian.transforms: ObservationTimeline, StatefulTransform
 damian.transforms.entries: Entries

@@ -289,22 +289,6 @@ class ObservationTimeline(StatefulTransform):
         found = found.view(*after["sent"].shape, *found.shape[1:])
         return entries | {next_key(self.out_keys[0]): found}
 
-    def noted_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """The memory with an agent's message [M] that arrives in the next step, ``lag`` >= 1 steps
-        late."""
-        facts = self.encoded(message).view(1, -1, memory["kept"].shape[-1])
-        ages = torch.zeros(1, 1, dtype=torch.long)
-        if self.ages is not None:
-            ages = self.ages(message).view(1, -1)
-        # Slots are of the step before the next one.
-        ages = torch.where(ages < 0, -1, ages + lag - 1)
-        (kept,), (told,) = told_slots(facts, ages, self.slots)
-        memory = {name: value.clone() for name, value in memory.items()}
-        memory["kept"][agent, told] = kept[told]
-        memory["due"][agent, told] = memory["due"][agent, told].clamp(max=1)
-        memory["sent"][agent] |= told
-        return memory
-
     def encoded(self, message: Tensor) -> Tensor:
         """The numbers to keep of messages, [..., D]."""
         return message if self.encode is None else self.encode(message)

@@ -5,13 +5,16 @@ Places in reports count as the landing points nearest to them.
 """
 
 import bisect
+import json
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
+import shapely
 import torch
 from torch import Tensor
 
@@ -65,6 +68,21 @@ class Ground:
             return round(east + self.region.offset[0], 3), round(north + self.region.offset[1], 3)
         latitude, longitude = to_latlon(east, north, self.region.origin)
         return round(float(latitude), 8), round(float(longitude), 8)
+
+    def on_earth(self, geometry: Any) -> dict[str, Any]:
+        """A geometry of local metres as GeoJSON (RFC 7946), with holes clockwise; across the
+        antimeridian, longitudes go beyond 180."""
+        origin = self.region.origin
+        if origin is None:
+            raise InputError(f"geofence: {self.region.name} has no place on Earth")
+
+        def degrees(metres: Any) -> Any:
+            latitude, longitude = to_latlon(metres[:, 0], metres[:, 1], origin)
+            longitude = origin[1] + (longitude - origin[1] + 180) % 360 - 180
+            return np.column_stack([longitude, latitude]).round(7)  # a centimetre
+
+        placed = shapely.transform(geometry, degrees)
+        return json.loads(shapely.to_geojson(shapely.orient_polygons(placed)))
 
     def way(self, origin: int, goal: int) -> tuple[float, float]:
         """Distance between two landing points [m] and heading, clockwise from north [deg]; two

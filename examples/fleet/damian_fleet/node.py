@@ -170,9 +170,9 @@ class Node:
         """Memories and outputs after actions [1, N, ...] that the ``chosen`` UAVs took in the step
         before."""
         memories = _copies(memories)
-        for i, transform in enumerate(self.transforms):
+        for transform, memory in zip(self.transforms, memories, strict=True):
             for late in reported.late:
-                memories[i] = note_late(transform, memories[i], *late)
+                note_late(transform, memory, *late)
         entries: Entries = {keys.ACTION: action, keys.READY: chosen}
         _, memories, outputs = self.env.step_fn(cast(Any, reported), memories, entries)
         return memories, self.worlds.to_tensordict(outputs)
@@ -185,13 +185,20 @@ def _copies(memories: Memories) -> Memories:
 
 def note_late(
     transform: StatefulTransform, memory: dict[str, Tensor], message: Tensor, agent: int, lag: int
-) -> dict[str, Tensor]:
+) -> None:
     """Note an agent's packed message [M] that arrives in the next step, ``lag`` >= 1 steps late.
 
-    Of a single world; what a belief remembers is changed in place.
+    Of a single world; the memory is changed in place.
     """
     if isinstance(transform, ObservationTimeline):
-        return transform.noted_late(memory, message, agent, lag)
+        ages = [0] if transform.ages is None else transform.ages(message).flatten().tolist()
+        facts = transform.encoded(message).view(len(ages), -1)
+        for fact, age in zip(facts, ages, strict=True):
+            slot = age + lag - 1  # of the step before the next one
+            if age >= 0 and slot < transform.slots:
+                memory["kept"][agent, slot] = fact
+                memory["due"][agent, slot].clamp_(max=1)
+                memory["sent"][agent, slot] = True
     if isinstance(transform, Belief) and lag <= transform.longest:
         messages = transform.server.messages(message.view(1, 1, -1))
         slot = (memory["slot"] + 1 - lag) % len(memory["report"])
@@ -201,7 +208,6 @@ def note_late(
             -1
         )
         memory["delay"][slot, agent] = lag
-    return memory
 
 
 def scenario_of_reports(scenario: ScenarioConfig) -> ScenarioConfig:

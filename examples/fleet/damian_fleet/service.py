@@ -27,7 +27,6 @@ import damian
 from damian.common.errors import InputError, RunError
 from damian.common.plotting import UAV_COLOURS
 from damian.common.text_files import one_line, show
-from damian.show.geojson import on_earth
 from damian.show.replay_page import PAGE
 from damian_fleet.fleet import Fleet, Held, Waiting
 from damian_fleet.reports import (
@@ -267,12 +266,9 @@ def _fleets(fleets: Fleets, token: str, now: Clock) -> APIRouter:
     async def geofence(name: str) -> dict[str, Any]:
         """The region as a GeoJSON feature, with its landing points."""
         ground = fleets[name].ground
-        region = ground.region
-        if region.origin is None:
-            raise InputError(f"geofence: {region.name} has no place on Earth")
-        points = on_earth(shapely.MultiPoint(ground.points.tolist()), region.origin)["coordinates"]
-        shape = on_earth(region.polygon, region.origin)
-        about = {"name": region.name, "landing_points": points}
+        points = ground.on_earth(shapely.MultiPoint(ground.points.tolist()))["coordinates"]
+        about = {"name": ground.region.name, "landing_points": points}
+        shape = ground.on_earth(ground.region.polygon)
         return {"type": "Feature", "properties": about, "geometry": shape}
 
     @router.get("/{name}/journal", response_class=PlainTextResponse)
