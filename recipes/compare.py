@@ -42,7 +42,6 @@ from .known import key_of
 from .shared.runs import Run, check_policy_fits
 from .shared.settings import check_learning, late
 from .shared.sweeps import (
-    FIGURE,
     LOG,
     MARKDOWN,
     NO_RESULTS,
@@ -57,7 +56,7 @@ from .shared.sweeps import (
 from .train import train
 
 TABLE = "table.csv"
-CURVES = "curves.png"
+CURVES, FIGURE = "curves.png", "figure.png"
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:

@@ -1,4 +1,4 @@
-"""Figures of trainings, sweeps and comparisons: learning curves, and scores with intervals."""
+"""Figures of trainings and comparisons: learning curves, and scores with intervals."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +12,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
-from pandas.api.types import is_numeric_dtype
 
 from damian.common.plotting import STYLE, save_figure
 from damian.compare.comparison import ENDS, HELD_OUT_MARK, NOT_LATE, Comparison, Method, sign_of
@@ -142,29 +141,6 @@ def plot_scores(comparison: Comparison, path: Path) -> None:
     save(path, _places(comparison), panel, (3.4, 2.8), width=3)
 
 
-def plot_sweep(lines: pd.DataFrame, groups: Sequence[str], path: Path) -> None:
-    """Draw the returns of a sweep (lines of ``means``) with their 95 % intervals over one setting.
-
-    That along the axis has most values, and numbers if any has; each value of the others, and each
-    policy, has a curve.
-    """
-    fitness = {key: (is_numeric_dtype(lines[key]), lines[key].nunique()) for key in groups}
-    along = max(groups, key=fitness.__getitem__, default="")
-    names = [*(key for key in groups if key != along), "policy"]
-    compared = lines[lines["policy"].isin([TRAINED, SCRIPT, RANDOM])]
-
-    def panel(axis: Axes, _: str) -> None:
-        for values, found in compared.groupby(names, sort=False):
-            curve = found.sort_values(along)
-            value, low, high = (curve["return" + end].to_numpy() for end in ENDS)
-            error = np.nan_to_num([value - low, high - value])
-            label = " ".join(map(str, values))
-            axis.errorbar(curve[along], value, error, marker="o", markersize=4, label=label)
-        axis.set(xlabel=along, ylabel="return")
-
-    save(path, [*filter(None, [along])], panel, (4.4, 3.2))
-
-
 def look(methods: Mapping[str, Method], method: str) -> Style:
     """Style of a method by its place among all; dotted lines are of methods that train nothing."""
     again, colour = divmod([*methods].index(method), len(METHOD_COLOURS))
@@ -182,7 +158,7 @@ def save(
     panels: Sequence[Panel],
     draw: Callable[[Axes, Panel], None],
     size: tuple[float, float],
-    width: int = 1,
+    width: int,
 ) -> None:
     """Draw panels of this size [inches] in rows of ``width``, with one legend to the right of
     them."""

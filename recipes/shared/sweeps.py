@@ -27,7 +27,7 @@ from damian.common.errors import InputError
 from damian.common.tables import markdown_table, write_csv
 from damian.common.text_files import read_text
 from damian.compare.comparison import OF_METHOD, RUN, Method, regime
-from damian.compare.figures import LABELS, plot_sweep
+from damian.compare.figures import LABELS
 from damian.compare.paired import as_table, means
 from damian.runs.metrics_log import read_metrics
 from damian.runs.processes import each_in_processes
@@ -42,7 +42,7 @@ LOG = "log.txt"
 """Output of a run of a comparison."""
 ROWS = "results.csv"
 POINTS = "curves.csv"
-MARKDOWN, FIGURE = "table.md", "figure.png"
+MARKDOWN = "table.md"
 """What follows from the rows."""
 
 
@@ -135,7 +135,7 @@ def sweep_rows(folder: Path) -> tuple[list[str], pd.DataFrame]:
 
 
 def report(folder: Path) -> str:
-    """Write rows, table and figure of a sweep into its folder; returns the table."""
+    """Write rows and table of a sweep into its folder; returns the table."""
     failed = [file.parent for file in sorted(folder.rglob(FAILED))]
     for each in (folder, *failed):
         check_no_links(each)
@@ -147,9 +147,7 @@ def report(folder: Path) -> str:
     rows = pd.DataFrame(errors, columns=["folder", "error"])
     if any(folder.rglob(RESULTS)) or not failed:
         groups, finished = sweep_rows(folder)
-        lines = means(finished, groups)
-        parts.append(as_table(lines, groups))
-        plot_sweep(lines, groups, folder / FIGURE)
+        parts.append(as_table(means(finished, groups), groups))
         rows = pd.concat([finished, rows], ignore_index=True) if failed else finished
     if failed:
         parts.append(markdown_table(["failed", "why"], errors, left=2))
