@@ -39,7 +39,6 @@ from damian.runs.processes import Interrupt, end_interrupted
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, TRAINED
 from damian.runs.training_state import RandomState, TrainingState, load_networks
 from damian.server.components import not_finite
-from damian.show.region import save_region
 
 from . import cli
 from .config import TrainConfig
@@ -49,6 +48,7 @@ from .shared.learning import (
     learning_env,
     make_collector,
     make_learner,
+    map_summary,
     own_code,
     read_by,
     replay_buffer,
@@ -76,7 +76,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     state = TrainingState(folder, learner.components(), collector, clock, buffer, hindsight)
     begin(config, state)
     if config.region.kind == "geojson":  # what was read of a map
-        print(save_region(env.uav_env.simulation, folder / "region.png"), flush=True)
+        print(map_summary(env.uav_env.simulation), flush=True)
     if config.compiles:
         print("compiling: the first update takes up to a minute longer")
     made = state.progress.frames

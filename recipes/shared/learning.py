@@ -1,6 +1,7 @@
 """The parts of a training: environment, learner, replay buffer, and batches between ticks of its
 clock."""
 
+import math
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import cast
@@ -32,6 +33,7 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.time_storage import TimeStorage
 from damian.runs.metrics import HindsightReturns
 from damian.server.server import Server
+from damian.world.simulation import Simulation
 
 from ..config import TrainConfig
 from .settings import backupdates, learning_setup, measures_hindsight
@@ -69,6 +71,24 @@ def assume(
         env.assume(assumed_policy(env.uav_env.simulation, env.server, policy))
     elif forward:
         env.assume(assumed_script(env))
+
+
+def map_summary(simulation: Simulation) -> str:
+    """What was read of a map: its area, its landing points and how many footprints it has room for.
+
+    A warning follows if these are fewer than the UAVs, or more than a hundred times as many.
+    """
+    region = simulation.airspace.regions[0]
+    radius = simulation.radius
+    agents = simulation.config.agents
+    area = region.polygon.area
+    fitting = area / (math.pi * radius**2)
+    n_points = int(simulation.airspace.n_points[0])
+    told = f"region: {region.name}: {area / 1e6:.3g} km², {n_points} landing points, "
+    told += f"room for {fitting:.3g} footprints of {radius:.3g} m"
+    if agents <= fitting <= 100 * agents:
+        return told
+    return f"{told}\nwarning: footprints do not fit agents={agents}; source.level_db sets them"
 
 
 def own_code(learner: LearnerConfig) -> AbstractContextManager[None]:

@@ -13,13 +13,14 @@ from helpers import check_refused, usecase
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from damian import make_env
+from damian import UavEnv, compose_scenario, make_env
 from damian.models.actor import make_actor
 from damian.models.critic import make_critic
 from damian.recipes import evaluate
 from damian.recipes import train as train_recipe
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.config import TrainConfig
+from damian.recipes.shared.learning import map_summary
 from damian.recipes.shared.runs import seed_generators, stored_config
 from damian.recipes.shared.settings import learning_setup
 from damian.runs.training_state import load_networks
@@ -222,3 +223,12 @@ def test_long_trainings_are_compiled_unless_the_settings_say_otherwise():
 def test_a_learner_knows_how_late_actions_are_executed_if_they_are(words, delay):
     config = composed_config(*words)
     assert learning_setup(config, config.make_delays()).action_delay == delay
+
+
+@pytest.mark.parametrize(("level_db", "fits"), [(115, False), (135, True), (155, False)])
+def test_the_summary_of_a_map_warns_where_footprints_do_not_fit(level_db, fits):
+    square = "region.vertices=[[0,0],[1000,0],[1000,500],[0,500]]"
+    words = ("scenario=coverage", "region=vertices", square, f"source.level_db={level_db}")
+    told = map_summary(UavEnv(compose_scenario(*words), 1).simulation)
+    assert "0.5 km²" in told
+    assert ("warning" in told) != fits
