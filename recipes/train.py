@@ -53,7 +53,6 @@ from .shared.learning import (
     read_by,
     replay_buffer,
     require_delayed_talk,
-    require_memory,
     ticks,
 )
 from .shared.runs import run_folder, save_config, start, stored_values
@@ -68,7 +67,6 @@ def train(config: TrainConfig, folder: Path) -> None:
     env = learning_env(config)
     clock = SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
-    require_memory(config, env, buffer)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compiles)
     require_delayed_talk(config, cast(DelayedEnv, collector.env), learner)

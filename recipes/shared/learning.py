@@ -17,7 +17,6 @@ from damian import keys
 from damian.baselines.script import assumed_script
 from damian.common import checks
 from damian.common.compiling import COMPILE_OPTIONS
-from damian.common.devices import free_memory
 from damian.common.errors import naming_errors
 from damian.delays.scenario import ScenarioDelays
 from damian.envs.delayed_env import DelayedEnv
@@ -37,10 +36,6 @@ from damian.world.simulation import Simulation
 
 from ..config import TrainConfig
 from .settings import backupdates, learning_setup, measures_hindsight
-
-BASE_MEMORY, COPIES = 0.6, 2.6
-"""Memory of the program [GiB], and how often it holds each step of the batch and of the buffer at
-once."""
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
@@ -174,20 +169,6 @@ def corrected_storage(
         corrections=corrections,
         hindsight_key=keys.HINDSIGHT if hindsight else None,
         device=config.device,
-    )
-
-
-def require_memory(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> None:
-    """Refuse a training that needs more memory than its device has free (docs/scaling.md)."""
-    step = sum(entry.nbytes for entry in env.fake_tensordict().values(True, True))
-    stored = 0 if buffer is None else buffer.storage.max_size / config.worlds
-    needed = BASE_MEMORY + COPIES * step * (config.update_steps + stored) / 2**30
-    free = free_memory(torch.device(config.device))
-    checks.require(
-        needed < free,
-        "worlds",
-        config.worlds,
-        f"these worlds need about {needed:.1f} GiB of memory, {free:.1f} are free: take fewer",
     )
 
 

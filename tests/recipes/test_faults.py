@@ -15,7 +15,6 @@ from stopped_runs import TINY, at_each_update, ended, files, forked, killed_afte
 
 from damian.common.devices import keep_freed_memory
 from damian.recipes import train
-from damian.recipes.shared import learning
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.run_folder import locked
 
@@ -71,13 +70,6 @@ def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
     after = contents(copied)
     changed = {name for name in after if after[name] != before.get(name)}
     assert changed <= {"metrics.csv", "run.json", "config.yaml"}
-
-
-def test_worlds_that_do_not_fit_into_the_memory_are_refused(run, capsys, monkeypatch):
-    monkeypatch.setattr(learning, "free_memory", lambda device: 0.5)
-    should = "these worlds need about 0.6 GiB of memory, 0.5 are free: take fewer"
-    check_refused(lambda: run(*TINY, "worlds=4"), f"worlds: 4 {should}", capsys)
-    assert not Path("run").exists() or not files(Path("run"))
 
 
 def test_freed_memory_is_used_again():
