@@ -185,7 +185,6 @@ class MappoConfig(LearnerConfig):
         "is late.",
         choices=("script", "planner"),
     )
-    teacher_horizon: int = setting(4, "Steps that a planning teacher looks ahead.", low=1, high=100)
     imitate: int = setting(
         50_000, "Environment steps in which the policy does nothing but imitate.", low=1
     )

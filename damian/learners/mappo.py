@@ -83,8 +83,7 @@ class Mappo:
         self.teacher = None
         if config.teacher is not None:
             worlds = cast(DelayedEnv, env).uav_env
-            horizon = config.teacher_horizon
-            self.teacher = Teacher(worlds, config.teacher, horizon, setup.compile)
+            self.teacher = Teacher(worlds, config.teacher, compile=setup.compile)
         # Compiling a recurrent actor, whose loop over time becomes one graph, takes many minutes.
         compiles = setup.compile and not setup.model.recurrent
         self.losses = compiled(self._losses, options=COMPILE_OPTIONS) if compiles else self._losses

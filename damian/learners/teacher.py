@@ -30,7 +30,9 @@ class Teacher:
         InputError: actions are continuous.
     """
 
-    def __init__(self, worlds: "UavEnv", name: str, horizon: int, compile: bool = False) -> None:
+    def __init__(
+        self, worlds: "UavEnv", name: str, horizon: int = 4, compile: bool = False
+    ) -> None:
         discrete = worlds.scenario.actions.kind == "discrete"
         checks.require(discrete, "learner.teacher", name, "needs discrete actions")
         self.server = worlds.server

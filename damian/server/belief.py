@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from damian.common import checks, devices
+from damian.common import devices
 from damian.common.tensors import gather_rows, tree_map
 from damian.world.airspace import Airspace
 from damian.world.messages import Messages
@@ -37,14 +37,11 @@ from damian.world.signal_source import SourceConfig, draw_walks, footprint_radiu
 # The grid: cells, and tables over them.
 
 CELL = 0.8
-"""Edge of a cell over the footprint's radius, if the settings do not give it."""
+"""Edge of a cell over the footprint's radius."""
 MOST_CELLS = 256
-"""A cell whose edge the settings do not give is so large that there are no more cells than about
-this."""
+"""Cells are larger where there would be more of them than about this."""
 LEAST_REPORT_PROBABILITY = 1e-3
 """Least probability that a UAV reports something else than the grid says: cells are not points."""
-_MAX_CELLS = 10_000
-"""Most cells: the table of moves has as many rows and columns."""
 _SAMPLES = 6
 """Points along each edge of a cell at which detection is tested."""
 _WALKS, _STEPS, _SEED = 512, 128, 0
@@ -118,17 +115,16 @@ class SourceGrid(NamedTuple):
 
 
 def build_source_grids(
-    airspace: Airspace, sources: Sequence[SourceConfig], dt: float, cell: float | None = None
+    airspace: Airspace, sources: Sequence[SourceConfig], dt: float
 ) -> SourceGrid:
     """The grid of K sources: ``build_source_grid`` of each kind, with cells as for the faintest of
     them."""
     alike = [replace(each, position=None) for each in sources]
     kinds = [each for number, each in enumerate(alike) if each not in alike[:number]]
     radii = [footprint_radius(kind) for kind in kinds]
-    if not cell:
-        cell = _edge([region.polygon for region in airspace.regions], min(radii))
+    edge = edge_of_cells(airspace, min(radii))
     grids = [
-        build_source_grid(airspace, kind, radius, dt, cell)
+        build_source_grid(airspace, kind, radius, dt, edge)
         for kind, radius in zip(kinds, radii, strict=True)
     ]
 
@@ -160,14 +156,14 @@ def build_source_grids(
     )
 
 
-def _edge(polygons: list, radius: float) -> float:
-    """Edge of a cell that the settings do not give [m]."""
-    largest = max(polygon.area for polygon in polygons)
+def edge_of_cells(airspace: Airspace, radius: float) -> float:
+    """Edge of a cell [m], by the smallest ``radius`` of a footprint."""
+    largest = max(region.polygon.area for region in airspace.regions)
     return max(CELL * radius, math.sqrt(largest / MOST_CELLS))
 
 
 def build_source_grid(
-    airspace: Airspace, source: SourceConfig, radius: float, dt: float, cell: float | None = None
+    airspace: Airspace, source: SourceConfig, radius: float, dt: float, edge: float
 ) -> SourceGrid:
     """Lay the grid over all regions, and tabulate what is known of one source (lengths in metres).
 
@@ -176,15 +172,6 @@ def build_source_grid(
     every step: with ``emission=per_stop``, silence counts for too much.
     """
     polygons = [region.polygon for region in airspace.regions]
-    edge = cell or _edge(polygons, radius)
-    largest = max(polygon.area for polygon in polygons)
-    n_cells = math.ceil(largest / edge**2)  # at least
-    checks.require(
-        n_cells <= _MAX_CELLS,
-        "observation.belief_cell",
-        f"{edge:g} m",
-        f"makes {n_cells} cells, more than {_MAX_CELLS}: take larger ones",
-    )
     columns = _columns(polygons, edge)
     positions = columns * edge
     centres = torch.as_tensor(positions, dtype=torch.float32)

@@ -25,8 +25,7 @@ class ObservationConfig(Settings):
 
     local_features: list[str] = setting(
         ["spotted"],
-        "Features of the UAV itself: battery, spotted, served, place, time_left, number, kind, "
-        "pending.",
+        "Features of the UAV itself: battery, spotted, served, place, number, kind, pending.",
     )
     global_features: list[str] = setting(
         ["source_distance", "source_bearing", "source_time"],
@@ -74,12 +73,6 @@ class ObservationConfig(Settings):
     belief: list[str] = setting(
         [],
         "Where the source is, by Bayes' rule: belief_gain (per action), belief_moments, belief_map.",
-    )
-    belief_cell: float | None = setting(
-        None,
-        "Edge of a cell of the belief; 0.8 footprint radii or more if not given.",
-        unit="m",
-        above=0,
     )
     window: int = setting(
         2, "Latest landing points of a UAV that its coverage counts.", low=1, high=16

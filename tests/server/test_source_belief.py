@@ -18,7 +18,7 @@ def make_grid(emission=0.6, moves=True, regions=1, **detection):
     emits = {"emission": "per_step", "emission_probability": emission, **detection}
     airspace = UavEnv(square() if regions == 1 else everything()).simulation.airspace
     source = walking(**emits) if moves else SourceConfig(**emits)
-    return build_source_grid(airspace, source, radius=50.0, dt=1.0, cell=45.0)
+    return build_source_grid(airspace, source, radius=50.0, dt=1.0, edge=45.0)
 
 
 GRIDS = {
@@ -34,7 +34,6 @@ GRIDS = {
             walking(miss=0.2),
         ],
         dt=1.0,
-        cell=45.0,
     ),
 }
 

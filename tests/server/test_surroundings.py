@@ -13,7 +13,7 @@ from damian.server.features.coverage import RINGS, SECTORS, nearest_distance
 from damian.server.features.others import OTHERS
 from damian.world.config import MotionConfig, RegionConfig
 
-REST = ["coverage_map", "place", "time_left", "number"]
+REST = ["coverage_map", "place", "number"]
 """Features behind ``others``, in the order of the observation."""
 
 
@@ -53,7 +53,6 @@ def twin(env, messages, region, now, i):
         "coverage_map": new,
         "others": ways,
         "place": [max(-1, min(1, v / (scale / 2))) for v in target[i]],
-        "time_left": [1 - now / env.uav_env.scenario.time_scale],
         "number": [float(i % 5 == column) for column in range(5)],
     }
 
@@ -80,7 +79,7 @@ def check_others(rows, ways):
 )
 @pytest.mark.parametrize("own", [False, True])
 def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
-    local = ["place", "time_left", "number"]
+    local = ["place", "number"]
     shared = ["others", "coverage_map"]
     scenario = ScenarioConfig(
         agents=agents,
@@ -103,7 +102,7 @@ def test_surroundings_equal_those_of_a_plain_loop(agents, motion, own):
                     rows[i] = sent[world, step, i]
                 messages = server.messages(rows)
                 expected = twin(env, messages, int(server.region_of(messages)), step + 1, i)
-                others, rest = observed[world, step, i].split([5 * OTHERS, 24 + 2 + 1 + 5])
+                others, rest = observed[world, step, i].split([5 * OTHERS, 24 + 2 + 5])
                 values = torch.tensor([number for name in REST for number in expected[name]])
                 assert rest.allclose(values, atol=1e-5), (world, step, i)
                 check_others(others.view(OTHERS, 5), expected["others"])

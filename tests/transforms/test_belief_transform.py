@@ -13,7 +13,7 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from damian import BackupdateStorage, DelayConfig, keys, make_env
 from damian.envs.recompute import server_recompute
-from damian.server.belief import build_source_grid
+from damian.server.belief import build_source_grid, edge_of_cells
 from damian.server.config import ObservationConfig
 from damian.world.config import MotionConfig, RegionConfig
 from damian.world.signal_source import footprint_radius
@@ -22,11 +22,10 @@ LONGEST = 7
 
 
 def tracking(law=PAPER, own=False, **changed):
-    """A moving, intermittent source in a small square, with a coarse grid, which the slow twin can
-    bear."""
+    """A moving, intermittent source in a small square."""
     return square(
         source=walking(emission="per_step", emission_probability=0.6, position=[100.0, 100.0]),
-        observation=ObservationConfig(belief=["belief_gain"], belief_cell=50.0, own=own),
+        observation=ObservationConfig(belief=["belief_gain"], own=own),
         delay=DelayConfig(obs=law, loss=0.1 if law else 0.0),
         **changed,
     )
@@ -69,15 +68,12 @@ def expected(env, data, begin, end, now, viewer=None):
 def grids_of(env):
     """The tables of each source alone."""
     simulation = env.uav_env.simulation
-    of_each = [(each, footprint_radius(each)) for each in simulation.sources]
+    airspace = simulation.airspace
+    radii = [footprint_radius(each) for each in simulation.sources]
+    edge = edge_of_cells(airspace, min(radii))
     return [
-        build_source_grid(
-            simulation.airspace,
-            *each,
-            dt=1.0,
-            cell=50.0,
-        )
-        for each in of_each
+        build_source_grid(airspace, each, radius, dt=1.0, edge=edge)
+        for each, radius in zip(simulation.sources, radii, strict=True)
     ]
 
 

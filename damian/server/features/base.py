@@ -87,12 +87,12 @@ def footprint_radii(simulation: Simulation) -> list[float]:
     return [footprint_radius(replace(source, **level)) for level in drawn_levels(simulation)]
 
 
-def source_grid(simulation: Simulation, observation: ObservationConfig) -> SourceGrid:
+def source_grid(simulation: Simulation, _: ObservationConfig) -> SourceGrid:
     """The cells in which the sources may be, with the tables of the belief for each level of the
     source."""
     levels = drawn_levels(simulation)
     kinds = [replace(each, **level) for level in levels for each in simulation.sources]
-    grid = build_source_grids(simulation.airspace, kinds, simulation.dt, observation.belief_cell)
+    grid = build_source_grids(simulation.airspace, kinds, simulation.dt)
     return grid._replace(first=grid.first.view(len(levels), -1))
 
 

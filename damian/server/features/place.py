@@ -49,14 +49,6 @@ def _kind(v: FeatureCache) -> Tensor:
     return v.table(kinds_of_uavs).expand(*v.messages.time.shape, 2)
 
 
-@feature("local", name="time_left")
-def _time_left(v: FeatureCache) -> Tensor:
-    """Time left of ``observation.time_scale``, by default that of an episode, as its share,
-    [*, N]."""
-    left = 1 - v.context.now / v.context.time_scale
-    return left.clamp(0, 1).unsqueeze(-1).expand(v.messages.time.shape)
-
-
 @feature("local", name="battery", tables=[battery_settings])
 def _battery(v: FeatureCache) -> Tensor:
     """Level of the battery, as a share, [*, N]."""
