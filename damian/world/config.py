@@ -65,11 +65,11 @@ class RegionConfig(Settings):
         kinds=FILES,
     )
     id: str = setting("", "Airspace ID of the region in the FIR table.", kinds=("fir",))
-    index: Any = setting(
-        None, "Index of the feature in the file, from 0, or a list to unite.", kinds=GEOJSON
+    index: list[int] = setting(
+        [], "Index of the feature in the file, from 0, or a list to unite.", low=0, kinds=GEOJSON
     )
-    where: Any = setting(
-        None, "Property of the feature, ``property:value``, or a list to unite.", kinds=GEOJSON
+    where: list[str] = setting(
+        [], "Property of the feature, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
     zones: Any = setting(
         [],
@@ -102,6 +102,10 @@ class RegionConfig(Settings):
     )
 
     def __post_init__(self) -> None:
+        for name in ("index", "where"):
+            given = getattr(self, name)
+            if not isinstance(given, list):
+                setattr(self, name, [] if given is None else [given])
         super().__post_init__()
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.initial_conditions", self.initial_conditions, self.pool)
@@ -116,22 +120,12 @@ class RegionConfig(Settings):
             "options",
             "means nothing without a region of your own (region.kind=package.module:function)",
         )
-        indices = self.index if isinstance(self.index, list) else [self.index]
-        good = indices == [None] or (
-            indices and all(type(each) is int and each >= 0 for each in indices)
+        should = (
+            "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
         )
-        self.refuse(
-            not good, "index", "is not a feature's number, counted from 0, or a list of numbers"
-        )
-        texts = self.where if isinstance(self.where, list) else [self.where]
-        fits = texts and all(isinstance(each, str) and re.search(".[:=]", each) for each in texts)
-        good = texts == [None] or fits
-        self.refuse(
-            not good,
-            "where",
-            "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts",
-        )
-        both = self.index is not None and self.where is not None
+        for each in self.where:
+            checks.require(re.search(".[:=]", each) is not None, "region.where", each, should)
+        both = self.index and self.where
         self.refuse(both, "where", "and region.index both choose; give one of them")
         zones = self.zones
         drawn = checks.is_number(self.zones)

@@ -213,4 +213,4 @@ def test_a_value_with_a_colon_is_no_name(store):
     Path("park.geojson").write_text(json.dumps(park), "utf-8")
     store("region", {"kind": "geojson", "path": "park.geojson", "where": "name:park"})
     _, env = damian.load("run")
-    assert env.uav_env.scenario.region.where == "name:park"
+    assert env.uav_env.scenario.region.where == ["name:park"]

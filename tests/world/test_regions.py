@@ -54,14 +54,14 @@ def test_rows_of_a_table_are_ordered_by_sequence_number():
 
 
 def test_a_hole_stays_a_hole_and_heights_are_ignored():
-    region = read_area(ZONES, where="name=lake")
+    region = read_area(ZONES, where=["name=lake"])
     outer_area = Polygon(region.polygon.exterior).area
     assert region.polygon.area == pytest.approx(outer_area * 8 / 9, rel=1e-3)
 
 
 def test_policies_are_measured_over_ten_outlines_of_which_four_have_a_hole():
     names = [each["properties"]["name"] for each in json.loads(OUTLINES.read_text())["features"]]
-    polygons = [read_area(OUTLINES, where=f"name:{name}").polygon for name in names]
+    polygons = [read_area(OUTLINES, where=[f"name:{name}"]).polygon for name in names]
     assert len({*names}) == 10
     assert sum(len(polygon.interiors) for polygon in polygons) == 4
     areas = [polygon.area for polygon in polygons]
@@ -178,10 +178,10 @@ def test_maps_of_other_kinds_are_read_by_their_suffix(tmp_path, suffix):
             archive.write(file, "doc.kml")
         file = tmp_path / "map.kmz"
     square = read_area(_written(tmp_path, "square.geojson", _polygon(RING)))
-    region = read_area(file, where="Name:Łąka: a=b")
+    region = read_area(file, where=["Name:Łąka: a=b"])
     assert region.name == "Łąka: a=b"
     assert region.polygon.normalize().equals_exact(square.polygon.normalize(), 1e-6)
-    assert read_area(file, index=1).name == "yard"
+    assert read_area(file, index=[1]).name == "yard"
 
 
 def test_the_fence_of_a_plan_is_latitude_and_longitude_without_what_it_excludes(tmp_path):
@@ -310,7 +310,7 @@ METRES = _polygon([[5e5, 4e6], [6e5, 4e6], [6e5, 5e6]])
             {},
             "2 features are areas: choose by region.index=NUMBER or region.where=PROPERTY",
         ),
-        (TWO_FEATURES, {"where": "zone=c"}, "fits 0 features, not one; the file has 'a', 'b'"),
+        (TWO_FEATURES, {"where": ["zone=c"]}, "fits 0 features, not one; the file has 'a', 'b'"),
         (LINE, {}, "feature is a LineString; a region is an area: draw a closed outline (Polygon)"),
         (METRES, {}, "[500000.0, 4000000.0] is not a longitude"),
         (_polygon(RING) | {"crs": _crs("EPSG:999999")}, {}, "reference system is not understood: "),

@@ -6,7 +6,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -54,7 +54,10 @@ class _Feature(NamedTuple):
 
 
 def read_area(
-    path: str | os.PathLike[str], index: Any = None, where: Any = None, every: bool = False
+    path: str | os.PathLike[str],
+    index: Sequence[int] = (),
+    where: Sequence[str] = (),
+    every: bool = False,
 ) -> Region:
     """Read one area of a file, or unite several; the suffix of the file says how it is read.
 
@@ -66,9 +69,9 @@ def read_area(
 
     Args:
         path: the file.
-        index: the feature's index, counted from 0 over all features of the file, or a list of them.
-        where: a property that only the feature has, as ``property:value`` or ``property=value``, or
-            a list; the property's name may be in capitals or not.
+        index: the indices of the features, counted from 0 over all of the file.
+        where: for each feature a property that only it has, as ``property:value`` or
+            ``property=value``; the property's name may be in capitals or not.
         every: unite all features that are areas.
 
     Raises:
@@ -81,7 +84,7 @@ def read_area(
         try:
             features = read(path)
             areas = [number for number, each in enumerate(features) if not each.fault]
-            chosen = _choose(features, areas if every and areas else index, where)
+            chosen = _choose(features, areas if every else index, where)
             parts, excluded = (
                 [
                     [_degrees(ring, each) for ring in rings]
@@ -95,7 +98,7 @@ def read_area(
         except Exception as error:  # a file can hold anything at any place
             raise InputError(f"is not {kind}: {error!r}") from None
         left_out = [each for each in features if each.fault and not each.is_excluded]
-        if left_out and (every or index is where is None):
+        if left_out and (every or not (index or where)):
             _tell(f"{path}: left out: {listed(f'{each.place} {each.fault}' for each in left_out)}")
         names = [_name(each) or f"{path.stem} {each.place}" for each in chosen]
         return local_region(
@@ -211,19 +214,14 @@ def _extra(module: str, what: str) -> Any:
         ) from None
 
 
-def _choose(features: list[_Feature], index: Any, where: Any) -> list[_Feature]:
+def _choose(features: list[_Feature], index: Sequence[int], where: Sequence[str]) -> list[_Feature]:
     """Find the features chosen by ``index`` or ``where``, or else the only one that is an area."""
-    if index is not None:
-        numbers = index if isinstance(index, list) else [index]
-        if max(numbers) >= len(features):
-            raise InputError(
-                f"region.index: {max(numbers)} is not between 0 and {len(features) - 1}"
-            )
-        chosen = [features[number] for number in numbers]
-    elif where is not None:
-        chosen = [
-            _fitting(features, each) for each in (where if isinstance(where, list) else [where])
-        ]
+    if index:
+        if max(index) >= len(features):
+            raise InputError(f"region.index: {max(index)} is not between 0 and {len(features) - 1}")
+        chosen = [features[number] for number in index]
+    elif where:
+        chosen = [_fitting(features, each) for each in where]
     else:
         chosen = [each for each in features if not each.fault]
         if len(chosen) > 1:
