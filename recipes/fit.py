@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from damian.common.atomic_files import write_atomically
 from damian.common.text_files import named
-from damian.delays.clocks import are_right, check_clocks, in_order, note_on
+from damian.delays.clocks import check_clocks, in_order
 from damian.delays.law_fit import LawFit, fit_laws
 from damian.delays.logs import delays_of, read_log, steps_of, trace_rows
 
@@ -27,12 +27,9 @@ def fit(config: FitConfig, folder: Path) -> None:
     log = Path(config.log)
     dt = config.clock.dt
     messages = in_order(read_log(log))
-    right = are_right(messages)
     with named(log):
-        check_clocks(messages, right)
-    if not right.all():
-        print(note_on(messages, right))
-    delays = delays_of(messages, right)
+        check_clocks(messages)
+    delays = delays_of(messages)
     trace = folder / "trace.csv"
     write_atomically(trace, "\n".join(["delay", *trace_rows(delays), ""]))
     print(summary(delays))

@@ -54,7 +54,7 @@ def read_log(path: Path) -> pd.DataFrame:
         log = []
         for where, report, came in rows:
             with named(where):
-                log.append({"where": f"{path}: {where}", **_row(report, came)})
+                log.append({"where": where, **_row(report, came)})
         if len(log) < 2:
             raise InputError(f"{len(log)} reports are too few to tell how late they are")
     return pd.DataFrame(log)
@@ -111,27 +111,20 @@ def _number(cells: Mapping[str, str], name: str) -> float:
     return number
 
 
-def delays_of(messages: pd.DataFrame, right: pd.Series) -> pd.DataFrame:
-    """A row for each message from a right clock, in the order of ``in_order``, whose columns these
-    are.
+def delays_of(messages: pd.DataFrame) -> pd.DataFrame:
+    """A row for each message, in the order of ``in_order``, whose columns these are.
 
     Columns: ``uav`` (ID), ``time`` when it was generated [s], ``received`` when it came in first
     [s], and its ``delay`` [s], 0 if clocks differ a little, so that it came in before its time; the
-    last two are nan for a
-    message that never came in, whose time is estimated: one whose number is missing. Where a UAV
-    does not number its reports, no loss can be seen.
+    last two are nan for a message that never came in, whose time is estimated: one whose number is
+    missing. Where a UAV does not number its reports, no loss can be seen.
     """
-    told = messages.assign(right=right).drop_duplicates(["uav", "run", "time", "sequence", "right"])
     parts = []
-    for uav, own in told.groupby("uav"):
+    for uav, own in messages.drop_duplicates(["uav", "run", "time", "sequence"]).groupby("uav"):
         gaps = own.groupby("run").sequence.diff().sub(1).fillna(0)
         rows = np.arange(len(own)) + gaps.where(gaps <= LONGEST_GAP, 0).cumsum().to_numpy(int)
-        every = own.set_index(rows)[["time", "received", "right"]].reindex(range(rows[-1] + 1))
-        counts = every.right.bfill().astype(
-            bool
-        )  # what was lost before a message counts if that does
-        time = every.time.where(counts).interpolate(limit_direction="both")
-        part = every.assign(uav=uav, time=time)[counts].drop(columns="right")
+        every = own.set_index(rows)[["time", "received"]].reindex(range(rows[-1] + 1))
+        part = every.assign(uav=uav, time=every.time.interpolate(limit_direction="both"))
         parts.append(part.sort_values("time", kind="stable") if own.sequence.isna().all() else part)
     delays = pd.concat(parts, ignore_index=True)
     return delays.assign(delay=(delays.received - delays.time).clip(lower=0))

@@ -3,11 +3,13 @@
 import json
 import shlex
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from damian import Trace
 from damian.common.errors import InputError
-from damian.delays.clocks import are_right, in_order
+from damian.delays.clocks import check_clocks, in_order
 from damian.delays.logs import delays_of, read_log, trace_rows
 from damian.recipes.cli import settings
 from damian.recipes.command import main
@@ -34,8 +36,7 @@ def table(numbered=True, period=1.0, uavs=2, start=1.7e9):
 
 
 def fitted_log(path):
-    messages = in_order(read_log(path))
-    return delays_of(messages, are_right(messages))
+    return delays_of(in_order(read_log(path)))
 
 
 @pytest.fixture
@@ -111,6 +112,22 @@ def test_numbered_reports_of_one_second_are_different_messages_also_without_plac
     assert trace_rows(fitted)[7] == "lost"
 
 
+def test_who_starts_anew_counts_anew():
+    numbers = np.arange(400)
+    late = np.random.default_rng(0).uniform(0, 4, 400)
+    log = pd.DataFrame(
+        {
+            "uav": "A",
+            "time": 1000.0 + numbers,
+            "received": 1000 + numbers + late,
+            "sequence": numbers % 200.0,
+        }
+    ).drop(index=[3, 199, 200])  # 200: the first number, again
+    messages = in_order(log.sample(frac=1, random_state=0))
+    assert [*messages.index] == [*log.index]
+    assert [*messages.run] == [0] * 198 + [1] * 199
+
+
 @pytest.mark.parametrize(
     ("shift", "said"),
     [
@@ -134,6 +151,23 @@ def test_clocks_that_differ_are_named_before_anything_is_written(
     )
     assert line.startswith(f"{start} {said} times; correct one of them")
     assert not (tmp_path / "run" / "trace.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("time", "said"),
+    [
+        (3000025.5, "time: 3000025.5 s is 5 s after the receive time"),
+        (20.0, "time: 20 s is 3e+06 s before the receive time"),
+    ],
+)
+def test_a_message_of_a_wrong_clock_is_named(log, time, said):
+    times = [time if i == 20 else 3e6 + i for i in range(40)]
+    lines = [f"A,{sent},{3000000.5 + i}" for i, sent in enumerate(times)]
+    messages = in_order(read_log(log("\n".join(["ID,time,receive time", *lines]))))
+    with pytest.raises(InputError) as error:
+        check_clocks(messages)
+    remedy = "the clock of A was wrong then; correct the time, or leave such rows out"
+    assert str(error.value) == f"line 22: {said}: {remedy}"
 
 
 def test_a_few_messages_that_came_in_before_their_time_are_named(log):

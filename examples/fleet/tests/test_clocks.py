@@ -5,7 +5,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from damian.delays.clocks import are_right, in_order, note_on
+from damian.delays.clocks import in_order
+from damian_fleet.clocks import are_right, note_on
 
 N = 400
 START = 1.77e9
