@@ -120,7 +120,6 @@ def test_a_late_pendulum_prints_the_age_of_what_it_observes(capsys):
 @pytest.mark.parametrize(
     ("name", "entry"),
     [
-        ("late_words", "age"),
         pytest.param("late_vmas", "age", marks=pytest.mark.slow),
         pytest.param("late_replay_buffer", "buffer", marks=pytest.mark.slow),
     ],

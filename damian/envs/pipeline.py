@@ -183,10 +183,8 @@ def server_transforms(
             comm_range=links.range,
             position_key=keys.POSITION if law.reads or links.range is not None else None,
             sent_key=keys.MESSAGE_SENT,
-            known_at_reset=True,
             dt=scenario.clock.dt,
             age_key=None,
-            mask_key=None,
             delay_key=keys.LINK_DELAY if scenario.observation.timeline else None,
         )
         transforms.append(channel)

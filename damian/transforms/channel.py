@@ -3,9 +3,9 @@
 from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Composite
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask, where_rows
@@ -29,28 +29,25 @@ class Channel(StatefulTransform):
     """Lets the agents of a group send messages to each other, which arrive some steps later or are
     lost.
 
-    In each step an agent sends an entry of its own (``in_key``), or what its policy chooses
-    (``action_key``). Each receiver holds, of each sender, the message that was generated last of
-    those that have arrived, and observes it, its age, and whether any has arrived in this episode.
-    An agent knows its own message at once. The outputs of a reset are sent like those of a step; a
-    chosen message exists from the first step on. No gradient flows through the channel.
+    In each step an agent sends an entry of its own (``in_key``). Each receiver holds, of each
+    sender, the message that was generated last of those that have arrived, and observes it and its
+    age. An agent knows its own message at once, and everyone knows everyone's first message of an
+    episode, whatever the delay and the links. No gradient flows through the channel.
 
     A ``DelayLine`` delays only the time at which a message was generated, on every link [M]; the
     latest K messages of each of the S senders lie in a ring (``contents`` [K, S, ...]), and what is
     held in ``held`` [M, ...]. The memory also has the ``sender`` of each link, and a ``link`` of
     each sender.
 
-    A worked timeline, with a delay of 3 steps: the messages of the reset, t = 0, arrive at t = 3,
-    and those of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds
-    their messages of t = 0, of age 3.
+    A worked timeline, with a delay of 3 steps: messages of t = 1 arrive at t = 4. Until t = 3 an
+    agent holds those of the reset, t = 0, of the others.
 
     Args:
         delay, dt, seed: as in ``ObservationDelay``, but drawn for each receiver and message; or an
             N x N nested list of delays, ``delay[receiver][sender]``, whose diagonal is not used.
             With a ``position_key``, a law may read ``position`` and ``receiver_position``.
-        in_key: key of the entry [*B, N, ...] of a group of agents that every agent sends; if
-            neither this nor ``action_key`` is given, ``("agents", "observation")``. A bare name for
-            another key means an entry beside it.
+        in_key: key of the entry [*B, N, ...] of a group of agents that every agent sends. A bare
+            name for another key means an entry beside it.
         out_key: key under which the received entries are written, [*B, N, N, ...]
             (receiver, sender).
         loss: probability that a message does not reach a receiver, or an N x N nested list of it, 1
@@ -59,13 +56,7 @@ class Channel(StatefulTransform):
         position_key: key of an entry [*B, N, ...] whose first two numbers are the agent's position
             [m].
         sent_key: key of a flag [*B, N] bool: does the agent send in this step.
-        action_key: key of an action [*B, N, message_size] in [-1, 1], which the transform adds to
-            the specs.
-        message_size: how many numbers ``action_key`` has.
-        known_at_reset: everyone knows everyone's first message, whatever the delay and the links.
-        age_key: key for the age of the held messages [steps], [*B, N, N] float; before one has
-            arrived, steps since the reset; or None.
-        mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; or None.
+        age_key: key for the age of the held messages [steps], [*B, N, N] float; or None.
         delay_key: key for the delays of the messages sent in this step [steps], [*B, N, N] long
             (receiver, sender), -1 if they never arrive; or None. An actor must not observe it.
 
@@ -78,47 +69,30 @@ class Channel(StatefulTransform):
     def __init__(
         self,
         delay: Any,
-        in_key: NestedKey | None = None,
+        in_key: NestedKey = ("agents", "observation"),
         out_key: NestedKey = "received",
         *,
         loss: Any = 0.0,
         comm_range: float | None = None,
         position_key: NestedKey | None = None,
         sent_key: NestedKey | None = None,
-        action_key: NestedKey | None = None,
-        message_size: int | None = None,
-        known_at_reset: bool = False,
         dt: float = 1.0,
         age_key: NestedKey | None = "received_age",
-        mask_key: NestedKey | None = "received_mask",
         delay_key: NestedKey | None = None,
         seed: int | None = None,
     ) -> None:
-        if action_key is not None:
-            checks.whole("message_size", message_size, 1, unit="numbers")
-            should = (
-                "does not go with in_key or known_at_reset: at a reset no message has been chosen "
-                "yet"
-            )
-            chosen_only = in_key is None and not known_at_reset
-            checks.require(chosen_only, "action_key", action_key, should)
         placed = position_key is not None
         known_places = comm_range is None or placed
         checks.require(known_places, "comm_range", comm_range, "needs a position_key")
-        sent = in_key or ("agents", "observation")
-        super().__init__(sent if action_key is None else None, seed=seed)
-        self.action_key = None if action_key is None else unravel_key(action_key)
-        self._beside = self.action_key or self.in_keys[0]
+        super().__init__(in_key, seed=seed)
+        sent = self.in_keys[0]
         should = "is not in a group of agents, as ('agents', 'observation') is"
-        checks.require(isinstance(self._beside, tuple), "in_key", self._beside, should)
-        written = out_key, age_key, mask_key, delay_key
-        beside = [sibling_key(self._beside, key) for key in written]
-        _, self.age_key, self.mask_key, self.delay_key = beside
-        self.out_keys = existing(beside)
-        self.sent_key = sibling_key(self._beside, sent_key)
-        self.position_key = sibling_key(self._beside, position_key)
-        self.message_size = message_size
-        self.known_at_reset = known_at_reset
+        checks.require(isinstance(sent, tuple), "in_key", sent, should)
+        written = [sibling_key(sent, key) for key in (out_key, age_key, delay_key)]
+        _, self.age_key, self.delay_key = written
+        self.out_keys = existing(written)
+        self.sent_key = sibling_key(sent, sent_key)
+        self.position_key = sibling_key(sent, position_key)
         self.dt = dt
         self.comm_range = comm_range
         self.sampler = link_sampler(delay, loss, dt)
@@ -129,12 +103,7 @@ class Channel(StatefulTransform):
             checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
         self.line = DelayLine(self.sampler, "generation")
         self._n_slots = self.sampler.longest + 1
-        self.action_keys = existing([self.action_key])
         self.step_keys = existing([*self.in_keys, self.position_key, self.sent_key])
-
-    @property
-    def row_key(self) -> NestedKey:
-        return self._beside
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         """The shape of the rows: there is one for each link (receiver, sender), [*B, N, N]."""
@@ -144,7 +113,7 @@ class Channel(StatefulTransform):
             self.n_agents in (None, n),
             "Channel",
             "the links",
-            f"are given for {self.n_agents} agents, but {self._beside} is of {n}",
+            f"are given for {self.n_agents} agents, but {self.row_key} is of {n}",
         )
         return torch.Size((*agents, n))
 
@@ -156,9 +125,7 @@ class Channel(StatefulTransform):
     # The time of a message is counted in steps since the reset, whose own messages have time 1.
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        entries = select_entries(tensordict, self.step_keys)
-        example = next(iter(tensordict.values(True, True)))
-        content = self._content(entries, example.device)
+        content = self._content(select_entries(tensordict, self.in_keys))
         n = self.agents[-1]
         streams = self.streams(tensordict.batch_size, content.device, self.sampler)
         links = torch.arange(len(streams), device=streams.device)
@@ -177,17 +144,13 @@ class Channel(StatefulTransform):
         return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        self._put(memory, self._content(entries, mask.device))
+        self._put(memory, entries)
         begun, _ = self.line.reset(memory, [], mask)
-        held = begun["held"]
-        begun["held"] = held.masked_fill(expand_mask(mask, held), 0)
-        wanted = self._wanted(entries, mask) & (self.action_key is None)
-        after = self._send(begun, entries, wanted)
-        if self.known_at_reset:
-            after["generated_at"] = torch.where(mask, after["clock"], after["generated_at"])
-            after = self._hold(after, mask)
-            if self.delay_key:
-                after["delay"] = torch.zeros_like(after["delay"])
+        after = self._send(begun, entries, self._wanted(entries, mask))
+        after["generated_at"] = torch.where(mask, after["clock"], after["generated_at"])
+        after = self._hold(after, mask)
+        if self.delay_key:
+            after["delay"] = torch.zeros_like(after["delay"])
         memory = dict(memory)
         for name, new in after.items():
             old = begun[name]
@@ -195,32 +158,23 @@ class Channel(StatefulTransform):
             memory[name] = where_rows(mask, new, old) if changed else new
         return memory, self._outputs(memory)
 
-    def on_action(self, memory: Memory, entries: Entries) -> Change:
-        if self.action_key:
-            self._put(memory, as_rows(entries[self.action_key], self.agents))
-        return memory, {}
-
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        if not self.action_key:
-            self._put(memory, self._content(entries, memory["hears"].device))
+        self._put(memory, entries)
         active = torch.ones_like(memory["hears"])
         if STEPPED in entries:
             active = self.expand_worlds(entries[STEPPED].reshape(-1))
         memory = memory | self._send(memory, entries, self._wanted(entries, active))
         return memory, self._outputs(memory)
 
-    def _content(self, entries: Entries, device: torch.device) -> Tensor:
-        """What the agents send at a reset, [B * N, ...]; zeros for an action that is not chosen
-        yet."""
-        if self.message_size:
-            return torch.zeros(self.agents.numel(), self.message_size, device=device)
+    def _content(self, entries: Entries) -> Tensor:
+        """What the agents send in a step, [B * N, ...]."""
         return as_rows(entries[self.in_keys[0]], self.agents)
 
-    def _put(self, memory: Memory, content: Tensor) -> None:
-        """Write what the senders send in the next step, [S, ...]; the step may send it or not."""
+    def _put(self, memory: Memory, entries: Entries) -> None:
+        """Write what the senders send in the next step; the step may send it or not."""
         following = memory["clock"][memory["link"]] + 1
         rows = slot_rows(following % self._n_slots)
-        memory["contents"].flatten(0, 1).index_copy_(0, rows, content)
+        memory["contents"].flatten(0, 1).index_copy_(0, rows, self._content(entries))
 
     def _hold(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [M] is true, hold the messages that were generated at ``generated_at``."""
@@ -275,7 +229,7 @@ class Channel(StatefulTransform):
         return MessageContext(sender % n, receiver % n, n_sending, time, uniform, self.dt, read)
 
     def _outputs(self, memory: Memory) -> Entries:
-        """What the agents hold, with ages and flags; each agent holds its own message at once."""
+        """What the agents hold, with ages and delays; each agent holds its own message at once."""
         n = self.agents[-1]
         shape = self.rows
         start = memory["reset_at"]
@@ -284,51 +238,26 @@ class Channel(StatefulTransform):
         agents = torch.arange(len(now), device=now.device)
         senders = torch.arange(n, device=now.device)
         is_own = (agents % n).unsqueeze(-1) == senders
-        own_time = now
-        if self.action_key:  # nothing is chosen at a reset
-            own_time = now.masked_fill(now == 1, 0)
-        time = torch.where(is_own, own_time, time)
+        time = torch.where(is_own, now, time)
         newest = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
         own = memory["contents"].flatten(0, 1).index_select(0, newest)
         held = memory["held"].unflatten(0, (-1, n))
         value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
         entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
         if self.age_key is not None:
-            age = now - time.clamp(min=1)
-            entries[self.age_key] = age.to(torch.float32).view(shape)
-        if self.mask_key is not None:
-            entries[self.mask_key] = (time > 0).view(shape)
+            entries[self.age_key] = (now - time).to(torch.float32).view(shape)
         if self.delay_key is not None:
             delay = memory["delay"].view(-1, n).masked_fill(is_own, 0)
             delay = torch.where(delay < self.sampler.lost, delay, -1)
             entries[self.delay_key] = delay.view(shape)
         return entries
 
-    # The chosen message is an action for the policy, but none for the environment.
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = super()._inv_call(tensordict)
-        return tensordict.exclude(self.action_key) if self.action_key else tensordict
-
-    def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        input_spec = super().transform_input_spec(input_spec)
-        if self.action_key and self.message_size:
-            specs = cast(Composite, input_spec)["full_action_spec"]
-            shape = torch.Size((*spec_rows(specs, self.action_key), self.message_size))
-            specs[self.action_key] = Bounded(-1.0, 1.0, shape, device=specs.device)
-        return input_spec
-
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        agents = spec_rows(observation_spec, self._beside)
+        agents = spec_rows(observation_spec, self.row_key)
         pairs = (*agents, agents[-1])
-        received = self.out_keys[0]
-        if self.message_size:
-            add_spec(observation_spec, received, (*pairs, self.message_size))
-        else:
-            sent = observation_spec[self.in_keys[0]]
-            size = sent.shape[len(agents) :]
-            add_spec(observation_spec, received, (*pairs, *size), sent.dtype)
+        sent = observation_spec[self.in_keys[0]]
+        size = sent.shape[len(agents) :]
+        add_spec(observation_spec, self.out_keys[0], (*pairs, *size), sent.dtype)
         add_spec(observation_spec, self.age_key, pairs)
-        add_spec(observation_spec, self.mask_key, pairs, torch.bool)
         add_spec(observation_spec, self.delay_key, pairs, torch.long)
         return observation_spec

@@ -28,61 +28,38 @@ class World:
     Args:
         n_agents: number of agents, N.
         delay: delay of what is sent on a link at a clock [steps], None if it is lost.
-        known: does everyone know everyone's first message.
-        own_at_reset: is there an own message at the reset.
     """
 
-    def __init__(
-        self,
-        n_agents,
-        delay,
-        known=False,
-        own_at_reset=True,
-    ):
+    def __init__(self, n_agents, delay):
         self.agents = range(n_agents)
         self.delay = delay
-        self.known = known
-        self.own_at_reset = own_at_reset
         self.clock = 0
-        self.began = 0
 
     def step(self, contents, wanted, begins=False):
         """Send on the wanted links, and receive."""
         self.clock += 1
-        if begins:
-            self.began = self.clock
+        if begins:  # everyone knows everyone's first message
             self.in_transit = []
-            self.holds = {}
+            self.holds = {
+                (i, j): (self.clock, contents[j]) for i in self.agents for j in self.agents
+            }
         for link in wanted:
             if (delay := self.delay(self.clock, link)) is not None:
                 self.in_transit.append((self.clock + delay, link, self.clock, contents[link[1]]))
         for arrives, link, sent, content in self.in_transit:
-            if arrives == self.clock and (link not in self.holds or self.holds[link][0] < sent):
+            if arrives == self.clock and self.holds[link][0] < sent:
                 self.holds[link] = (sent, content)
-        if begins and self.known:
-            self.holds = {
-                (i, j): (self.clock, contents[j]) for i in self.agents for j in self.agents
-            }
         self.own = contents
 
-    def seen(self, receiver, sender, zeros):
-        """Content and age of what a receiver holds of a sender, and whether it holds anything."""
-        since = self.clock - self.began
+    def seen(self, receiver, sender):
+        """Content and age of what a receiver holds of a sender."""
         if receiver == sender:
-            return (self.own[sender], 0, True) if since or self.own_at_reset else (zeros, 0, False)
-        if (receiver, sender) not in self.holds:
-            return zeros, since, False
+            return self.own[sender], 0
         sent, content = self.holds[receiver, sender]
-        return content, self.clock - sent, True
+        return content, self.clock - sent
 
 
-def check_against_twin(
-    env,
-    make,
-    wants,
-    forced=lambda _: [],
-    sent=("agents", "observation"),
-):
+def check_against_twin(env, make, wants, forced=lambda _: []):
     """Compare every output of a rollout with partial resets with that of the twins.
 
     Args:
@@ -90,44 +67,38 @@ def check_against_twin(
         make: the twin of a world, given its number and the channel's random streams.
         wants: which links carry a message.
         forced: worlds to reset after a step, beside those that are done.
-        sent: key of what is sent, among the outputs, or among the inputs of a step.
     """
     torch.manual_seed(0)
     td = env.reset()
     worlds = range(env.batch_size[0])
     twins = [make(b, env.transform[-1].memory["streams"]) for b in worlds]
 
-    def follow(outputs, inputs, mask):
-        source = outputs if sent in outputs.keys(True) else inputs
+    def follow(outputs, mask, begins):
         for b in worlds:
             if mask[b]:
-                no_content = [[0.0]] * len(twins[b].agents)
-                contents = source[sent][b].tolist() if source is not None else no_content
-                twins[b].step(contents, wants(outputs, inputs, b), begins=inputs is None)
+                contents = outputs["agents", "observation"][b].tolist()
+                twins[b].step(contents, wants(outputs, b), begins)
             assert_same(twins[b], outputs[b])
 
-    follow(td, None, [True] * len(worlds))
+    follow(td, [True] * len(worlds), begins=True)
     for t in range(STEPS):
         td = env.rand_action(td)
         stepped = env.step(td)
-        follow(stepped["next"], stepped, [True] * len(worlds))
+        follow(stepped["next"], [True] * len(worlds), begins=False)
         td = step_mdp(stepped)
         mask = td["done"].view(-1).tolist()
         mask = [done or b in forced(t) for b, done in enumerate(mask)]
         if any(mask):
             td = env.reset(td.set("_reset", torch.tensor(mask).unsqueeze(-1)))
-            follow(td, None, mask)
+            follow(td, mask, begins=True)
 
 
 def assert_same(twin, outputs):
     """The messages that each agent has received from each other one are those of the twin."""
-    got = [
-        outputs["agents", name].tolist() for name in ("received", "received_age", "received_mask")
-    ]
-    zeros = [0.0] * len(got[0][0][0])
+    got = [outputs["agents", name].tolist() for name in ("received", "received_age")]
     for i in twin.agents:
         for j in twin.agents:
-            assert tuple(part[i][j] for part in got) == tuple(twin.seen(i, j, zeros)), (i, j)
+            assert tuple(part[i][j] for part in got) == twin.seen(i, j), (i, j)
 
 
 def table(law, streams, n_steps, loss=0.0):
@@ -146,7 +117,7 @@ def everyone(*_):
     return ALL
 
 
-def twin_of(law, loss=0.0, **rules):
+def twin_of(law, loss=0.0):
     """Makes twins whose links all have one law."""
 
     def make(b, streams):
@@ -155,7 +126,7 @@ def twin_of(law, loss=0.0, **rules):
         def delay(clock, link):
             return delays(clock, b * N * N + link[0] * N + link[1])
 
-        return World(N, delay, **rules)
+        return World(N, delay)
 
     return make
 
@@ -174,10 +145,8 @@ def twin_of(law, loss=0.0, **rules):
         ),
     ],
 )
-@pytest.mark.parametrize("known", [False, True])
-def test_messages_arrive_as_their_law_says(law, known):
-    env = counting(Channel(law, loss=0.2, known_at_reset=known))
-    check_against_twin(env, twin_of(law, 0.2, known=known), everyone)
+def test_messages_arrive_as_their_law_says(law):
+    check_against_twin(counting(Channel(law, loss=0.2)), twin_of(law, 0.2), everyone)
 
 
 def test_a_flag_chooses_who_sends():
@@ -185,15 +154,13 @@ def test_a_flag_chooses_who_sends():
         Uniform(0, 3),
         sent_key="message_sent",
         loss=0.1,
-        known_at_reset=True,
     )
 
-    def wants(outputs, _, b):
+    def wants(outputs, b):
         sent = outputs["agents", "message_sent"][b]
         return {(i, j) for i, j in ALL if sent[j]}
 
-    make = twin_of(Uniform(0, 3), 0.1, known=True)
-    check_against_twin(counting(channel), make, wants)
+    check_against_twin(counting(channel), twin_of(Uniform(0, 3), 0.1), wants)
 
 
 def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
@@ -252,7 +219,7 @@ def test_agents_hear_only_those_in_their_range(navigation):
     env = navigation(Channel(Uniform(1, 5), comm_range=0.9, position_key="observation"))
     heard = []
 
-    def wants(outputs, _, b):
+    def wants(outputs, b):
         links = {
             (i, j) for i, j in ALL if math.dist(place(outputs, b, i), place(outputs, b, j)) <= 0.9
         }
@@ -274,19 +241,8 @@ def test_a_law_may_read_the_positions_of_sender_and_receiver(navigation):
 
         return World(N, delay)
 
-    def wants(outputs, _, b):
+    def wants(outputs, b):
         now["outputs"] = outputs
         return ALL
 
     check_against_twin(env, make, wants, forced=some_worlds)
-
-
-def test_an_agent_sends_what_its_policy_chooses(navigation):
-    key = ("agents", "message")
-    env = navigation(Channel(Uniform(0, 3), action_key=key, message_size=2))
-
-    def wants(_, inputs, b):
-        return set() if inputs is None else ALL
-
-    make = twin_of(Uniform(0, 3), own_at_reset=False)
-    check_against_twin(env, make, wants, forced=some_worlds, sent=key)

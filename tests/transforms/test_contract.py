@@ -99,9 +99,6 @@ CASES = {
             [[0, LATE, 1], [3, 0, 0], [0, LATE, 0]], OBSERVATION, loss=0.2, sent_key="message_sent"
         ),
     ),
-    "Channel, messages": Case(
-        uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)
-    ),
     "ServerNode": Case(unserved, lambda: ServerNode(unserved().server, ("agents", "message"))),
 }
 """Every transform on every kind of environment that it works on; the name before the comma is its
