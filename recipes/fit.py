@@ -15,11 +15,14 @@ from omegaconf import DictConfig
 from damian.common.atomic_files import write_atomically
 from damian.common.text_files import named
 from damian.delays.clocks import check_clocks, in_order
-from damian.delays.law_fit import LawFit, fit_laws
+from damian.delays.law_fit import Integers, fit_laws
 from damian.delays.logs import delays_of, read_log, steps_of, trace_rows
 
 from . import cli
 from .config import FitConfig
+
+BAD_FIT = 0.1
+"""Distance of a law from what was recorded above which its fit is called bad."""
 
 
 def fit(config: FitConfig, folder: Path) -> None:
@@ -34,7 +37,7 @@ def fit(config: FitConfig, folder: Path) -> None:
     write_atomically(trace, "\n".join(["delay", *trace_rows(delays), ""]))
     print(summary(delays))
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
-    print(law_summary(*fit_laws(steps_of(delays, dt)), dt))
+    print(law_summary(steps_of(delays, dt), dt))
     print(f"results: {folder}")
 
 
@@ -61,17 +64,14 @@ def summary(messages: pd.DataFrame) -> str:
     )
 
 
-def law_summary(best: LawFit, own: LawFit, dt: float) -> str:
-    """The law that ``fit_laws`` finds as settings, and what of the delays it does not repeat, as
-    text."""
-    other = np.abs(best.chances - own.chances).sum() / 2
-    gain = (own.likelihood - best.likelihood) / best.n
+def law_summary(steps: Integers, dt: float) -> str:
+    """The best law for delays, as of ``fit_laws``, as settings, and how well it repeats them."""
+    best, distance = fit_laws(steps)
     law = str(best.written).replace("'", "")
     loss = f" delay.loss={best.loss}" * (best.loss > 0)
     text = f'best law: "delay.obs={law}"{loss} clock.simulation={dt:g}s\n'
-    text += f"it gives {other:.1%} of the messages another delay; "
-    text += f"{own.written} are likelier by {gain:.3f} nats a message"
-    if best.bic - own.bic > 10:  # very strong evidence (Kass and Raftery, 1995)
+    text += f"it gives {distance:.1%} of all two successive messages other delays"
+    if distance > BAD_FIT:
         text += "\na bad fit: take the trace"
     return text
 

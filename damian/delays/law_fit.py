@@ -12,22 +12,21 @@ from damian.delays.samplers import TableSampler
 
 LOST_STEPS, NO_MESSAGE = -1, -2
 """Marks among delays: a message that never arrives, and none, after the end of a sequence."""
-OWN = ("recorded frequencies", "recorded frequencies of pairs")
-"""Laws are compared with these: the recorded frequency of each delay, and that given the delay
-before it."""
 Integers = NDArray[np.integer]
 Floats = NDArray[np.floating]
 
 
 class LawFit(NamedTuple):
-    """A law (as settings write it, or one of ``OWN``) with its likeliest parameters for n messages.
+    """A law, as settings write it, with its likeliest parameters for n messages.
 
-    ``chances`` has the probabilities of the delays 0, 1, ..., K and, last, of a loss, whatever came
-    before, [K + 2], ``likelihood`` is a logarithm [nats], and ``loss`` what ``delay.loss`` has to
-    add to the law.
+    ``states`` has the probabilities of the states of the channel at a message and at the next one,
+    [S, S], ``chances`` those of the delays 0, 1, ..., K and, last, of a loss, in each state,
+    [S, K + 2]; ``likelihood`` is a logarithm [nats], and ``loss`` what ``delay.loss`` has to add to
+    the law.
     """
 
     written: Any
+    states: Floats
     chances: Floats
     likelihood: float
     n_parameters: int
@@ -40,33 +39,27 @@ class LawFit(NamedTuple):
         return round(self.n_parameters * float(np.log(self.n)) - 2 * self.likelihood, 6)
 
 
-def fit_laws(steps: Integers) -> tuple[LawFit, LawFit]:
-    """The best of the laws that need nothing but delays, and the better of ``OWN``.
+def fit_laws(steps: Integers) -> tuple[LawFit, float]:
+    """The best of the laws that need nothing but delays, and how far it is from what was recorded.
 
     Sequences [S, T] have the delays of messages in their order [steps], or marks; one at least has
-    arrived.
+    arrived. The distance is the total variation between the delays of two successive messages: the
+    share of these pairs that the law gives other delays, from 0 to 1.
     """
     codes = np.where(steps >= 0, steps, steps.max() - steps)  # K + 1 is lost, K + 2 none
-    counts = np.bincount(codes.ravel(), minlength=int(steps.max()) + 3)[:-1]
-    n = int(counts.sum())
-    chances = counts / n
-    n_outcomes = int(np.count_nonzero(counts))
-    own = LawFit(OWN[0], chances, _likelihood(counts, chances), n_outcomes, n)
-
-    size = len(counts)
-    later = codes[:, 1:]
-    of_pairs = codes[:, :-1] * size + later
-    pairs, often = np.unique(of_pairs[later < size], return_counts=True)
-    before = pairs // size
-    after = often / np.bincount(before, often, size)[before]
-    starts = np.bincount(codes[:, 0], minlength=size)
-    likelihood = _likelihood(often, after) + _likelihood(starts, chances)
-    paired = LawFit(OWN[1], chances, likelihood, len(pairs), n)
-
+    none = int(steps.max()) + 2
+    counts = np.bincount(codes.ravel(), minlength=none + 1)[:none]
     laws = [_memoryless(counts)]
-    if n_outcomes > 1:
+    if np.count_nonzero(counts) > 1:
         laws.append(_burst(codes, counts))
-    return _best(laws), _best([own, paired])
+    best = _best(laws)
+    follows = codes[:, 1:] < none
+    pairs = np.stack([codes[:, :-1][follows], codes[:, 1:][follows]])
+    (delay, next_delay), often = np.unique(pairs, axis=1, return_counts=True)
+    recorded = often / often.sum()
+    chances = best.chances
+    given = ((best.states.T @ chances[:, delay]) * chances[:, next_delay]).sum(0)
+    return best, float((recorded - given).clip(0).sum())
 
 
 def _best(fits: list[LawFit]) -> LawFit:
@@ -109,7 +102,8 @@ def _memoryless(counts: Integers) -> LawFit:
         chances[-1] = lost
         likelihood = _likelihood(counts, chances)
         n_parameters = k + (0 < loss < 1)
-        fits.append(LawFit(law, chances, likelihood, n_parameters, n, round(loss, 5)))
+        one_state = np.ones((1, 1)), chances[None]
+        fits.append(LawFit(law, *one_state, likelihood, n_parameters, n, round(loss, 5)))
     return _best(fits)
 
 
@@ -138,7 +132,8 @@ def _burst(codes: Integers, counts: Integers) -> LawFit:
         "bad": worse.written,
         "bad_loss": worse.loss,
     }
-    chances = share @ [good.chances, worse.chances]
+    states = share[:, None] * move
+    chances = np.concatenate([good.chances, worse.chances])
     likelihood = good.likelihood + worse.likelihood + path
     n_parameters = 2 + good.n_parameters + worse.n_parameters
-    return LawFit(written, chances, likelihood, n_parameters, worse.n + good.n)
+    return LawFit(written, states, chances, likelihood, n_parameters, worse.n + good.n)

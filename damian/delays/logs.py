@@ -14,7 +14,7 @@ import pandas as pd
 from damian.common.errors import InputError
 from damian.common.text_files import named, parse_table, read_text, show
 from damian.delays.law_fit import LOST_STEPS, NO_MESSAGE, Integers
-from damian.delays.laws import LOST, in_steps
+from damian.delays.laws import LOST
 
 JOURNAL = ".jsonl"
 """End of the name of a journal: a head on its first line, and reports with when they came in on
@@ -139,8 +139,6 @@ def trace_rows(delays: pd.DataFrame) -> list[str]:
 def steps_of(delays: pd.DataFrame, dt: float) -> Integers:
     """Delays of the messages of each UAV in whole steps of ``dt`` seconds, for ``fit_laws``,
     [U, T]."""
-    steps = [
-        LOST_STEPS if row == LOST else in_steps("delay", row, dt) for row in trace_rows(delays)
-    ]
+    steps = np.ceil(delays.delay.round(6) / dt - 1e-9).fillna(LOST_STEPS)
     table = pd.DataFrame({"uav": delays.uav, "n": delays.groupby("uav").cumcount(), "steps": steps})
     return table.pivot(index="uav", columns="n", values="steps").fillna(NO_MESSAGE).to_numpy(int)

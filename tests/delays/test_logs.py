@@ -13,7 +13,7 @@ from damian.delays.clocks import check_clocks, in_order
 from damian.delays.logs import delays_of, read_log, trace_rows
 from damian.recipes.cli import settings
 from damian.recipes.command import main
-from damian.recipes.fit import summary
+from damian.recipes.fit import law_summary, summary
 
 DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
 """Of the messages of a UAV [s]; None: lost."""
@@ -185,10 +185,15 @@ def test_the_law_of_the_delays_is_a_setting(log, tmp_path, capsys):
     ]
     path = log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))
     main(["fit", f"log={path}", f"hydra.run.dir={tmp_path / 'run'}"])
-    *_, law, _, bad, _ = capsys.readouterr().out.splitlines()
-    assert bad == "a bad fit: take the trace"  # bursts of the same length, in regular distances
+    *_, law, distance, _ = capsys.readouterr().out.splitlines()
+    assert distance == "it gives 7.4% of all two successive messages other delays"
     delay = settings(*shlex.split(law.removeprefix("best law: "))).delay
     assert (delay.obs["law"], delay.obs["good"], delay.obs["bad"]) == ("burst", 1, 6)
+
+
+def test_a_bad_fit_is_called_so():
+    in_turn = np.arange(300).reshape(1, -1) % 3
+    assert law_summary(in_turn, 1.0).endswith("a bad fit: take the trace")
 
 
 @pytest.mark.parametrize(
