@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from damian.common import checks
@@ -176,13 +177,9 @@ class ActionHistory(ActionTransform):
         shape = torch.Size((*old.shape[:-1], old.shape[-1] + width))
         if not isinstance(old, Bounded) or (self.codes is None and not self.actions.bounded):
             return Unbounded(shape, dtype=old.dtype, device=old.device)
-        if self.codes is None:
-            lowest = torch.zeros(width)
-            highest = torch.ones(width)
-        else:
-            lowest, highest = (code.repeat(self.steps) for code in self.codes.aminmax(dim=0))
-        low, high = (
-            torch.cat([bound, added.to(bound).expand(*shape[:-1], width)], -1)
-            for bound, added in ((old.low, lowest), (old.high, highest))
-        )
+        lowest, highest = 0.0, 1.0
+        if self.codes is not None:
+            lowest, highest = (code.item() for code in self.codes.aminmax())
+        low = pad(old.low, (0, width), value=lowest)
+        high = pad(old.high, (0, width), value=highest)
         return Bounded(low, high, shape=shape, dtype=old.dtype, device=old.device)
