@@ -69,7 +69,7 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: LatLon) -> tuple[Floats, F
     up = height * sin_lat + north * cos_lat
     lat = np.degrees(np.arctan2(up, np.hypot(out, east)))
     lon = np.degrees(np.arctan2(east, out)) + origin[1]
-    return lat, wrap_longitude(lon)
+    return lat, lon - 360 * np.floor((lon + 180) / 360)
 
 
 def area_centroid(rings: Sequence[Floats]) -> LatLon:
@@ -111,9 +111,3 @@ def area_centroid(rings: Sequence[Floats]) -> LatLon:
     x, y = _by_bearing(arc, np.arctan2(east, north))
     lat, lon = to_latlon(x, y, base)
     return float(lat), float(lon)
-
-
-def wrap_longitude(lon_deg: ArrayLike) -> Floats:
-    """Wrap longitudes [*] in degrees into [-180, 180)."""
-    lon = np.asarray(lon_deg, float)
-    return lon - 360 * np.floor((lon + 180) / 360)
