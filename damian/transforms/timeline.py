@@ -133,7 +133,12 @@ class ObservationTimeline(StatefulTransform):
         return blank
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory = self._begun(memory, self._sent(entries.__getitem__), mask)
+        empty = {name: torch.zeros_like(old) for name, old in memory.items()}
+        empty["due"] += _NEVER
+        first = self._sent(entries.__getitem__)
+        first["sent"] = torch.ones_like(first["sent"])
+        begun = self._added(empty, first)
+        memory = {name: where_rows(mask, new, memory[name]) for name, new in begun.items()}
         return memory, self._written(memory)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
@@ -178,13 +183,6 @@ class ObservationTimeline(StatefulTransform):
             else:
                 rows[name] = each.reshape(n_rows, *each.shape[lead:])
         return rows
-
-    def _begun(self, memory: Memory, first: Memory, mask: Tensor) -> Memory:
-        """The memory with nothing but the ``first`` messages in the rows of the mask [M]."""
-        empty = {name: torch.zeros_like(old) for name, old in memory.items()}
-        empty["due"] += _NEVER
-        begun = self._added(empty, first | {"sent": torch.ones_like(first["sent"])})
-        return {name: where_rows(mask, new, memory[name]) for name, new in begun.items()}
 
     def _added(self, memory: Memory, sent: Memory) -> Memory:
         """The memory with the messages of a step as the newest."""
@@ -263,20 +261,31 @@ class ObservationTimeline(StatefulTransform):
     def _corrected(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
         first = self._sent(steps.__getitem__)
         after = self._sent(lambda key: steps[next_key(key)])
-        age_now = torch.arange(len(steps), device=count.device).flip(0)
-        for sent in (first, after):
-            arrived = sent["due"] <= expand_mask(age_now, sent["due"])
-            sent["due"] = torch.where(arrived, 0, _NEVER)
-        memory = self.init_memory(steps[0])
-        memories = []
-        for step, begins in enumerate(count == 0):
-            if begins.any():
-                begun = {name: each[step] for name, each in first.items()}
-                memory = self._begun(memory, begun, self.expand_worlds(begins))
-            memory = self._added(memory, {name: each[step] for name, each in after.items()})
-            memories.append(memory)
-        slots = {name: torch.cat([each[name] for each in memories]) for name in memory}
-        found = self._timeline(slots, slots["due"] <= 0)
+        first["sent"] = torch.ones_like(first["sent"])
+        last = len(steps) - 1
+        step = torch.arange(len(steps), device=count.device)
+        slots = []
+        arrived = []
+        for k in range(self.slots):  # a slot of all steps and worlds at once
+            sent_at = step - k  # before 0 lies what is not among the steps
+            age_now = last - sent_at
+            of_step = sent_at.clamp(min=0)
+            of_reset = (sent_at + 1).clamp(0, last)
+            is_reset = (k == count + 1) & (sent_at >= -1).unsqueeze(-1)
+            is_step = (k <= count) & (sent_at >= 0).unsqueeze(-1)
+            exists = is_reset | is_step
+            slot = {
+                name: where_rows(is_reset, first[name][of_reset], new[of_step])
+                for name, new in after.items()
+            }
+            sent = slot["sent"] & expand_mask(exists, slot["sent"])
+            slot["sent"] = sent
+            is_due = slot["due"] <= expand_mask(age_now, slot["due"])
+            has_arrived = is_due & sent.unsqueeze(-1)
+            slots.append(self._by_row(slot))
+            arrived.append(has_arrived.flatten(0, -2))
+        stacked = {name: torch.stack([slot[name] for slot in slots], 1) for name in after}
+        found = self._timeline(stacked, torch.stack(arrived, 1))
         found = found.view(*after["sent"].shape, *found.shape[1:])
         return entries | {next_key(self.out_keys[0]): found}
 
