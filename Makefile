@@ -128,6 +128,7 @@ pictures: $(VENV)/base
 	  "formats=[gif]" hydra.run.dir=build/flight
 	cp build/flight/episode_0.gif docs/images/flight.gif
 	$(PY) docs/figures.py
+	$(PY) docs/leaderboard_pages.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
 	$(VENV)/bin/damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench "tasks=[crowded]" \
 	  "delays=['1-7',lag,paper]" "methods=[undelayed,naive,naive+gru,naive+timeline,backupdate,backupdate+gru,backupdate+gru+hold,timeline,timeline+gru,forecast+filter]" > build/delaybench.md

@@ -4,15 +4,13 @@ delaybench.
 python docs/figures.py    (make pictures)
 """
 
-from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-import pandas as pd
 import torch
-from leaderboard import FEWEST_SEEDS, NUMBERS, WORDS, delaybench
+from leaderboard_pages import FEWEST
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
@@ -21,18 +19,11 @@ from torchrl.envs import GymEnv, TransformedEnv
 from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
 from damian.baselines.script import script_policy
 from damian.common.plotting import COLOURS, STYLE
-from damian.common.tables import markdown_table, read_csv
 from damian.compare.comparison import (
     ENDS,
-    HELD_OUT_MARK,
-    LATE_DATA,
     NOT_LATE,
-    RUN,
-    SIMULATOR,
     TRAINED,
     Comparison,
-    means_over_seeds,
-    shown,
 )
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
@@ -115,21 +106,6 @@ WINNERS = {
 SCRIPTED = {"script+forward": SCRIPT, "planner": PLANNER}
 """Policies of methods that train none."""
 UNDELAYED = "undelayed"
-LEADERBOARD = """# Leaderboard
-
-Made from the files in `docs/results/leaderboard` (`make pictures`). True returns of sampled actions, by
-damian's own evaluation: mean over seeds [95 % interval] (seeds). [Join in](delaybench.md#your-method);
-tasks and delays are those of [delaybench](delaybench.md). A submission needs five seeds; some of our own
-cells have three or four. Rows of *0.18 or before* have no fingerprint of their task. Where these policies
-flew without being trained for it is [a page of its own](leaderboard_matrix.md)."""
-MATRIX = """# Flown where they were not trained
-
-Policies of the [leaderboard](leaderboard.md) over the delay of the flight: four UAVs (`agents`), and other
-delays. Mean over seeds [95 % interval] (seeds).
-
-![Returns over the delay of the flight](results/delaybench/matrix.png)"""
-FEWEST = 3
-"""Fewest seeds of which the leaderboard shows a mean: fewer have no interval."""
 LOOKS = [*((colour, "o") for colour in COLOURS), *(("0.3", marker) for marker in "os^")]
 BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
 
@@ -205,7 +181,6 @@ def main() -> None:
     figure.savefig(IMAGES / "delay_laws.png", dpi=110)
     plot_matrix(DELAYBENCH / "matrix.png")
     plot_tasks(IMAGES / "tasks.png")
-    write_leaderboard()
     for name, (words, step) in WORLDS.items():
         plot_world(IMAGES / f"world_{name}.png", words, step, 1 + (name == "randomisation"))
 
@@ -228,85 +203,6 @@ def plot_world(path: Path, words: list[str], step: int, worlds: int) -> None:
         figure.legend(handles=legend_marks(episode), loc="outside right upper", frameon=False)
         figure.savefig(path, dpi=110)
     Image.open(path).convert("RGB").quantize(dither=Image.Dither.NONE).save(path, optimize=True)
-
-
-def write_leaderboard() -> None:
-    """Write docs/leaderboard.md and docs/leaderboard_matrix.md."""
-    for name, page in leaderboard_pages().items():
-        (IMAGES.parent / name).write_text(page, encoding="utf-8")
-
-
-def leaderboard_pages() -> dict[str, str]:
-    """The submissions as tables, with our runs of the same methods that are too few for a
-    submission: a page for each file."""
-    files = sorted((DELAYBENCH.parent / "leaderboard").glob("*.csv"))
-    submitted = pd.concat([read_csv(file, text=WORDS) for file in files], ignore_index=True)
-    stored = stored_results(DELAYBENCH).rows
-    ours = stored[(stored["policy"] == TRAINED) & stored["task"].isin([*delaybench().tasks])][
-        [*RUN, *NUMBERS]
-    ]
-    ours = ours.groupby(RUN[:-1]).filter(lambda runs: FEWEST <= len(runs) < FEWEST_SEEDS)
-    facts = submitted.drop(columns=[*RUN[:2], "seed", *NUMBERS]).drop_duplicates("method")
-    few = ours.merge(facts[facts["authors"] == "DAMIAN"], on="method")
-    rows = pd.concat([submitted, few], ignore_index=True)
-    away = rows["task"].str.contains(HELD_OUT_MARK, regex=False)
-    return {
-        "leaderboard.md": by_task(rows[~away], delaybench().delays),
-        "leaderboard_matrix.md": by_flight(rows[away]),
-    }
-
-
-def by_task(rows: pd.DataFrame, delays: Collection[str]) -> str:
-    """The leaderboard, as Markdown: a table for each track and task."""
-    parts = [LEADERBOARD]
-    for regime in (LATE_DATA, SIMULATOR):
-        for task in rows.loc[rows["regime"] == regime, "task"].unique():
-            of_task = rows[(rows["regime"] == regime) & (rows["task"] == task)]
-            parts += [f"## {task}, {regime}", _methods(of_task, [*delays])]
-    return "\n\n".join(parts) + "\n"
-
-
-def by_flight(rows: pd.DataFrame) -> str:
-    """What policies return where they were not trained, as Markdown: a table for each method."""
-    parts = [MATRIX]
-    for method in rows["method"].unique():
-        parts += [f"## {method}", _flights(rows[rows["method"] == method])]
-    return "\n\n".join(parts) + "\n"
-
-
-def _methods(rows: pd.DataFrame, delays: Sequence[str]) -> str:
-    """A line for each method, the best one under the first delay first, with a column for each
-    delay."""
-    present = [delay for delay in delays if (rows["delay"] == delay).any()]
-    means = rows.pivot_table(values="return", index="method", columns="delay")
-    lines = []
-    for method in means.sort_values(present, ascending=False).index:
-        runs = rows[rows["method"] == method]
-        cells = [_mean(runs[runs["delay"] == delay]) for delay in present]
-        one = runs.iloc[0]
-        steps = f"{runs['frames'].max() / 1e6:.2g}"
-        size = f"{int(one['parameters']):,}"
-        version = f"{one['damian']} ({str(one['commit'])[:7]})".removesuffix(" (several)")
-        lines.append((method, *cells, one["authors"], steps, size, version))
-    return markdown_table(
-        ["method", *present, "authors", "million steps", "parameters", "damian"], lines
-    )
-
-
-def _flights(rows: pd.DataFrame) -> str:
-    """A line for each held-out task, with a column for each delay of the training."""
-    trained = [*rows["delay"].unique()]
-    lines = []
-    for task, runs in rows.groupby("task", sort=False):
-        lines.append((task, *(_mean(runs[runs["delay"] == delay]) for delay in trained)))
-    return markdown_table(["flown in", *(f"trained under {delay}" for delay in trained)], lines)
-
-
-def _mean(runs: pd.DataFrame) -> str:
-    """Mean return with its interval and the number of seeds."""
-    if runs.empty:
-        return "-"
-    return f"{shown(means_over_seeds(runs[['return']]), 'return')} ({len(runs)})"
 
 
 def plot_matrix(path: Path) -> None:

@@ -164,8 +164,11 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         values = [*rows[name].unique()]
         checks.require(len(values) == 1, f"{path}: {name}", values, "is not one for all rows")
     for name in WORDS:
-        empty = rows[name].astype(str).str.strip().isin(["", "nan", "None"])
-        checks.require(not empty.any(), f"{path}: {name}", "it", "is empty")
+        empty = rows[name].isna() | (rows[name].astype(str).str.strip() == "")
+        should = "is empty"
+        if name == "commit":
+            should += ": train in a clone, with `pip install -e .` or `make train`"
+        checks.require(not empty.any(), f"{path}: {name}", "it", should)
     words = words_of_tasks(experiment)
     for (task, delay), found in rows.groupby(["task", "delay"])["fingerprint"]:
         asked = fingerprint(*words[trained_in(task), delay])
@@ -173,9 +176,8 @@ def check_submission(rows: pd.DataFrame, experiment: Experiment, path: str) -> N
         known = found.isin([asked, OLDER]).all()
         checks.require(known, f"{path}: {task}/{delay}: fingerprint", found.iloc[0], should)
     changed = rows["commit"].astype(str).str.contains("+", regex=False)
-    checks.require(
-        not changed.any(), f"{path}: commit", rows["commit"].iloc[0], "has changes: commit them"
-    )
+    should = "was a clone with changed files: commit them, then train again in a new folder"
+    checks.require(not changed.any(), f"{path}: commit", rows["commit"].iloc[0], should)
     finite = np.isfinite(rows[[*NUMBERS, "parameters"]].to_numpy(float)).all()
     checks.require(bool(finite), path, "a number", "is not finite")
     for place, runs in rows.groupby(RUN[:-1], sort=False):
@@ -204,8 +206,8 @@ def main() -> None:
         path = Path(f"{method}.csv")
         write_csv(path, rows)
         print(
-            f"{path}: {len(rows)} runs; add it to docs/results/leaderboard, and your files to "
-            "examples/extending"
+            f"{path}: {len(rows)} runs; move it to docs/results/leaderboard, and run "
+            "python docs/leaderboard_pages.py"
         )
 
 

@@ -2,11 +2,11 @@
 somewhere."""
 
 import re
-import runpy
 import shlex
 
 import pytest
 import yaml
+from leaderboard_pages import leaderboard_pages
 from sites import ROOT, anchors, links
 
 import damian
@@ -79,7 +79,7 @@ def test_the_numbers_of_the_guide_to_methods_are_those_of_the_results():
 
 
 def test_the_leaderboard_is_that_of_the_stored_results():
-    pages = runpy.run_path(str(ROOT / "docs" / "figures.py"))["leaderboard_pages"]()
+    pages = leaderboard_pages()
     for name, page in pages.items():
         assert (ROOT / "docs" / name).read_text("utf-8") == page
     readme = (ROOT / "README.md").read_text("utf-8")

@@ -116,7 +116,9 @@ WRONG = {
     "seed: [0, 1, 2, 3, 4] are too few, or too small: run compare again": {"seed": range(5)},
     "task: crowded_mini is not of the leaderboard: train in one that is": {"task": "crowded_mini"},
     "mine.csv: regime: R0": {"regime": "R0"},
-    "has changes: commit them": {"commit": "abc+changes"},
+    "was a clone with changed files: commit them, then train": {"commit": "abc+changes"},
+    "commit: it is empty: train in a clone": {"commit": None},
+    "fingerprint: it is empty": {"fingerprint": float("nan")},
     "a number is not finite": {"return": float("nan")},
     "crowded/1-7: fingerprint: 0123456789ab is not ": {"fingerprint": "0123456789ab"},
 }
