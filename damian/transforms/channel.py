@@ -1,6 +1,6 @@
 """A transform through which agents send messages to each other, which arrive late or are lost."""
 
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -8,16 +8,15 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from damian.common import checks, counter_rng
-from damian.common.tensors import expand_mask, where_rows
+from damian.common.tensors import where_rows
 from damian.delays.laws import link_sampler
-from damian.delays.line import DelayLine, slot_rows
+from damian.delays.line import DelayLine
 from damian.delays.samplers import MessageContext
 from damian.keys import STEPPED
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.entries import (
     Entries,
     add_spec,
-    as_rows,
     existing,
     select_entries,
     sibling_key,
@@ -34,10 +33,8 @@ class Channel(StatefulTransform):
     age. An agent knows its own message at once, and everyone knows everyone's first message of an
     episode, whatever the delay and the links. No gradient flows through the channel.
 
-    A ``DelayLine`` delays only the time at which a message was generated, on every link [M]; the
-    latest K messages of each of the S senders lie in a ring (``contents`` [K, S, ...]), and what is
-    held in ``held`` [M, ...]. The memory also has the ``sender`` of each link, and a ``link`` of
-    each sender.
+    A ``DelayLine`` delays what its sender sends on each of the M links, which are numbered by
+    world, receiver and sender.
 
     A worked timeline, with a delay of 3 steps: messages of t = 1 arrive at t = 4. Until t = 3 an
     agent holds those of the reset, t = 0, of the others.
@@ -102,7 +99,6 @@ class Channel(StatefulTransform):
             given = placed and name in ("position", "receiver_position")
             checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
         self.line = DelayLine(self.sampler, "generation")
-        self._n_slots = self.sampler.longest + 1
         self.step_keys = existing([*self.in_keys, self.position_key, self.sent_key])
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
@@ -122,135 +118,95 @@ class Channel(StatefulTransform):
         """The shape of the agents, [*B, N]."""
         return self.rows[:-1]
 
-    # The time of a message is counted in steps since the reset, whose own messages have time 1.
-
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        content = self._content(select_entries(tensordict, self.in_keys))
-        n = self.agents[-1]
+        content = self._by_sender(select_entries(tensordict, self.in_keys)[self.in_keys[0]])
         streams = self.streams(tensordict.batch_size, content.device, self.sampler)
-        links = torch.arange(len(streams), device=streams.device)
-        receiver = links // n
-        sender = links % n
-        first_of_world = receiver // n * n
-        of_last_receiver = links.view(-1, n, n)[:, -1]
-        memory = self.line.init_memory([], streams)
-        memory["sender"] = first_of_world + sender
-        memory["hears"] = receiver % n != sender
-        memory["link"] = of_last_receiver.flatten()
-        memory["contents"] = content.new_zeros(self._n_slots, *content.shape)
-        memory["held"] = content.new_zeros(len(links), *content.shape[1:])
-        if self.delay_key:
-            memory["delay"] = torch.zeros_like(streams)
+        memory = self.line.init_memory([content], streams)
+        own = torch.eye(self.agents[-1], dtype=torch.bool, device=content.device)
+        memory["is_own"] = own.expand(self.rows).flatten()
+        memory["delay"] = torch.zeros_like(streams)
         return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        self._put(memory, entries)
+        content = self._by_sender(entries[self.in_keys[0]])
         begun, _ = self.line.reset(memory, [], mask)
-        after = self._send(begun, entries, self._wanted(entries, mask))
-        after["generated_at"] = torch.where(mask, after["clock"], after["generated_at"])
-        after = self._hold(after, mask)
-        if self.delay_key:
-            after["delay"] = torch.zeros_like(after["delay"])
+        after = self._send(begun, content, entries, mask)
+        known = {
+            "held_0": content,
+            "generated_at": after["clock"],
+            "delay": torch.zeros_like(after["delay"]),
+        }
         memory = dict(memory)
-        for name, new in after.items():
+        for name, new in (after | known).items():
             old = begun[name]
             changed = new is not old
             memory[name] = where_rows(mask, new, old) if changed else new
-        return memory, self._outputs(memory)
+        return memory, self._outputs(memory, content)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        self._put(memory, entries)
-        active = torch.ones_like(memory["hears"])
+        content = self._by_sender(entries[self.in_keys[0]])
+        active = torch.ones_like(memory["is_own"])
         if STEPPED in entries:
             active = self.expand_worlds(entries[STEPPED].reshape(-1))
-        memory = memory | self._send(memory, entries, self._wanted(entries, active))
-        return memory, self._outputs(memory)
+        memory = self._send(memory, content, entries, active)
+        return memory, self._outputs(memory, content)
 
-    def _content(self, entries: Entries) -> Tensor:
-        """What the agents send in a step, [B * N, ...]."""
-        return as_rows(entries[self.in_keys[0]], self.agents)
+    def _by_sender(self, value: Tensor) -> Tensor:
+        """An entry of the agents [*B, N, ...], for each link that of its sender, [M, ...]."""
+        at_receivers = value.unsqueeze(len(self.agents) - 1)
+        return self.to_rows(at_receivers.expand(*self.rows, *value.shape[len(self.agents) :]))
 
-    def _put(self, memory: Memory, entries: Entries) -> None:
-        """Write what the senders send in the next step; the step may send it or not."""
-        following = memory["clock"][memory["link"]] + 1
-        rows = slot_rows(following % self._n_slots)
-        memory["contents"].flatten(0, 1).index_copy_(0, rows, self._content(entries))
+    def _by_receiver(self, value: Tensor) -> Tensor:
+        """The same of its receiver."""
+        at_senders = value.unsqueeze(len(self.agents))
+        return self.to_rows(at_senders.expand(*self.rows, *value.shape[len(self.agents) :]))
 
-    def _hold(self, memory: Memory, mask: Tensor) -> Memory:
-        """Where the mask [M] is true, hold the messages that were generated at ``generated_at``."""
-        slot = memory["generated_at"] % self._n_slots
-        old = memory["held"]
-        rows = slot * len(memory["link"]) + memory["sender"]
-        new = memory["contents"].flatten(0, 1).index_select(0, rows)
-        return memory | {"held": where_rows(mask, new, old)}
-
-    def _wanted(self, entries: Entries, active: Tensor) -> Tensor:
-        """Links among the active ones [M] on which an agent wants to send, [M] bool."""
-        if self.sent_key is None:
-            return active
-        n = self.agents[-1]
-        wants = entries[self.sent_key].reshape(-1, 1, n)
-        return active & wants.expand(-1, n, n).reshape(-1)
-
-    def _send(self, memory: Memory, entries: Entries, wanted: Tensor) -> Memory:
-        """Send what was written last over the wanted links [M], and deliver what arrives in this
+    def _send(self, memory: Memory, content: Tensor, entries: Entries, active: Tensor) -> Memory:
+        """Send the content [M, ...] over the active links [M], and deliver what arrives in this
         step."""
-        n = self.agents[-1]
-        position = None
-        if self.position_key:
-            position = as_rows(entries[self.position_key], self.agents)[:, :2]
-        sent = wanted & memory["hears"]
+        sent = active & ~memory["is_own"]
+        if self.sent_key is not None:
+            wants = entries[self.sent_key].reshape(self.agents)
+            sent = sent & self._by_sender(wants)
+        places = {}
+        if self.position_key is not None:
+            position = entries[self.position_key][..., :2]
+            places["position"] = self._by_sender(position)
+            places["receiver_position"] = self._by_receiver(position)
         if self.comm_range is not None:
-            place = cast(Tensor, position).view(-1, n, 2)
-            way = place.unsqueeze(1) - place.unsqueeze(2)
-            is_near = torch.linalg.vector_norm(way, dim=-1) <= self.comm_range
-            sent = sent & is_near.view(-1)
-        context = self._context(memory, sent, position) if self.sampler.sees_context else None
-        memory, delivery = self.line.step(memory, [], sent, context)
-        memory = self._hold(memory, delivery.fresh)
-        if self.delay_key:
-            memory["delay"] = delivery.delay
-        return memory
+            way = places["position"] - places["receiver_position"]
+            sent = sent & (torch.linalg.vector_norm(way, dim=-1) <= self.comm_range)
+        context = self._context(memory, sent, places) if self.sampler.sees_context else None
+        memory, delivery = self.line.step(memory, [content], sent, context)
+        return memory | {"delay": delivery.delay}
 
-    def _context(self, memory: Memory, sent: Tensor, position: Tensor | None) -> MessageContext:
-        """The circumstances of what is ``sent`` over the links [M]; positions are [B * N, 2]."""
+    def _context(self, memory: Memory, sent: Tensor, places: dict[str, Tensor]) -> MessageContext:
+        """The circumstances of what is ``sent`` over the links [M]."""
         n = self.agents[-1]
-        sender = memory["sender"]
-        receiver = torch.arange(len(sender), device=sender.device) // n
-        read = {}
-        if position is not None:
-            read["position"] = position.index_select(0, sender)
-            read["receiver_position"] = position.index_select(0, receiver)
+        numbers = torch.arange(n, device=sent.device).expand(self.agents)
+        sender = self._by_sender(numbers)
+        receiver = self._by_receiver(numbers)
         is_sending = sent.view(-1, n, n).any(1)
         n_sending = is_sending.sum(-1).repeat_interleave(n * n)
         steps = memory["clock"] - memory["reset_at"]
         time = steps * self.dt
         uniform = counter_rng.uniform(memory["streams"], memory["clock"] + 1)
-        return MessageContext(sender % n, receiver % n, n_sending, time, uniform, self.dt, read)
+        return MessageContext(sender, receiver, n_sending, time, uniform, self.dt, places)
 
-    def _outputs(self, memory: Memory) -> Entries:
+    def _outputs(self, memory: Memory, content: Tensor) -> Entries:
         """What the agents hold, with ages and delays; each agent holds its own message at once."""
-        n = self.agents[-1]
-        shape = self.rows
-        start = memory["reset_at"]
-        time = (memory["generated_at"] - start).view(-1, n)
-        now = (memory["clock"] - start).view(-1, n)
-        agents = torch.arange(len(now), device=now.device)
-        senders = torch.arange(n, device=now.device)
-        is_own = (agents % n).unsqueeze(-1) == senders
-        time = torch.where(is_own, now, time)
-        newest = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
-        own = memory["contents"].flatten(0, 1).index_select(0, newest)
-        held = memory["held"].unflatten(0, (-1, n))
-        value = torch.where(expand_mask(is_own, held), own.unsqueeze(1), held)
-        entries = {self.out_keys[0]: value.view(*shape, *value.shape[2:])}
+        is_own = memory["is_own"]
+        held = where_rows(is_own, content, memory["held_0"])
+        written: Entries = {self.out_keys[0]: self.from_rows(held)}
         if self.age_key is not None:
-            entries[self.age_key] = (now - time).to(torch.float32).view(shape)
+            age = memory["clock"] - memory["generated_at"]
+            age = age.masked_fill(is_own, 0)
+            written[self.age_key] = self.from_rows(age.to(torch.float32))
         if self.delay_key is not None:
-            delay = memory["delay"].view(-1, n).masked_fill(is_own, 0)
+            delay = memory["delay"].masked_fill(is_own, 0)
             delay = torch.where(delay < self.sampler.lost, delay, -1)
-            entries[self.delay_key] = delay.view(shape)
-        return entries
+            written[self.delay_key] = self.from_rows(delay)
+        return written
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         agents = spec_rows(observation_spec, self.row_key)
