@@ -9,25 +9,30 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from damian.delays.config import DelayConfig as DelayConfig
-    from damian.delays.laws import Burst as Burst
-    from damian.delays.laws import Constant as Constant
-    from damian.delays.laws import Distance as Distance
-    from damian.delays.laws import Geometric as Geometric
-    from damian.delays.laws import Lag as Lag
-    from damian.delays.laws import Law as Law
-    from damian.delays.laws import Trace as Trace
-    from damian.delays.laws import Uniform as Uniform
-    from damian.delays.samplers import ContextSampler as ContextSampler
-    from damian.delays.samplers import MessageContext as MessageContext
-    from damian.delays.samplers import Sampler as Sampler
-    from damian.delays.samplers import TableSampler as TableSampler
-    from damian.envs.config import ClockConfig as ClockConfig
-    from damian.envs.config import ScenarioConfig as ScenarioConfig
+    from damian.delays.laws import (
+        Burst as Burst,
+        Constant as Constant,
+        Distance as Distance,
+        Geometric as Geometric,
+        Lag as Lag,
+        Law as Law,
+        Trace as Trace,
+        Uniform as Uniform,
+    )
+    from damian.delays.samplers import (
+        ContextSampler as ContextSampler,
+        MessageContext as MessageContext,
+        Sampler as Sampler,
+        TableSampler as TableSampler,
+    )
+    from damian.envs.config import ClockConfig as ClockConfig, ScenarioConfig as ScenarioConfig
     from damian.envs.nodes import ServerNode as ServerNode
     from damian.envs.pipeline import make_env as make_env
     from damian.envs.uav_env import UavEnv as UavEnv
-    from damian.learners.config import LearnerConfig as LearnerConfig
-    from damian.learners.config import LearningSetup as LearningSetup
+    from damian.learners.config import (
+        LearnerConfig as LearnerConfig,
+        LearningSetup as LearningSetup,
+    )
     from damian.models.config import ModelConfig as ModelConfig
     from damian.recipes.evaluate import load as load  # type: ignore[import-not-found]
     from damian.recipes.results import results as results  # type: ignore[import-not-found]
@@ -36,15 +41,17 @@ if TYPE_CHECKING:
     from damian.runs.measures import metric as metric
     from damian.server.features import feature as feature
     from damian.server.rewards import reward_term as reward_term
-    from damian.transforms import ActionDelay as ActionDelay
-    from damian.transforms import ActionHistory as ActionHistory
-    from damian.transforms import Channel as Channel
-    from damian.transforms import CumulativeReward as CumulativeReward
-    from damian.transforms import ObservationDelay as ObservationDelay
-    from damian.transforms import ObservationTimeline as ObservationTimeline
-    from damian.transforms import RewardDelay as RewardDelay
-    from damian.transforms import SampleAndHold as SampleAndHold
-    from damian.transforms import set_seed as set_seed
+    from damian.transforms import (
+        ActionDelay as ActionDelay,
+        ActionHistory as ActionHistory,
+        Channel as Channel,
+        CumulativeReward as CumulativeReward,
+        ObservationDelay as ObservationDelay,
+        ObservationTimeline as ObservationTimeline,
+        RewardDelay as RewardDelay,
+        SampleAndHold as SampleAndHold,
+        set_seed as set_seed,
+    )
     from damian.world.sensors import sensor as sensor
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported

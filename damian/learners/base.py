@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 import torch
@@ -45,6 +46,22 @@ UNREAD: list[NestedKey] = ["collector", keys.LOGITS, keys.LOC, keys.SCALE]
 """Entries that a collector and an actor write, and no learner reads; they are not stored."""
 LARGEST_WEIGHT = 1e5
 """Weights of useful networks are thousands of times smaller."""
+
+
+@dataclass
+class Progress:
+    """How far a training has come."""
+
+    frames: int = 0
+    """Environment steps, over all worlds."""
+    updates: int = 0
+    """Batches that the learner has learnt from."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return dict(vars(self))
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        vars(self).update(state)
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from damian import keys
 from damian.common.compiling import COMPILE_OPTIONS, compiled
 from damian.envs.delayed_env import DelayedEnv
-from damian.learners.base import UNREAD, LearningSetup
+from damian.learners.base import UNREAD, LearningSetup, Progress
 from damian.learners.config import MappoConfig
 from damian.learners.teacher import Teacher
 from damian.models.critic import NormalizedValue, make_critic
@@ -38,22 +38,6 @@ LOSS_KEYS: list[NestedKey] = [
     keys.READY,
 ]
 """Entries of a step that the loss reads, besides the critic's observation."""
-
-
-class Progress:
-    """How far a learner has come."""
-
-    updates = 0
-    """Number of updates so far."""
-    frames = 0
-    """Number of environment steps so far."""
-
-    def state_dict(self) -> dict[str, int]:
-        return {"updates": self.updates, "frames": self.frames}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        self.updates = state["updates"]
-        self.frames = state["frames"]
 
 
 class Mappo:

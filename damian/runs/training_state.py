@@ -14,6 +14,7 @@ from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
 
 from damian.common.text_files import data_file
+from damian.learners.base import Progress
 from damian.learners.schedule import SystemClock
 from damian.runs.checkpoint import Stored, read_checkpoint, restore, to_tensordict, write_checkpoint
 from damian.runs.metrics import EpisodeLog, HindsightReturns
@@ -22,21 +23,11 @@ from damian.runs.run_folder import BEST, CHECKPOINT, REPLAY
 
 
 @dataclass
-class Progress:
+class RunProgress(Progress):
     """How far the training of a run has come."""
 
-    frames: int = 0
-    """Environment steps, over all worlds."""
-    updates: int = 0
-    """Batches that the learner has learnt from."""
     best: float = -math.inf
     """Best mean episode return at a checkpoint so far."""
-
-    def state_dict(self) -> Stored:
-        return vars(self)
-
-    def load_state_dict(self, state: Stored) -> None:
-        vars(self).update(state)
 
 
 class TrainingState:
@@ -54,7 +45,7 @@ class TrainingState:
     ) -> None:
         self.folder = folder
         self.components = components
-        self.progress = Progress()
+        self.progress = RunProgress()
         self.episodes = EpisodeLog(collector.env.batch_size[0], hindsight)
         self.saved = 0
         """The update after which the checkpoint of the run was written."""

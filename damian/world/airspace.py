@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.tensors import distances, gather_rows
+from damian.common.tensors import gather_rows
 from damian.world.config import RegionConfig
 from damian.world.paths import Detours, detours
 from damian.world.regions.polygon import (
@@ -103,12 +103,6 @@ class Airspace(NamedTuple):
             return self.detours.length(origin, goal, points)
         way = gather_rows(points, goal) - gather_rows(points, origin)
         return torch.linalg.vector_norm(way, dim=-1)
-
-    def point_at(self, places: Tensor, region: Tensor) -> Tensor:
-        """Flat ids of the landing points nearest to places [B, N, 2] m, [B, N], in regions [B]."""
-        points = self.points[region]
-        nearest = distances(places, points).nan_to_num(nan=torch.inf).argmin(-1)
-        return nearest + region.unsqueeze(-1) * points.shape[1]
 
     def nearest(self, places: Floats, region: int) -> Tensor:
         """The landing points nearest to places [P, 2] m, as ids within their region, [P]."""

@@ -6,6 +6,8 @@ from typing import Annotated, NamedTuple, get_type_hints
 import torch
 from torch import Tensor
 
+from damian.common.tensors import distances, gather_rows
+
 MAX_EXACT_INTEGER = 2**24
 """Messages are packed as float32, which holds integers up to this exactly."""
 
@@ -187,6 +189,13 @@ class Messages(NamedTuple):
         """Index of the region of each world, [*], by the largest number of landing points in a
         region."""
         return self.trail[..., 0, 0] // n_points
+
+    def bound_for(self, points: Tensor, region: Tensor) -> Tensor:
+        """The landing points [R, L, 2] m on which UAVs stand, or to which they fly, in regions [*],
+        flat ids [*, N]."""
+        nearest = distances(self.target, gather_rows(points, region)).argmin(-1)
+        goal = nearest + region.unsqueeze(-1) * points.shape[1]
+        return torch.where(self.in_flight, goal, self.trail[..., 0])
 
     def age(self, now: Tensor) -> Tensor:
         """Age of information: time since each message was generated [s], [*, N]; ``now`` is in s,

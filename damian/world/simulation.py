@@ -5,9 +5,9 @@ import math
 from typing import Any
 
 import numpy as np
-import shapely
 import torch
 from numpy.random import Generator
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from damian.common import checks, counter_rng
@@ -196,12 +196,10 @@ class Simulation:
 
     def bound_for(self, messages: Messages) -> Tensor:
         """The landing points on which UAVs stand, or to which they fly, flat ids [B, N]."""
-        latest = messages.trail[..., 0]
         if self.vehicles.instant:
-            return latest
+            return messages.trail[..., 0]
         region = messages.region(self.airspace.max_points)
-        target = self.airspace.point_at(messages.target, region)
-        return torch.where(messages.in_flight, target, latest)
+        return messages.bound_for(self.airspace.points, region)
 
     # The stages of one step, in order.
 
@@ -666,11 +664,8 @@ def _nearest_other(points: Tensor) -> Tensor:
     """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for
     padded ones."""
     distance = torch.full((len(points),), torch.inf)
-    real = points.isfinite().all(-1).nonzero().squeeze(-1)
-    exact = points[real].double().numpy()
-    places = np.asarray(shapely.points(exact))
-    options = {"exclusive": True, "return_distance": True, "all_matches": False}
-    pairs, found = shapely.STRtree(places).query_nearest(places, **options)
-    index = torch.as_tensor(pairs[0])
-    distance[real[index]] = torch.as_tensor(found).float()
+    real = points.isfinite().all(-1)
+    places = points[real].double().numpy()
+    nearest, _ = KDTree(places).query(places, k=2)  # the first one is the point itself
+    distance[real] = torch.as_tensor(nearest[:, 1]).float()
     return distance

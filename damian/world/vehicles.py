@@ -271,7 +271,7 @@ class PolynomialFlight(MotionModel):
         stop = sent.trail[..., 0]
         stop_before = sent.trail[..., min(1, sent.trail.shape[-1] - 1)]
         origin = torch.where(flies, stop, stop_before)
-        goal = torch.where(flies, self.airspace.point_at(sent.target, state.region), stop)
+        goal = sent.bound_for(self.airspace.points, state.region)
         at_reset = state.elapsed
         ready = torch.ones_like(flies)
         state = self.take_off(state._replace(goal=origin), goal, ready, goal != origin)

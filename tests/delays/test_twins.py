@@ -9,6 +9,7 @@ import pytest
 import torch
 from delay_twin import (
     ACTION,
+    LAWS as TABLES,
     LONGEST,
     N_AGENTS,
     OBSERVATION,
@@ -28,7 +29,6 @@ from delay_twin import (
     drawn,
     twin_delay,
 )
-from delay_twin import LAWS as TABLES
 from delayed_envs import choices as uav_choices
 from helpers import everything, play
 

@@ -10,8 +10,14 @@ import pytest
 import torch
 import yaml
 from helpers import check_refused
-from leaderboard import WORDS, check_submission, delaybench, fingerprint, words_of_tasks
-from leaderboard import main as submit
+from leaderboard import (
+    WORDS,
+    check_submission,
+    delaybench,
+    fingerprint,
+    main as submit,
+    words_of_tasks,
+)
 
 import damian
 from damian.common.errors import InputError

@@ -16,8 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from damian import UavEnv, compose_scenario, make_env
 from damian.models.actor import make_actor
 from damian.models.critic import make_critic
-from damian.recipes import evaluate
-from damian.recipes import train as train_recipe
+from damian.recipes import evaluate, train as train_recipe
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.config import TrainConfig
 from damian.recipes.shared.learning import map_summary

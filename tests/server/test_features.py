@@ -5,8 +5,7 @@ import re
 import torch
 import twin
 from helpers import SCALE, TIME_SCALE, messages_of, random_worlds
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from damian.common.fields import rules
 from damian.server.config import ObservationConfig

@@ -4,8 +4,7 @@ import numpy as np
 import torch
 import twin
 from helpers import messages_of, random_worlds
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from damian.server.config import BUILT_IN
 from damian.server.rewards import Counters, RewardConfig, reward, terms_of

@@ -5,8 +5,7 @@ import json
 import pytest
 import torch
 from helpers import DATA, KEEPS_GOING, act, everything, fresh, random_actions
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain, observed, used_so_far
 

@@ -5,8 +5,7 @@ from fractions import Fraction
 
 import torch
 from helpers import clock, fresh, one_uav
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from damian.world.config import MotionConfig
 

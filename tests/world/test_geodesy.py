@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from helpers import ring
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from damian.world.regions.geodesy import EARTH_RADIUS_M, area_centroid, to_latlon, to_local
 

@@ -10,14 +10,12 @@ import shapely
 import torch
 import twin
 from helpers import SQUARE, both_kinds
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
-from damian.world import airspace as search
-from damian.world import landing
+from damian.world import airspace as search, landing
 from damian.world.airspace import build_airspace, build_cells, inside, nearest_points
 from damian.world.config import RegionConfig, WorldConfig
 from damian.world.landing import ActionConfig, Ranking, assign_landing_points

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from damian.common.errors import InputError
 from damian.world.motion import MotionConfig, flight_levels, minimum_time, poses, time_law

@@ -3,8 +3,7 @@ message."""
 
 import torch
 from helpers import both_motions, everything, random_actions
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 
 from damian import UavEnv

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from damian.world.signal_source import SourceConfig, Walk, draw_walks, leg_profile, locate
 

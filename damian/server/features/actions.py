@@ -175,14 +175,10 @@ def _listed(bits: Tensor, n_points: int) -> Tensor:
 def stands(v: FeatureCache) -> Tensor:
     """Flat ids of the landing points from which the UAVs choose next, [*, N]: where they stand, or
     to which they fly."""
-    messages = v.messages
-    latest = messages.trail[..., 0]
-    if v.table(action_tables).instant:
-        return latest
-    ground = gather_rows(v.table(action_tables).ground, v.region)
-    nearest = distances(messages.target, ground).argmin(-1)
-    base = v.region.unsqueeze(-1) * v.context.n_points
-    return torch.where(messages.in_flight, nearest + base, latest)
+    tables = v.table(action_tables)
+    if tables.instant:
+        return v.messages.trail[..., 0]
+    return v.messages.bound_for(tables.ground, v.region)
 
 
 def legal(v: FeatureCache) -> Tensor:
