@@ -76,8 +76,9 @@ def stored():
     rows = {name: read_results(DOCS / "results" / name / "results.csv") for name in FOLDERS}
     names = {"sampled": TRAINED, "deterministic": TRAINED + DETERMINISTIC}
     spread = read_csv(DOCS / "results" / "spread" / "results.csv", text=["method", "delay"])
-    spread = spread.rename(columns=names).assign(task="spread")
-    rows["spread"] = spread.melt([*PLACE[1:4], "seed"], var_name="policy", value_name="return")
+    spread = spread.rename(columns=names).rename(columns={"frames": "task"})
+    spread = spread.melt([*PLACE[1:4], "seed"], var_name="policy", value_name="return")
+    rows["spread"] = spread.dropna()
     return pd.concat(rows, names=["folder", None]).reset_index("folder").groupby(PLACE)
 
 
