@@ -141,8 +141,3 @@ class DelayLine:
             held.append(where_rows(fresh, flat.index_select(0, row_now), old))
             memory[f"held_{i}"] = held[i]
         return memory, Delivery(held, clock - generated_at, fresh, delay)
-
-
-def slot_rows(slot: Tensor) -> Tensor:
-    """Rows of [K * M, ...] that hold one slot [M] of each of the M rows."""
-    return slot * len(slot) + torch.arange(len(slot), device=slot.device)

@@ -14,7 +14,6 @@ from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask, next_true, where_rows
 from damian.delays.laws import LOSES, sampler_of
-from damian.delays.line import slot_rows
 from damian.keys import next_key
 from damian.transforms.base import Change, Correction, Memory, StatefulTransform
 from damian.transforms.context import ContextReader
@@ -41,11 +40,8 @@ class RewardDelay(StatefulTransform):
     and received at t = 4; the steps before receive 0. If the episode ends at t = 5, that step
     receives r2 + r3 + r4 + r5.
 
-    Rewards in transit lie in a ring of K slots (``past``); ``due`` [K, M] is the time at which
-    those in a slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a
-    reset and at the end of
-    an episode: whatever is in transit then is never received. So a step writes one slot of each
-    row, in place.
+    The memory's ``past`` [M, K, ...] is what each row will receive, by the number of steps until
+    then.
 
     Args:
         delay, dt, context_keys, seed: as in ``ObservationDelay``; the law must lose nothing.
@@ -103,69 +99,44 @@ class RewardDelay(StatefulTransform):
         streams = self.streams(tensordict.batch_size, reward.device, self.sampler)
         zero = torch.zeros_like(streams)
         state = self.sampler.initial_state(streams)
-        memory = {name: zero.clone() for name in ("clock", "slot", "time", "reset_at")}
+        memory = {name: zero.clone() for name in ("clock", "reset_at")}
         memory |= {"streams": streams, "state": state}
-        memory["due"] = zero.repeat(self.n_slots, 1)
-        memory["past"] = reward.new_zeros(self.n_slots, *reward.shape)
+        memory["past"] = reward.unsqueeze(1).repeat_interleave(self.n_slots, 1)
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         clock = memory["clock"]
-        memory = dict(memory)
-        memory["reset_at"] = torch.where(mask, clock, memory["reset_at"])
-        memory["time"] = memory["time"] + self.n_slots * mask
-        memory["state"] = self.sampler.begin_episode(memory["state"], mask)
-        delay = torch.zeros_like(clock)
-        return memory, self._told(delay, torch.zeros_like(memory["past"][0]))
+        past = where_rows(~mask, memory["past"], 0)
+        memory = memory | {
+            "reset_at": torch.where(mask, clock, memory["reset_at"]),
+            "state": self.sampler.begin_episode(memory["state"], mask),
+            "past": past,
+        }
+        return memory, self._told(torch.zeros_like(clock), torch.zeros_like(past[:, 0]))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock = memory["clock"] + 1
         reward = self.to_rows(entries[self.reward_key])
         context = self.contexts.read(memory, entries, None, self.rows)
         delay, state = self.sampler(memory["streams"], clock, memory["state"], context)
-        slot = (memory["slot"] + 1) % self.n_slots
-        time = memory["time"] + 1
-        memory = memory | {"clock": clock, "slot": slot, "state": state, "time": time}
-        past = self._send(memory, reward, delay, self.sending_rows(entries))
-        row = slot_rows(slot)
-        here = past.flatten(0, 1).index_select(0, row)
-        due = memory["due"].flatten().index_select(0, row)
-        received = where_rows(due == time, here, 0)
+        before = memory["past"]
+        past = torch.cat([before[:, 1:], torch.zeros_like(before[:, :1])], 1)
+        steps = torch.arange(self.n_slots, device=delay.device)
+        arrives = steps == delay.unsqueeze(-1)
+        past = where_rows(arrives, past + reward.unsqueeze(1), past)
+        received = past[:, 0]
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = any_flag(done, self.rows)
-            late = where_rows(memory["due"] > time, past, 0)
             # In double precision, so that the order of the sum, which depends on the batch, does
             # not matter.
             precise = torch.float64 if past.is_floating_point() else past.dtype
-            in_transit = late.sum(0, dtype=precise).to(past.dtype)
+            in_transit = past[:, 1:].sum(1, dtype=precise).to(past.dtype)
             received = where_rows(ended, received + in_transit, received)
-            memory["time"] = time + self.n_slots * ended
+            past = where_rows(~ended, past, 0)
+        memory = memory | {"clock": clock, "state": state, "past": past}
         outputs: Entries = {self.reward_key: self.from_rows(received)}
         return memory, outputs | self._told(delay, reward)
-
-    def _send(
-        self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None
-    ) -> Tensor:
-        """The slots [K, M, ...] with rewards [M, ...] that arrive after delays [M], in rows that
-        step."""
-        past = memory["past"]
-        arrival = memory["time"] + delay
-        flat = past.flatten(0, 1)
-        due = memory["due"].view(-1)
-        row = slot_rows((memory["slot"] + delay) % self.n_slots)
-        there = flat.index_select(0, row)
-        old = due.index_select(0, row)
-        added = where_rows(old == arrival, there, 0) + reward
-        # ``old`` is never later; a compiler that sees that it is read before writes the new times
-        # in place.
-        arrival = torch.maximum(arrival, old)
-        if stepped is not None:
-            added = where_rows(stepped, added, there)
-            arrival = torch.where(stepped, arrival, old)
-        due.index_copy_(0, row, arrival)
-        flat.index_copy_(0, row, added)
-        return past
 
     def _told(self, delay: Tensor, earned: Tensor) -> Entries:
         """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards
