@@ -50,9 +50,9 @@ class DelayLine:
     The memory, [M] if nothing else is said: ``clock``, the number of steps so far; ``place`` of the
     current slot (slot times M, plus the sender's number); random ``streams``; the sampler's
     ``state``, [M, ...]; clock of the latest reset, ``reset_at``, and of the held message,
-    ``generated_at``; numbers of the ``senders``; ``stamps``, the clock of the message in each of K
-    slots, and in one for messages that never arrive, [K + 1, M]; values in these, ``slots_i``
-    [K + 1, M, ...], and held, ``held_i`` [M, ...].
+    ``generated_at``; ``stamps``, the clock of the message in each of K slots, and in one for
+    messages that never arrive, [K + 1, M]; values in these, ``slots_i`` [K + 1, M, ...], and held,
+    ``held_i`` [M, ...].
     """
 
     def __init__(self, sampler: Sampler, order: str) -> None:
@@ -72,7 +72,6 @@ class DelayLine:
             "state": self.sampler.initial_state(streams),
             "reset_at": zero.clone(),
             "generated_at": zero.clone(),
-            "senders": torch.arange(len(streams), device=streams.device),
             "stamps": zero.new_full((n_rows, len(streams)), -1),
         }
         for i, value in enumerate(values):
@@ -118,7 +117,7 @@ class DelayLine:
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
         if sent is not None or not self._always_longest:
-            row_sent = torch.where(delay < n_slots, row_sent, n_places + memory["senders"])
+            row_sent = torch.where(delay < n_slots, row_sent, n_places + row_now % n_senders)
         stamps = memory["stamps"].view(-1)
         stamp = stamps.index_copy_(0, row_sent, clock).index_select(0, row_now)
         if self._hold_last_generated:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import where_rows
@@ -65,8 +66,6 @@ class Sampler(nn.Module, ABC):
     """Names of the entries that the context must contain."""
     same_draws_for_all_agents: bool = False
     """Whether all agents of a world draw the same numbers."""
-    constant_delay: int | None = None
-    """The delay [steps] if it is always the same and no message is lost, else None."""
     arrival_delay: int | None = None
     """The delay of every message that arrives [steps]; None if it varies."""
 
@@ -79,6 +78,11 @@ class Sampler(nn.Module, ABC):
         """Delay value that marks a message that never arrives."""
         self.loses = loses or loss > 0
         """Whether messages can be lost."""
+
+    @property
+    def constant_delay(self) -> int | None:
+        """The delay [steps] if it is always the same and no message is lost, else None."""
+        return None if self.loses else self.arrival_delay
 
     @property
     def late(self) -> bool:
@@ -130,21 +134,15 @@ class TableSampler(Sampler):
         transitions: list[list[float]] | None = None,
         loss: float = 0.0,
     ) -> None:
-        longest = max(map(len, states)) - 1
-        super().__init__(longest, loses=False, loss=loss)
-        arrive = torch.zeros(len(states), longest + 1, dtype=torch.float64)
-        for row, chances in zip(arrive, states, strict=True):
-            given = torch.tensor(chances, dtype=torch.float64)
-            row[: len(chances)] = given * (1 - loss)
+        given = [torch.tensor(chances, dtype=torch.float64) for chances in states]
+        arrive = pad_sequence(given, batch_first=True) * (1 - loss)
+        super().__init__(arrive.shape[1] - 1, loses=False, loss=loss)
         rest = 1 - arrive.sum(-1, keepdim=True)
         lost = rest.where(rest > _ROUNDING, 0.0)
         chances = torch.cat([arrive, lost], -1)
         self.register_buffer("chances", chances, persistent=False)
         self.loses = bool((lost > 0).any())
-        likeliest = int(chances[0, :-1].argmax())
-        is_certain = chances[:, likeliest] == 1
-        if is_certain.all():
-            self.constant_delay = likeliest
+        likeliest = int(arrive[0].argmax())
         if (arrive[:, likeliest] == arrive.sum(-1)).all():
             self.arrival_delay = likeliest
         change = torch.tensor(transitions or [[1.0]], dtype=torch.float64)
@@ -192,7 +190,6 @@ class Recorded(Sampler):
         super().__init__(max(*delays, 0), loses=shortest < 0, loss=loss)
         if shortest == self.longest:
             self.arrival_delay = self.longest
-            self.constant_delay = None if self.loses else self.longest
         codes = torch.tensor([self.lost if delay < 0 else delay for delay in delays])
         self.register_buffer("_delays", codes, persistent=False)
 
@@ -222,7 +219,6 @@ class HeldSampler(Sampler):
         self.sees_context = drawn.sees_context
         self.reads = drawn.reads
         self.same_draws_for_all_agents = drawn.same_draws_for_all_agents
-        self.constant_delay = None if self.loses else self.longest
         self.arrival_delay = self.longest
 
     def initial_state(self, streams: Tensor) -> Tensor:
@@ -245,7 +241,6 @@ class LossSampler(HeldSampler):
     def __init__(self, drawn: Sampler) -> None:
         super().__init__(drawn)
         self.loses = True
-        self.constant_delay = None
         self.arrival_delay = drawn.arrival_delay
         self.sees_context = True
         self.reads = (*drawn.reads, "loss")
@@ -273,7 +268,6 @@ class LagSampler(Sampler):
         arrives = sum(chances)
         loss = table.chances[0, -1].item()
         super().__init__(table.longest, loses=False, loss=loss)
-        self.constant_delay = table.constant_delay
         self.arrival_delay = table.arrival_delay
         lags = [chance / arrives for chance in chances] if arrives else [1.0]
         self._lags = TableSampler([lags])
@@ -293,8 +287,6 @@ class LagSampler(Sampler):
     def forward(
         self, streams: Tensor, clock: Tensor, state: Tensor, context: Context = None
     ) -> Drawn:
-        if self.constant_delay is not None:
-            return torch.full_like(streams, self.constant_delay), state
         lag, wait = state.unbind(-1)
         first = lag < 0
         due = wait == 0

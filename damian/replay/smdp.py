@@ -39,10 +39,8 @@ def find_decisions(
     ``ready`` and ``ready_next`` [T, B, N] tell whether a UAV could choose before and after each
     step, ``done`` and ``terminated`` [T, B] how the episode ended.
     """
-    n_steps, end = (
-        len(ready),
-        next_true(ready_next | done.unsqueeze(-1)),
-    )  # n_steps: it has not ended yet
+    n_steps = len(ready)
+    end = next_true(ready_next | done.unsqueeze(-1))  # n_steps if it has not ended yet
     outcome_known = (ready_next | terminated.unsqueeze(-1)).gather(0, end.clamp(max=n_steps - 1))
     begin, world, agent = (ready & outcome_known & (end < n_steps)).nonzero().unbind(-1)
     return Decisions(begin, world, agent, end[begin, world, agent])
