@@ -37,7 +37,7 @@ class CompiledMethods:
             self._graphs[key] = CudaGraph(function) if self._cuda_graph else function
         return self._graphs[key]
 
-    def __reduce__(self) -> tuple[type["CompiledMethods"], tuple[dict[str, Any], bool]]:
+    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return CompiledMethods, (self._options, self._cuda_graph)
 
 

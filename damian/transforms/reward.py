@@ -28,7 +28,37 @@ from damian.transforms.entries import (
 )
 
 
-class RewardDelay(StatefulTransform):
+class RewardTransform(StatefulTransform):
+    """Base class of transforms that add up rewards of up to K = ``n_slots`` steps.
+
+    The memory's ``past`` [M, K, ...] has rewards of each row.
+    """
+
+    is_of_rewards = True
+    n_slots: int
+    lowest_dtype = torch.bool
+    """Sums have the dtype of the rewards, or this one if it is higher."""
+
+    def __init__(self, reward_key: NestedKey, seed: int | None = None) -> None:
+        super().__init__(reward_key, reward_key, seed=seed)
+        self.reward_key: NestedKey = self.in_keys[0]
+
+    def no_rewards(self) -> Tensor:
+        """Rewards of 0, [M, K, ...]."""
+        specs = self.env.full_reward_spec
+        zero = self.as_rows_of_spec(specs[self.reward_key].zero(), specs, self.reward_key)
+        return zero.unsqueeze(1).repeat_interleave(self.n_slots, 1)
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
+        key = self.reward_key
+        if self.n_slots > 1:  # sums of rewards have other bounds than one reward
+            old = reward_spec[key]
+            dtype = torch.promote_types(old.dtype, self.lowest_dtype)
+            reward_spec[key] = Unbounded(old.shape, dtype=dtype, device=old.device)
+        return reward_spec
+
+
+class RewardDelay(RewardTransform):
     """Delays rewards: each reward is received some steps after it was earned.
 
     Rewards that are received in the same step are added up. In the last step of an episode, all
@@ -58,7 +88,6 @@ class RewardDelay(StatefulTransform):
     """
 
     flushes_at_end = True
-    is_of_rewards = True
 
     def __init__(
         self,
@@ -71,8 +100,7 @@ class RewardDelay(StatefulTransform):
         earned_key: NestedKey | None = None,
         seed: int | None = None,
     ) -> None:
-        super().__init__(reward_key, reward_key, seed=seed)
-        self.reward_key: NestedKey = self.in_keys[0]
+        super().__init__(reward_key, seed)
         self.delay_key = sibling_key(self.reward_key, delay_key)
         self.earned_key = sibling_key(self.reward_key, earned_key)
         self.out_keys = [self.reward_key, *existing([self.delay_key, self.earned_key])]
@@ -95,13 +123,12 @@ class RewardDelay(StatefulTransform):
         return flag_keys("done", self.reward_key, self.env.done_keys)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        reward = _zero_rewards(self)
-        streams = self.streams(tensordict.batch_size, reward.device, self.sampler)
+        past = self.no_rewards()
+        streams = self.streams(tensordict.batch_size, past.device, self.sampler)
         zero = torch.zeros_like(streams)
         state = self.sampler.initial_state(streams)
         memory = {name: zero.clone() for name in ("clock", "reset_at")}
-        memory |= {"streams": streams, "state": state}
-        memory["past"] = reward.unsqueeze(1).repeat_interleave(self.n_slots, 1)
+        memory |= {"streams": streams, "state": state, "past": past}
         return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
@@ -148,13 +175,6 @@ class RewardDelay(StatefulTransform):
         if self.earned_key is not None:
             entries[self.earned_key] = self.from_rows(earned.clone())
         return entries
-
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
-        key = self.reward_key
-        if self.n_slots > 1:  # sums of rewards have other bounds than one reward
-            old = reward_spec[key]
-            reward_spec[key] = Unbounded(old.shape, dtype=old.dtype, device=old.device)
-        return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         rewards = self.env.full_reward_spec
@@ -207,14 +227,7 @@ class RewardDelay(StatefulTransform):
         return arrived | done.gather(0, last)
 
 
-def _zero_rewards(transform: StatefulTransform) -> Tensor:
-    """A reward of 0 for each of the M rows of a transform of rewards, [M, ...]."""
-    specs = transform.env.full_reward_spec
-    key = transform.in_keys[0]
-    return transform.as_rows_of_spec(specs[key].zero(), specs, key)
-
-
-class CumulativeReward(StatefulTransform):
+class CumulativeReward(RewardTransform):
     """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
     R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode; gamma
@@ -225,22 +238,19 @@ class CumulativeReward(StatefulTransform):
         >>> rollout = env.rollout(200)  # each reward is a discounted sum of the last five
     """
 
-    is_of_rewards = True
+    lowest_dtype = torch.float32
 
     def __init__(self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward") -> None:
         checks.whole("steps", steps, 1)
         checks.above("gamma", gamma, 0.0)
         checks.in_range("gamma", gamma, 0.0, 1.0)
-        super().__init__(reward_key, reward_key)
-        self.reward_key: NestedKey = self.in_keys[0]
+        super().__init__(reward_key)
         self.step_keys = self.in_keys
         self.n_slots = steps
         self.gamma = gamma
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        reward = _zero_rewards(self).unsqueeze(1)
-        past = reward.repeat_interleave(self.n_slots, 1)  # [M, K, ...]
-        return {"past": past}
+        return {"past": self.no_rewards()}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         past = memory["past"]
@@ -253,14 +263,6 @@ class CumulativeReward(StatefulTransform):
         past = torch.cat([reward.unsqueeze(1), before], 1)
         total = discounted_sum(past.movedim(1, 0), self.gamma)
         return {"past": past}, {self.reward_key: self.from_rows(total)}
-
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
-        key = self.reward_key
-        if self.n_slots > 1:
-            old = reward_spec[key]
-            dtype = torch.promote_types(old.dtype, torch.float32)
-            reward_spec[key] = Unbounded(old.shape, dtype=dtype, device=old.device)
-        return reward_spec
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
         """Sums the corrected rewards of the same episode."""
