@@ -81,8 +81,6 @@ class Planner:
         samples: int,
         compile: bool = False,
     ) -> None:
-        checks.whole("planner.horizon", horizon, 1, 1000)
-        checks.whole("planner.samples", samples, 1, 1000)
         self.worlds = worlds
         self.simulation = simulation
         self.horizon = horizon

@@ -246,7 +246,7 @@ def _entry(values: Tensor, index: Tensor) -> Tensor:
 
 def _places_at(ground: Tensor, index: Tensor) -> Tensor:
     """Landing points [B, N, 2] of these indices [B, N] among ``ground`` [B, L, 2]."""
-    return ground.gather(1, index.unsqueeze(-1).expand(*index.shape, 2))
+    return ground.take_along_dim(index.unsqueeze(-1), 1)
 
 
 class Commander:
@@ -454,5 +454,4 @@ def _only(known: Messages, uav: int) -> Messages:
 
 def _footprint_at(footprints: Tensor, point: Tensor) -> Tensor:
     """The footprints [B or 1, L, W] of the landing points of these indices [B], [B, W]."""
-    rows = footprints.expand(len(point), -1, -1)
-    return rows.gather(1, point.view(-1, 1, 1).expand(-1, 1, rows.shape[-1])).squeeze(1)
+    return footprints.take_along_dim(point.view(-1, 1, 1), 1).squeeze(1)

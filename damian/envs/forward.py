@@ -96,8 +96,7 @@ class ToldWorlds(ForetoldWorlds):
         steps = rows.shape[2] - 1
         age = torch.arange(steps + 1, device=now.device)
         earliest = torch.where(known, age, -1).argmax(-1)
-        at = earliest[..., None, None].expand(*earliest.shape, 1, rows.shape[-1])
-        first = rows.gather(2, at).squeeze(2)
+        first = rows.take_along_dim(earliest[..., None, None], 2).squeeze(2)
         first = where_rows(known.any(-1), first, newest)
         begin = (now - steps).clamp(min=0)
         latest = self._messages(newest)

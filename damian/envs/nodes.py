@@ -250,32 +250,29 @@ class Belief(WorldTransform):
         return empty_window(self.grid, self.longest, n_beliefs, n_agents, self.own)._asdict()
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        messages = self.server.messages(self.to_rows(entries[keys.MESSAGE]))
-        region = self.server.region_of(messages)
-        level = self.server.level(messages)
-        rows = report_rows(self.grid, messages, level)
-        place = places(self.grid, region, level)
-        told = rows.flatten(0, 1), place.flatten(), self._of_each(mask)
+        report, place = self._told(self.to_rows(entries[keys.MESSAGE]))
+        told = report, place, self._of_each(mask)
         return memory, self._written(begin_beliefs(self.grid, Window(**memory), *told))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         rows = {key: self.to_rows(entries[key]) for key in self.in_keys}
-        messages = self.server.messages(rows[keys.MESSAGE])
-        region = self.server.region_of(messages)
-        level = self.server.level(messages)
-        report = report_rows(self.grid, messages, level, rows[keys.MESSAGE_SENT])
-        delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(messages.motions)
-        every = torch.ones_like(region, dtype=torch.bool)
+        sent = rows[keys.MESSAGE_SENT]
+        report, place = self._told(rows[keys.MESSAGE], sent)
+        delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(sent).long()
+        every = torch.ones_like(sent[:, 0])
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        told = (
-            report.flatten(0, 1),
-            self._of_each(delay),
-            places(self.grid, region, level).flatten(),
-        )
-        window, beliefs = advance_beliefs(
-            self.grid, Window(**memory), *told, self._of_each(stepped)
-        )
+        told = report, self._of_each(delay), place, self._of_each(stepped)
+        window, beliefs = advance_beliefs(self.grid, Window(**memory), *told)
         return window._asdict(), self._written(beliefs)
+
+    def _told(self, message: Tensor, sent: Tensor | bool = True) -> tuple[Tensor, Tensor]:
+        """What messages [B, N, M], if ``sent`` [B, N], report of each source, [B K, N], and the
+        places of its tables, [B K]."""
+        messages = self.server.messages(message)
+        level = self.server.level(messages)
+        report = report_rows(self.grid, messages, level, sent)
+        place = places(self.grid, self.server.region_of(messages), level)
+        return report.flatten(0, 1), place.flatten()
 
     def _of_each(self, values: Tensor) -> Tensor:
         """Values of worlds [B, ...] for the belief about each source, [B K, ...]."""

@@ -25,11 +25,12 @@ FIRST_LOG_WEIGHT, LEAST = 8.0, 1e-3
 def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
     """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``."""
     layout = layout_at(env, keys.OBSERVATION)
-    shape = env.observation_spec[keys.OBSERVATION].shape
+    n_networks = 1 if model.shared else env.observation_spec[keys.OBSERVATION].shape[-2]
 
     def make(n_out: int, *out_keys: NestedKey) -> TensorDictModule:
         if not model.recurrent:
-            network = _network(model, layout, n_out, shape)
+            networks = [model.make_network(layout, n_out) for _ in range(n_networks)]
+            network = networks[0] if model.shared else SeparateNetworks(networks)
             return _module(network, [keys.OBSERVATION], model, layout, out_keys)
         head = model.make_head(layout, n_out)
         memory = AgentGRU(*model.make_encoder(layout), model.hidden[-1])
@@ -39,13 +40,6 @@ def make_actor(env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
     actor = with_distribution(env, make)
     actor.to(env.device)
     return actor
-
-
-def _network(model: ModelConfig, layout: Layout, n_out: int, observed: torch.Size) -> nn.Module:
-    """The network that all UAVs share, or one for each of them."""
-    if model.shared:
-        return model.make_network(layout, n_out)
-    return SeparateNetworks([model.make_network(layout, n_out) for _ in range(observed[-2])])
 
 
 def _module(

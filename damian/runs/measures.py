@@ -45,9 +45,7 @@ def metric(better: str = "", **declared: Any) -> Callable[[Compute], Metric]:
 
 def declared(name: str) -> Metric:
     """What is known of a metric; one whose code nobody has named is shown like any other."""
-    if name in METRICS:
-        return METRICS[name]
-    return _UNKNOWN
+    return METRICS[name] if name in METRICS else Metric(lambda _: float("nan"))
 
 
 def check_score(name: str) -> None:
@@ -58,9 +56,6 @@ def check_score(name: str) -> None:
         name,
         "is neither better when higher nor when lower: declare that, or choose another score",
     )
-
-
-_UNKNOWN = Metric(lambda _: float("nan"))
 
 
 def _add(name: str, compute: Compute, better: str = "", **declared: Any) -> None:

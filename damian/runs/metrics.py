@@ -218,12 +218,11 @@ def _latest(known: Tensor, ended: Tensor) -> Tensor:
         ended: those of the episodes that end in some later steps, nan where none does, [B, T, N].
     """
     both = torch.cat([known, ended], 1)
-    _, n_all, n_numbers = both.shape
     is_known = ~both[..., 0].isnan()
-    when = torch.arange(n_all).where(is_known, -1)
+    when = torch.arange(both.shape[1]).where(is_known, -1)
     latest = when.topk(known.shape[1], 1).indices
     in_order = latest.sort(1).values.unsqueeze(-1)
-    return both.gather(1, in_order.expand(-1, -1, n_numbers))
+    return both.take_along_dim(in_order, 1)
 
 
 class HindsightReturns:

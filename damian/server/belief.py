@@ -172,10 +172,9 @@ def build_source_grid(
     every step: with ``emission=per_stop``, silence counts for too much.
     """
     polygons = [region.polygon for region in airspace.regions]
-    columns = _columns(polygons, edge)
+    columns, prior = _cells(polygons, edge)
     positions = columns * edge
     centres = torch.as_tensor(positions, dtype=torch.float32)
-    prior = _shares_of_cells(polygons, positions, edge)
     moves = None
     staying = torch.ones_like(prior)
     if source.motion == "dynamic":
@@ -215,31 +214,23 @@ def _in_turn(after_silence: Tensor, after_report: Tensor) -> Tensor:
     return torch.stack([after_silence, after_report], 1).flatten(0, 1)
 
 
-def _shares_of_cells(polygons: list, positions: np.ndarray, edge: float) -> Tensor:
-    """Share of the area of each polygon that lies in each cell, [R, C]."""
-    half = edge / 2
-    squares = shapely.box(*(positions - half).T, *(positions + half).T)
-    parts = [shapely.intersection(squares, polygon) for polygon in polygons]
-    area = torch.as_tensor(shapely.area(parts))
-    return (area / area.sum(-1, keepdim=True)).float()
-
-
-def _columns(polygons: list, edge: float) -> np.ndarray:
-    """Column and row numbers of all cells that any of the polygons touches, [C, 2]."""
+def _cells(polygons: list, edge: float) -> tuple[np.ndarray, Tensor]:
+    """Column and row numbers of all cells with a part of any of the polygons, [C, 2], and the share
+    of the area of each polygon that lies in each cell, [R, C]."""
     bounds = shapely.total_bounds(polygons) / edge
     south_west = np.floor(bounds[:2])
     north_east = np.ceil(bounds[2:])
     axes = [np.arange(a, b + 1) for a, b in zip(south_west, north_east, strict=True)]
     columns = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    low = (columns - 0.5) * edge
-    high = (columns + 0.5) * edge
-    squares = shapely.box(*low.T, *high.T)
-    touched = np.zeros(len(columns), dtype=bool)
-    for polygon in polygons:
-        shapely.prepare(polygon)
-        meets = shapely.intersects(squares, polygon)
-        touched |= meets & ~shapely.touches(squares, polygon)
-    return columns[touched]
+    positions = columns * edge
+    half = edge / 2
+    squares = shapely.box(*(positions - half).T, *(positions + half).T)
+    parts = [shapely.intersection(squares, polygon) for polygon in polygons]
+    area = torch.as_tensor(shapely.area(parts))
+    touched = (area > 0).any(0)
+    area = area[:, touched]
+    share = area / area.sum(-1, keepdim=True)
+    return columns[touched.numpy()], share.float()
 
 
 def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarray:

@@ -86,7 +86,6 @@ class Server:
         time_scale: float,
     ) -> None:
         airspace = simulation.airspace
-        battery = simulation.config.battery
         n_points = airspace.points.shape[:2].numel()
         checks.require(
             n_points < MAX_EXACT_INTEGER,
@@ -98,7 +97,6 @@ class Server:
         self.observation = observation
         self.reward = reward
         self.episode = episode
-        self.battery = battery
         self.dt = simulation.dt
         self._scales = airspace.scale
         self._read_terms()

@@ -73,13 +73,8 @@ SENSORS = Registry[Sensor](
 @SENSORS.register(FOOTPRINT)
 @sensor()
 def footprint(state: State, world: Any) -> Tensor:
-    """Radius of the UAV's footprint [m], [B, N]."""
-    drawn = world.radii(state)
-    return (
-        torch.full_like(state.track, world.radius)
-        if drawn is None
-        else drawn.expand_as(state.track)
-    )
+    """Radius of the UAV's footprint [m], [B, N, 1]."""
+    return torch.zeros_like(state.track).unsqueeze(-1) + world.radii(state, world.radius)
 
 
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:

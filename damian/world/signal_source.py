@@ -126,8 +126,7 @@ def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
     here = stop.unsqueeze(-1)
     following = (here + 1).clamp_max(last)
     ends = torch.cat([here, following], dim=-1)
-    index = ends.unsqueeze(-1).expand(*ends.shape, 2)
-    origin, target = walk.stop.gather(-2, index).unbind(-2)
+    origin, target = walk.stop.take_along_dim(ends.unsqueeze(-1), -2).unbind(-2)
     depart, speed, acceleration = (
         x.gather(-1, here).squeeze(-1) for x in (walk.depart, walk.speed, walk.acceleration)
     )

@@ -212,9 +212,6 @@ class Simulation:
     ) -> State:
         """Assign landing points to the UAVs that may choose, and start their flights, as in
         ``step``."""
-        n_points = self.airspace.max_points
-        base = state.region.unsqueeze(-1) * n_points
-        standing = state.goal - base
         origin = state.goal
         if command is not None:
             start, number, _ = command[..., 0, :].unbind(-1)
@@ -226,13 +223,24 @@ class Simulation:
         if action_valid is not None:
             reach = torch.where(action_valid, reach, -1.0)
         ready = reach >= 0
-        goal = assign_landing_points(ranking, row, standing, reach, n_points) + base
-        departs = goal != state.goal
-        track = torch.where(departs, self._heading(state.goal, goal), state.track)
-        state = state._replace(track=track, motions=state.motions + ready)
+        goal, departs, state = self._assigned(state, ranking, row, reach, state.goal)
+        state = state._replace(motions=state.motions + ready)
         if command is not None:
             state = state._replace(sent=self._with_commands(state, command, ready))
         return self.vehicles.take_off(state, goal, ready, departs)
+
+    def _assigned(
+        self, state: State, ranking: Ranking, row: Tensor, reach: Tensor, start: Tensor
+    ) -> tuple[Tensor, Tensor, State]:
+        """The landing points to which UAVs fly next, flat ids, which of them are others than
+        before, [B, N] each, and the state with the headings of flights to these from ``start``."""
+        n_points = self.airspace.max_points
+        base = state.region.unsqueeze(-1) * n_points
+        standing = state.goal - base
+        goal = assign_landing_points(ranking, row, standing, reach, n_points) + base
+        turns = goal != state.goal
+        track = torch.where(turns, self._heading(start, goal), state.track)
+        return goal, turns, state._replace(track=track)
 
     def _with_commands(self, state: State, command: Tensor, ready: Tensor) -> Messages:
         """The latest messages, in which UAVs tell what they have executed, and what is under
@@ -275,13 +283,8 @@ class Simulation:
         distance = self._action_distances(state._replace(goal=start))
         distance = distance.where(distance <= reach.unsqueeze(-1), torch.inf)
         ranking, row = self.news.elsewhere(state, start, distance)
-        base = state.region.unsqueeze(-1) * self.airspace.max_points
-        standing = state.goal - base
-        assigned = assign_landing_points(ranking, row, standing, reach, self.airspace.max_points)
-        goal = assigned + base
-        turns = goal != state.goal
-        track = torch.where(turns, self._heading(start, goal), state.track)
-        return self.vehicles.divert(state._replace(track=track), goal, turns)
+        goal, turns, state = self._assigned(state, ranking, row, reach, start)
+        return self.vehicles.divert(state, goal, turns)
 
     def _sense(
         self, state: State, action_valid: Tensor | None = None, joins: Tensor | None = None
@@ -344,22 +347,19 @@ class Simulation:
             sent = sent._replace(requests=messages.requests)
         return state._replace(message_sent=sends, motions=motions, sent=sent)
 
-    def radii(self, state: State) -> Tensor | None:
-        """Radius of the footprints of each world's UAVs [m], [B, 1], if it is drawn."""
+    def radii(self, state: State, settings: float | Tensor) -> float | Tensor:
+        """Radius of the footprints of each world's UAVs [m], [B, 1, 1], if it is drawn; else as in
+        the settings."""
         level = self.vehicles.values.get("source.level_db", state.drawn)
         if isinstance(level, Tensor):
-            return drawn_radius(level, self.config.source)
-        return None
+            return drawn_radius(level.unsqueeze(-1), self.config.source)
+        return settings
 
     def in_reach(self, state: State, emits: Tensor, on_ground: Tensor) -> Tensor:
         """Whether UAVs ``on_ground`` [B, N] are within the radius of sources that emit [B, K];
         [B, N, K]."""
         ways = state.position[..., None, :2] - state.source.unsqueeze(-3)
-        reach = self.reach
-        drawn = self.radii(state)
-        if drawn is not None:
-            reach = drawn.unsqueeze(-1)
-        near = ways.square().sum(-1) <= reach.square()
+        near = ways.square().sum(-1) <= self.radii(state, self.reach) ** 2
         hears = on_ground.unsqueeze(-1) & emits.unsqueeze(-2)
         return hears & near
 
@@ -391,15 +391,13 @@ class Simulation:
         """Landing points and times [s] of each UAV's latest stops, newest first, [B, N, S] each,
         and what happened there, [B, N, S, E]."""
         sent = state.sent
-        trail = _prepended(state.goal, sent.trail)
-        landed = _prepended(now, sent.landed)
-        happened = sent.events
-        if self.widths.events:
-            happened = torch.cat([events.unsqueeze(-2), happened[..., :-1, :]], -2)
-        if added is not None:
-            trail = where_rows(added, trail, sent.trail)
-            landed = where_rows(added, landed, sent.landed)
-            happened = where_rows(added, happened, sent.events)
+        newest = state.goal, now, events
+        before = sent.trail, sent.landed, sent.events
+        found = []
+        for new, old in zip(newest, before, strict=True):
+            stops = torch.cat([new.unsqueeze(2), old[:, :, :-1]], 2)
+            found.append(stops if added is None else where_rows(added, stops, old))
+        trail, landed, happened = found
         return trail, landed, happened
 
     def _serve(self, state: State, now: Tensor, lands: Tensor) -> tuple[State, Tensor, Tensor]:
@@ -409,11 +407,8 @@ class Simulation:
         if not self.widths.requests:
             return state, served, serves
         requests = self._appear(state, now)
-        radius = self.radius
-        drawn = self.radii(state)
-        if drawn is not None:
-            radius = drawn.unsqueeze(-1)
         place = state.position[..., :2]
+        radius = self.radii(state, self.radius)
         served, serves = serve(requests, served, place, lands, radius)
         serves = serves.unsqueeze(-1).to(now.dtype)
         return state._replace(requests=requests), served, serves
@@ -576,11 +571,6 @@ class Simulation:
         times = torch.where(stop == 0, 0.0, -1.0)  # nothing is known of before
         sent = state.sent._replace(landed=times.expand_as(landed))
         return state._replace(sent=sent)
-
-
-def _prepended(newest: Tensor, before: Tensor) -> Tensor:
-    """Rows [*, S] with a newest entry [*] first, without the oldest."""
-    return torch.cat([newest.unsqueeze(-1), before[..., :-1]], -1)
 
 
 def _last_found(

@@ -160,15 +160,6 @@ class MotionModel(ABC):
         acceleration = self.values.get("motion.max_acceleration", drawn)
         return minimum_time(length, self.motion.degree, speed, acceleration)
 
-    def kinds(self, n_agents: int) -> Tensor:
-        """Speed limit and battery capacity of each UAV, over the largest ones, [N, 2]."""
-        each = []
-        for name in ("motion.max_speed", "battery.capacity_kwh"):
-            value = torch.as_tensor(self.values.settings[name])
-            each.append(value.float().expand(n_agents))
-        kinds = torch.stack(each, -1)
-        return kinds / kinds.amax(0)
-
     def vertical(self, state: State) -> Tensor:
         """Duration of a takeoff, and of a landing, of each UAV [s], [N], or [B, N] if it is
         drawn."""

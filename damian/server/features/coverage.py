@@ -11,7 +11,6 @@ from damian.common import devices
 from damian.common.tensors import distances, gather_rows
 from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature, footprint_radii
-from damian.world.airspace import Airspace
 from damian.world.coverage import (
     FootprintTables,
     covered_share,
@@ -48,8 +47,15 @@ def footprint_tables(
 def map_places_inside(simulation: Simulation, _: ObservationConfig) -> Tensor:
     """Whether the places of ``coverage_map`` lie in the region, for every radius, [V*R*L, 24] of 0
     and 1."""
-    radii = footprint_radii(simulation)
-    return torch.cat([places_inside(simulation.airspace, radius) for radius in radii])
+    airspace = simulation.airspace
+    points = airspace.points.nan_to_num(posinf=0.0).double().cpu().numpy()
+    found = []
+    for radius in footprint_radii(simulation):
+        places = points[:, :, None] + ring_places(radius).double().numpy()
+        for region, about in zip(airspace.regions, places, strict=True):
+            east, north = np.moveaxis(about, -1, 0)
+            found.append(shapely.contains_xy(region.polygon, east, north))
+    return torch.from_numpy(np.concatenate(found)).float()
 
 
 def ring_places(radius: float | Tensor, device: torch.device | None = None) -> Tensor:
@@ -61,18 +67,6 @@ def ring_places(radius: float | Tensor, device: torch.device | None = None) -> T
     angle = number * (2 * math.pi / SECTORS)
     ring = torch.stack([angle.sin(), angle.cos()], -1)
     return torch.cat([ring * distance * radius for distance in RINGS], -2)
-
-
-def places_inside(airspace: Airspace, radius: float) -> Tensor:
-    """Whether the places about each landing point lie in its region, by flat id, [R*L, 24] of 0 and
-    1."""
-    points = airspace.points.nan_to_num(posinf=0.0).double().cpu().numpy()
-    places = points[:, :, None] + ring_places(radius).double().numpy()
-    inside = []
-    for region, about in zip(airspace.regions, places, strict=True):
-        east, north = np.moveaxis(about, -1, 0)
-        inside.append(shapely.contains_xy(region.polygon, east, north))
-    return torch.from_numpy(np.stack(inside)).float().flatten(0, 1)
 
 
 @feature("global", name="coverage", tables=[footprint_tables])

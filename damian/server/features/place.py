@@ -13,7 +13,13 @@ from damian.world.simulation import Simulation
 
 def kinds_of_uavs(simulation: Simulation, _: ObservationConfig) -> Tensor:
     """Speed limit and battery capacity of each UAV, over the largest ones, [N, 2]."""
-    return simulation.vehicles.kinds(simulation.config.agents)
+    settings = simulation.vehicles.values.settings
+    each = []
+    for name in ("motion.max_speed", "battery.capacity_kwh"):
+        value = torch.as_tensor(settings[name])
+        each.append(value.float().expand(simulation.config.agents))
+    kinds = torch.stack(each, -1)
+    return kinds / kinds.amax(0)
 
 
 def battery_settings(simulation: Simulation, _: ObservationConfig) -> BatteryConfig:

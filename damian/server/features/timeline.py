@@ -32,19 +32,17 @@ def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
     return torch.where(messages.landed < 0, -1, ages)
 
 
-def told_timeline(messages: Messages, context: ServerContext) -> Tensor:
-    """What these messages alone tell, [*, slots, 3 + E], as ``ServerContext.timeline``."""
-    facts = stop_facts(messages, context)
-    as_of_now = messages._replace(time=context.now.unsqueeze(-1))
+def known_stops(v: FeatureCache) -> Tensor:
+    """What is known of each UAV's stops by when they were, as ``ServerContext.timeline``; without
+    that, what these messages alone tell."""
+    context = v.context
+    if context.timeline is not None:
+        return context.timeline
+    facts = stop_facts(v.messages, context)
+    as_of_now = v.messages._replace(time=context.now.unsqueeze(-1))
     ages = stop_ages(as_of_now, context)
     facts, told = told_slots(facts, ages, context.observation.timeline)
     return torch.cat([facts, told.unsqueeze(-1)], -1)
-
-
-def known_stops(v: FeatureCache) -> Tensor:
-    """What is known of each UAV's stops by when they were, as ``ServerContext.timeline``."""
-    known = v.context.timeline
-    return told_timeline(v.messages, v.context) if known is None else known
 
 
 @feature(
