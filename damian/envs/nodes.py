@@ -22,7 +22,6 @@ from damian.server.belief import (
 from damian.server.server import Server, own_or_others
 from damian.transforms.base import Change, Memory, StatefulTransform
 from damian.transforms.entries import Entries, add_spec, existing
-from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
 
 
@@ -112,26 +111,13 @@ class ServerNode(WorldTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])
-        memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
-        memory["held"] = torch.zeros_like(
-            rows[..., 0]
-        )  # when the messages were sent that the server held
-        if not self.server.remembers_coverage:
-            return memory
-        trail = self.server.counted(self.server.messages(rows))
-        return memory | {
-            "trail": trail,
-            "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype),
-        }
+        elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)
+        # When the messages were sent that the server held.
+        return {"elapsed": elapsed, "held": torch.zeros_like(rows[..., 0])}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         begun = {"elapsed": mask, "held": mask.unsqueeze(-1)}
-        memory = memory | {name: memory[name].masked_fill(rows, 0) for name, rows in begun.items()}
-        if "coverage" in memory:
-            memory["coverage"] = memory["coverage"].masked_fill(
-                expand_mask(mask, memory["coverage"]), -1
-            )
-        return memory, {}
+        return {name: memory[name].masked_fill(rows, 0) for name, rows in begun.items()}, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed = memory["elapsed"] + 1
@@ -142,12 +128,11 @@ class ServerNode(WorldTransform):
         steps = elapsed.view(self.rows)
         messages = self.server.messages(received)
         news = messages.time != memory["held"]
-        known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
         over = entries.get(keys.SOURCE_OVER)
         belief = entries.get(keys.BELIEF)
         timeline = entries.get(keys.STOPS)
         observers = () if self.simulation else ("actor", "critic")
-        remembered = known, belief, timeline, observers, news
+        remembered = belief, timeline, observers, news
         outputs = self.server(messages, steps, over, *remembered)
         written = outputs.entries(self.reward_terms)
         if self.known_key:
@@ -174,10 +159,7 @@ class ServerNode(WorldTransform):
                 timeline,
                 entries.get(keys.OWN_STOPS),
             )
-        memory = {"elapsed": elapsed, "held": messages.time.clone()}
-        if outputs.coverage is not None:
-            memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
-        return memory, written
+        return {"elapsed": elapsed, "held": messages.time.clone()}, written
 
     def _in_frames(
         self, simulation: Simulation, received: Tensor, entries: Entries, steps: Tensor

@@ -21,7 +21,6 @@ from damian.server.components import checked_features
 from damian.server.features.source import nearest_way
 from damian.server.layout import Layout
 from damian.server.server import Features, Server
-from damian.world.coverage import KnownCoverage
 from damian.world.requests import is_open
 from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State, Truth
@@ -235,17 +234,10 @@ class UavEnv(EnvBase):
     ) -> tuple[PackedState, Outputs]:
         """One step of the physics, then the server's outputs; inputs as in ``Simulation.step``."""
         layout = self.simulation.layout
-        before = layout.unpack(worlds)
-        state = self.simulation.step(before, action, valid, command)
+        state = self.simulation.step(layout.unpack(worlds), action, valid, command)
         if self.messages_only:
             return layout.pack(state), self._state_outputs(state)
-        known = None
-        if self.server.remembers_coverage:
-            counted = self.server.counted(before.sent)
-            known = KnownCoverage(counted, before.coverage)
-        served = self.server(state.sent, state.steps, state.source_over, known)
-        if served.coverage is not None:
-            state = state._replace(coverage=served.coverage.share)
+        served = self.server(state.sent, state.steps, state.source_over)
         outputs = self._state_outputs(state, served.global_observation)
         outputs |= served.entries("reward_terms" in self.extras)
         return layout.pack(state), outputs

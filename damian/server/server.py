@@ -27,7 +27,6 @@ from damian.server.layout import Layout
 from damian.server.rewards import Counters, final_reward, reward, terms_of
 from damian.server.termination import Status, status
 from damian.world.config import FOOTPRINT
-from damian.world.coverage import KnownCoverage
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.signal_source import footprint_radius
 from damian.world.simulation import Simulation
@@ -48,8 +47,6 @@ class ServerOutputs(NamedTuple):
     """Weighted terms of the rewards by name, [*, N] each."""
     status: Status
     """Success and the end of the episode, [*]."""
-    coverage: KnownCoverage | None
-    """For the next step, if ``Server.remembers_coverage``."""
 
     def entries(self, reward_terms: bool = False) -> dict[NestedKey, Tensor]:
         """The outputs by their keys in a TensorDict, ``reward_terms`` only if they are wanted."""
@@ -70,11 +67,10 @@ class Server:
     """Computes features, rewards and status from messages, with any leading dimensions.
 
     In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of
-    the episode [*], ``source_over`` tells whether the source has finished its walk [*],
-    ``coverage`` is that of an earlier step of the same worlds, which saves time, and ``belief`` the
-    probability that each source is in each cell of ``grid`` [*, K, C], and ``timeline`` what is
-    known of each UAV's stops (``ServerContext``); without them, these are the first messages of the
-    episode. Time features are divided by ``time_scale`` [s].
+    the episode [*], ``source_over`` tells whether the source has finished its walk [*], ``belief``
+    is the probability that each source is in each cell of ``grid`` [*, K, C], and ``timeline`` what
+    is known of each UAV's stops (``ServerContext``); without them, these are the first messages of
+    the episode. Time features are divided by ``time_scale`` [s].
     """
 
     def __init__(
@@ -127,9 +123,6 @@ class Server:
             },
             tables={make: make(simulation, observation) for make in makers},
         )
-        # UAVs that fly stay at a landing point for more than a step, so that coverage changes
-        # seldom.
-        self.remembers_coverage = "coverage" in self.names and not simulation.vehicles.instant
 
     def _read_terms(self) -> None:
         self.terms = terms_of(self.reward)
@@ -201,7 +194,6 @@ class Server:
         messages: Messages,
         steps: Tensor,
         source_over: Tensor | None = None,
-        coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
         timeline: Tensor | None = None,
         observers: Collection[str] = ("actor", "critic"),
@@ -215,11 +207,11 @@ class Server:
         """
         seen = {observer: getattr(self.observation, observer) for observer in observers}
         names = sorted({*self.reads, *itertools.chain(*seen.values())})
-        features = self.features(messages, steps, names, coverage, belief, timeline)
+        features = self.features(messages, steps, names, belief, timeline)
         judged = features
         if self.reward.detection == "truth":  # from here on, for all that decides and pays
             messages = messages.of_truth
-            judged = self.features(messages, steps, self.reads, coverage, belief, timeline)
+            judged = self.features(messages, steps, self.reads, belief, timeline)
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         if news is None:
             news = messages.time == (steps * self.dt).unsqueeze(-1)
@@ -230,24 +222,19 @@ class Server:
         actor, critic = (
             stack(features, seen[x]) if x in seen else None for x in ("actor", "critic")
         )
-        known = None
-        if self.remembers_coverage and "coverage" in features:
-            known = KnownCoverage(self.counted(messages), features["coverage"])
-        return ServerOutputs(actor, critic, sum(terms.values(), start=final), terms, ended, known)
+        return ServerOutputs(actor, critic, sum(terms.values(), start=final), terms, ended)
 
     def features(
         self,
         messages: Messages,
         steps: Tensor,
         names: list[str] | None = None,
-        coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
         timeline: Tensor | None = None,
     ) -> Features:
         """The features of these names, or all that an observation or a reward term needs
         (paper, Table 2)."""
-        remembered = {"coverage": coverage, "belief": belief, "timeline": timeline}
-        context = self._known(messages, steps)._replace(**remembered)
+        context = self._known(messages, steps)._replace(belief=belief, timeline=timeline)
         return observe(messages, context, self.names if names is None else names)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from damian.common.tensors import gather_rows
 from damian.world.regions.polygon import Area
 
 _GRID = 321
@@ -92,55 +91,6 @@ def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor)
     twice = torch.cat([cells, cells[:, :-1]], 1)
     share = _share_of_first(tables, ids, twice.unfold(1, n_uavs, 1))
     return share.reshape(point_ids.shape[:-1])
-
-
-class KnownCoverage(NamedTuple):
-    """The coverage of a step, from which that of the next one is computed."""
-
-    trail: Tensor
-    """Flat ids of the UAVs' latest landing points, ``[*, N, n]`` int64."""
-    share: Tensor
-    """Their coverage, ``[*, N]``; negative where it is not known."""
-
-
-def updated_share(
-    tables: FootprintTables, point_ids: Tensor, points: Tensor, known: KnownCoverage
-) -> Tensor:
-    """As ``covered_share``, from all ``points`` [m], but computed only for worlds that have
-    changed."""
-    moved = (point_ids != known.trail).flatten(-2).any(-1)
-    unknown = known.share[..., 0] < 0
-    changed = (moved | unknown).reshape(-1)
-    n_uavs, n_last = point_ids.shape[-2:]
-    ids = point_ids.reshape(-1, n_uavs, n_last)
-    share = known.share.reshape(-1, n_uavs)
-    updated = _update_share(*tables, ids, points, share, changed)
-    return updated.view(known.share.shape)
-
-
-@torch.library.custom_op("damian::update_share", mutates_args=())
-def _update_share(
-    masks: Tensor,
-    cells_per_metre: float,
-    ids: Tensor,
-    points: Tensor,
-    share: Tensor,
-    changed: Tensor,
-) -> Tensor:
-    """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``."""
-    updated = share.clone()
-    worlds = changed.nonzero().squeeze(-1)
-    if len(worlds):
-        ids = ids.index_select(0, worlds)
-        tables = FootprintTables(masks, cells_per_metre)
-        shares = covered_share(tables, ids, gather_rows(points, ids))
-        updated.index_copy_(0, worlds, shares)
-    return updated
-
-
-@_update_share.register_fake
-def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need only the shape
-    return torch.empty_like(share)
 
 
 def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:

@@ -556,7 +556,6 @@ class Simulation:
             source_over=torch.zeros_like(number, dtype=torch.bool),
             requests=torch.full((n, self.widths.requests, 3), -1.0),
             drawn=self.vehicles.values.draw(seeds, none),
-            coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
             sent=Messages.blank(trail, self.widths),
         )

@@ -57,9 +57,6 @@ class State(NamedTuple):
     """The latest request of each slot, east, north [m], and when it appeared [s], [B, M, 3]."""
     drawn: Tensor
     """Values of the settings that are drawn for the episode, [B, D]."""
-    coverage: Tensor
-    """Coverage of each UAV, as an undelayed server computed it last; negative if it has not,
-    [B, N]."""
     message_sent: Tensor
     """Whether the UAV sent a message in this step, [B, N]."""
     sent: Messages

@@ -13,7 +13,7 @@ from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Point, Polygon
 from twin import exact_share
 
-from damian.world.coverage import KnownCoverage, build_tables, covered_share, updated_share
+from damian.world.coverage import build_tables, covered_share
 
 DATA = Path(__file__).parents[1] / "data"
 R = 56.2341
@@ -90,23 +90,3 @@ def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
             rtol=0,
             atol=0.01 * golden["disc_area"],
         )
-
-
-def test_a_sequence_of_steps_equals_each_step_by_itself():
-    axis = np.linspace(-190, 190, 6)
-    points = np.array(list(itertools.product(axis, axis)))
-    tables = build_tables([shapely.box(-200, -200, 200, 200)], points[None], R)
-    places = torch.tensor(points, dtype=torch.float32)
-    ids = torch.randint(len(points), (40, 3, 2))
-    known = KnownCoverage(ids, -torch.ones(40, 3))
-    computed = []
-    for _ in range(30):
-        moved = torch.rand(40, 3, 1) < 0.1
-        ids = torch.where(moved, ids.roll(1, -1) + 1, ids) % len(points)
-        remembered = torch.rand(40, 1) < 0.9
-        known = known._replace(share=known.share.where(remembered, -1))
-        share = updated_share(tables, ids, places, known)
-        assert torch.equal(share, covered_share(tables, ids, places[ids]))
-        computed.append((ids != known.trail).any())
-        known = KnownCoverage(ids, share)
-    assert all(computed)

@@ -16,7 +16,6 @@ from damian.common.tensors import expand_mask
 from damian.server.belief import SourceGrid, build_source_grids, first_belief, places, report_rows
 from damian.server.config import ObservationConfig
 from damian.server.layout import Layout
-from damian.world.coverage import KnownCoverage
 from damian.world.messages import Messages
 from damian.world.signal_source import footprint_radius
 from damian.world.simulation import Simulation
@@ -63,9 +62,6 @@ class ServerContext(NamedTuple):
     """By sender and age in steps, where it is known to have stopped, east and north [m], what
     happened there (``Messages.events``), and 1, else zeros, [*, N, slots, 3 + E]; None: as after
     these first messages."""
-    coverage: KnownCoverage | None = None
-    """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be
-    computed."""
 
 
 def drawn_levels(simulation: Simulation) -> list[dict[str, float]]:

@@ -7,7 +7,6 @@ import shapely
 import torch
 from torch import Tensor
 
-from damian.common import devices
 from damian.common.tensors import distances, gather_rows
 from damian.server.config import ObservationConfig
 from damian.server.features.base import FeatureCache, feature, footprint_radii
@@ -16,7 +15,6 @@ from damian.world.coverage import (
     covered_share,
     own_covered_share,
     tables_of_all,
-    updated_share,
 )
 from damian.world.simulation import Simulation
 
@@ -74,10 +72,6 @@ def _coverage(v: FeatureCache) -> Tensor:
     """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
     footprints, points = v.table(footprint_tables)
     trail = v.tabled(v.trail)
-    known = v.context.coverage
-    if not v.own_only and known is not None and devices.data_dependent(trail.device):
-        known = known._replace(trail=v.tabled(known.trail))
-        return updated_share(footprints, trail, points, known)
     places = gather_rows(points, trail)
     if v.own_only:
         return own_covered_share(footprints, trail, places).unsqueeze(-1)
