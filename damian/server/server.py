@@ -395,9 +395,7 @@ class Server:
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m],
         [*]."""
-        region = self.region_of(messages)
-        scales = self._scales
-        return scales.expand(region.shape) if len(scales) == 1 else gather_rows(scales, region)
+        return gather_rows(self._scales, self.region_of(messages))
 
 
 def own_or_others(own: Tensor, others: Tensor, inner: int) -> Tensor:

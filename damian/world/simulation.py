@@ -609,19 +609,16 @@ def _draw_initial_conditions(
 
 
 def _joined(walks: list[Walk]) -> Walk:
-    """The walks of one source in all regions."""
-    stops = max(walk.arrive.shape[1] for walk in walks)
-    padded = [_pad(walk, stops) for walk in walks]
+    """The walks of one source in all regions, padded by stops that it never reaches."""
+    stop = torch.arange(max(walk.arrive.shape[1] for walk in walks))
+    padded = []
+    for walk in walks:
+        last = walk.arrive.shape[1] - 1
+        kept = stop.clamp(max=last)
+        longer = tree_map(lambda field, kept=kept: field[:, kept], walk)
+        arrive = longer.arrive.masked_fill(stop > last, torch.inf)
+        padded.append(longer._replace(arrive=arrive))
     return tree_map(lambda *parts: torch.cat(parts), *padded)
-
-
-def _pad(walk: Walk, stops: int) -> Walk:
-    """Pad walks to the given number of stops; the source never reaches the padded ones."""
-    last = walk.arrive.shape[1] - 1
-    index = torch.arange(stops)
-    kept = index.clamp(max=last)
-    padded = tree_map(lambda field: field[:, kept], walk)
-    return padded._replace(arrive=padded.arrive.masked_fill(index > last, torch.inf))
 
 
 def _draw_starts(

@@ -132,11 +132,6 @@ def _spotted(v: FeatureCache) -> Tensor:
     return v.messages.spotted.to(v.scale.dtype)
 
 
-def number_of_detections(simulation: Simulation, observation: ObservationConfig) -> int:
-    """How many detections of each source ``detections`` tells."""
-    return min(observation.detections, simulation.config.agents)
-
-
 @feature(
     "global",
     [None, None],
@@ -144,7 +139,6 @@ def number_of_detections(simulation: Simulation, observation: ObservationConfig)
     name="detections",
     entries=columns_of_detections,
     rows="detections",
-    tables=[number_of_detections],
 )
 def _detections(v: FeatureCache) -> Tensor:
     """The newest detections of each source, at most one of each UAV, the newest first,
@@ -158,7 +152,7 @@ def _detections(v: FeatureCache) -> Tensor:
     messages = v.messages
     times = messages.detected_time.transpose(-2, -1)  # [*, K, N]
     newest = times.argsort(dim=-1, descending=True, stable=True)
-    newest = newest[..., : v.table(number_of_detections)]
+    newest = newest[..., : v.context.observation.detections]
     times = times.take_along_dim(newest, -1)  # [*, K, D]
     places = messages.detected_position.transpose(-3, -2)
     places = places.take_along_dim(newest.unsqueeze(-1), -2)
