@@ -20,9 +20,9 @@ from torch import Tensor
 
 from damian.common.errors import InputError
 from damian.delays.clocks import AGREE
-from damian.server.server import Server
 from damian.world.airspace import Airspace
 from damian.world.battery import observed
+from damian.world.config import BatteryConfig
 from damian.world.messages import Messages
 from damian.world.regions.geodesy import to_latlon, to_local
 from damian_fleet.reports import DEGREES, METRES, Place, Report
@@ -263,16 +263,16 @@ class UavLog:
 
 
 def messages_of(
-    reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float
+    reports: Sequence[FilledReport], config: BatteryConfig, points: Tensor, dt: float
 ) -> Messages:
-    """Messages [n] as the simulation would send them; landing points are [L, 2] and steps ``dt``
-    long [s]."""
+    """Messages [n] as the simulation would send them; ``config`` is of the batteries, landing points
+    are [L, 2], and steps ``dt`` long [s]."""
     steps = torch.tensor([each.step for each in reports])
     detected = torch.tensor([-1 if each.detected is None else each.detected for each in reports])
     battery = torch.tensor([each.battery for each in reports])
     at = points[[each.detected_at or 0 for each in reports]]
     stops = torch.tensor([each.stops for each in reports])  # [n, S, 2]
-    is_empty = server.battery.enabled and observed(battery, server.battery) <= 0
+    is_empty = config.enabled and observed(battery, config) <= 0
     return Messages(
         time=steps * dt,
         position=points[[each.point for each in reports]],

@@ -240,7 +240,7 @@ class Tracker:
         )
 
     def _messages(self, reports: Sequence[FilledReport]) -> Messages:
-        return messages_of(reports, self.node.server, self.points, self.node.dt)
+        return messages_of(reports, self.node.scenario.battery, self.points, self.node.dt)
 
     def state(self, asking: Sequence[str]) -> State:
         """The world, as far as it is known; the UAVs that ask are ready to choose."""
