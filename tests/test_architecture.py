@@ -4,11 +4,13 @@ import ast
 import re
 import tomllib
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import damian
+from damian.interop.fleet import PUBLIC
 from damian.world.messages import Messages
 
 ROOT = Path(damian.__file__).parent
@@ -168,3 +170,10 @@ def test_the_service_for_fleets_fills_every_column_of_a_message():
     called = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
     (made,) = [each for each in called if getattr(each.func, "id", "") == "Messages"]
     assert {each.arg for each in made.keywords} == {*Messages._fields}
+
+
+@pytest.mark.parametrize("line", PUBLIC.strip().splitlines())
+def test_the_names_that_fleets_may_use_exist(line):
+    module, names = line.split(": ")
+    found = import_module(module)
+    assert [name for name in names.split(", ") if not hasattr(found, name)] == []
