@@ -39,7 +39,7 @@ delays. Mean over seeds [95 % interval] (seeds).
 
 ![Returns over the delay of the flight](results/delaybench/matrix.png)"""
 FEWEST = 3
-"""Fewest seeds of which the leaderboard shows a mean: fewer have no interval."""
+"""The leaderboard shows a mean only of this many seeds or more, since fewer give no interval."""
 
 
 def leaderboard_pages() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""A wrapper that delays what the agent of any Gymnasium environment observes, does and earns.
+"""A wrapper that delays observations, actions and rewards of any Gymnasium environment.
 
     import gymnasium
     from delay_wrapper import DelayWrapper
@@ -35,8 +35,7 @@ from damian.transforms.context import ContextReader
 
 
 class DelayWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
-    """Delays what the agent observes, does and earns, as the transforms do, whatever the spaces
-    are.
+    """Delays observations, actions and rewards as the transforms do, for spaces of any kind.
 
     The agent holds the observation that was made last among those that have arrived, at first that
     of the reset; ``info["age"]`` is its age [steps]. The environment executes the action that was
@@ -169,8 +168,8 @@ class DelayWrapper(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return observation if self._in_parts else {"": observation}
 
     def _told(self) -> tuple[Any, Any]:
-        """What the agent is told, and the age of it [steps]; by part, if these are messages of
-        their own."""
+        """The observation that the agent holds, and its age [steps]; for each part of a ``Dict``
+        whose parts are messages of their own."""
         links = self._observations
         told: Any = {part: link.held() for part, link in links.items()}
         age: Any = {part: link.age for part, link in links.items()}

@@ -40,7 +40,7 @@ class LawFit(NamedTuple):
 
 
 def fit_laws(steps: Integers) -> tuple[LawFit, float]:
-    """The best of the laws that need nothing but delays, and how far it is from what was recorded.
+    """Fit the laws that need nothing but delays; the best fit, and its distance to the recorded ones.
 
     Sequences [S, T] have the delays of messages in their order [steps], or marks; one at least has
     arrived. The distance is the total variation between the delays of two successive messages: the

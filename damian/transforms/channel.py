@@ -152,12 +152,12 @@ class Channel(StatefulTransform):
         return memory, self._outputs(memory, content)
 
     def _by_sender(self, value: Tensor) -> Tensor:
-        """An entry of the agents [*B, N, ...], for each link that of its sender, [M, ...]."""
+        """Copy the entry of each sender [*B, N, ...] to all of its links, [M, ...]."""
         at_receivers = value.unsqueeze(len(self.agents) - 1)
         return self.to_rows(at_receivers.expand(*self.rows, *value.shape[len(self.agents) :]))
 
     def _by_receiver(self, value: Tensor) -> Tensor:
-        """The same of its receiver."""
+        """Copy the entry of each receiver [*B, N, ...] to all of its links, [M, ...]."""
         at_senders = value.unsqueeze(len(self.agents))
         return self.to_rows(at_senders.expand(*self.rows, *value.shape[len(self.agents) :]))
 
@@ -181,7 +181,7 @@ class Channel(StatefulTransform):
         return memory | {"delay": delivery.delay}
 
     def _context(self, memory: Memory, sent: Tensor, places: dict[str, Tensor]) -> MessageContext:
-        """The circumstances of what is ``sent`` over the links [M]."""
+        """What laws may read of the messages that are ``sent`` over the links [M]."""
         n = self.agents[-1]
         numbers = torch.arange(n, device=sent.device).expand(self.agents)
         sender = self._by_sender(numbers)
@@ -194,7 +194,7 @@ class Channel(StatefulTransform):
         return MessageContext(sender, receiver, n_sending, time, uniform, self.dt, places)
 
     def _outputs(self, memory: Memory, content: Tensor) -> Entries:
-        """What the agents hold, with ages and delays; each agent holds its own message at once."""
+        """The messages that agents hold, with ages and delays; an agent's own arrives at once."""
         is_own = memory["is_own"]
         held = where_rows(is_own, content, memory["held_0"])
         written: Entries = {self.out_keys[0]: self.from_rows(held)}

@@ -65,11 +65,11 @@ class RegionConfig(Settings):
         kinds=FILES,
     )
     id: str = setting("", "Airspace ID of the region in the FIR table.", kinds=("fir",))
-    index: list[int] = setting(
-        [], "Index of the feature in the file, from 0, or a list to unite.", low=0, kinds=GEOJSON
+    index: list[int] | None = setting(
+        None, "Index of the feature in the file, from 0, or a list to unite.", low=0, kinds=GEOJSON
     )
-    where: list[str] = setting(
-        [], "Property of the feature, ``property:value``, or a list to unite.", kinds=GEOJSON
+    where: list[str] | None = setting(
+        None, "Property of the feature, ``property:value``, or a list to unite.", kinds=GEOJSON
     )
     zones: Any = setting(
         [],
@@ -104,8 +104,9 @@ class RegionConfig(Settings):
     def __post_init__(self) -> None:
         for name in ("index", "where"):
             given = getattr(self, name)
-            if not isinstance(given, list):
-                setattr(self, name, [] if given is None else [given])
+            self.refuse(given == [], name, "chooses no feature: leave it out")
+            if not isinstance(given, list | None):
+                setattr(self, name, [given])
         super().__post_init__()
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.initial_conditions", self.initial_conditions, self.pool)
@@ -123,9 +124,9 @@ class RegionConfig(Settings):
         should = (
             "must be PROPERTY:VALUE, for example region.where=name:park, or a list of such texts"
         )
-        for each in self.where:
+        for each in self.where or []:
             checks.require(re.search(".[:=]", each) is not None, "region.where", each, should)
-        both = self.index and self.where
+        both = bool(self.index and self.where)
         self.refuse(both, "where", "and region.index both choose; give one of them")
         zones = self.zones
         drawn = checks.is_number(self.zones)

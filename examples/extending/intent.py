@@ -177,8 +177,10 @@ class Intents(RecurrentModule):
         )
 
     def encoded(self, observation: Tensor, timeline: Tensor) -> Tensor:
-        """Intents [*, N, W] from observations [*, N, F] and timelines [*, N, S, K, C], of which
-        only a UAV's own part is read, the oldest slot first."""
+        """Intents [*, N, W] from observations [*, N, F] and timelines [*, N, S, K, C].
+
+        Each UAV reads only its own part of the timeline, from the oldest slot to the newest.
+        """
         own = timeline[..., 0, :, :].flatten(0, -3)
         belief = own.new_zeros(len(own), self.cell.hidden_size)
         for slot in own.flip(1).unbind(1):

@@ -247,6 +247,8 @@ def test_only_areas_of_a_map_count_and_what_else_is_in_it_is_told_once(tmp_path,
             "region.where: park must be PROPERTY:VALUE, for example region.where=name:park",
         ),
         ({"index": 0, "where": "name:park"}, "region.where: .* both choose"),
+        ({"index": []}, "region.index: .* chooses no feature"),
+        ({"where": []}, "region.where: .* chooses no feature"),
     ],
 )
 def test_a_wrong_choice_of_features_is_refused_by_its_key(choice, message):

@@ -33,8 +33,8 @@ def stop_ages(messages: Messages, context: ServerContext) -> Tensor:
 
 
 def known_stops(v: FeatureCache) -> Tensor:
-    """What is known of each UAV's stops by when they were, as ``ServerContext.timeline``; without
-    that, what these messages alone tell."""
+    """Each UAV's known stops by their age, [*, slots, 3 + E]: ``ServerContext.timeline``, or the
+    stops that the held messages tell if there is no timeline."""
     context = v.context
     if context.timeline is not None:
         return context.timeline

@@ -53,7 +53,9 @@ def _region_of_fir_table(config: RegionConfig, rng: Generator) -> list[Region]:
 
 @REGION_SOURCES.register("geojson")
 def _region_of_map(config: RegionConfig, rng: Generator) -> list[Region]:
-    return [read_area(data_file(config.path, "region.path"), config.index, config.where)]
+    return [
+        read_area(data_file(config.path, "region.path"), config.index or (), config.where or ())
+    ]
 
 
 def _without_zones(region: Region, config: RegionConfig, rng: Generator) -> Region:
